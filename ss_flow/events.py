@@ -1,0 +1,82 @@
+"""What happens while a flow runs: events, and who listens to them.
+
+The scheduler speaks to one `Reporter`; the silent one at the root of the hierarchy makes listening optional. A task says
+how far it is with `progress`, without knowing who listens.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import IO, Any
+
+Listener = Callable[[int, int, str], None]
+
+_listener: ContextVar[Listener | None] = ContextVar("progress_listener", default=None)
+
+
+def progress(done: int, total: int, note: str = "") -> None:
+    """Say how far a long task is; free of cost where nobody listens. A cancelled task ends here."""
+    listen = _listener.get()
+    if listen is not None:
+        listen(done, total, note)
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Within this, `progress` calls `listener`."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+class Reporter:
+    """Hears what the scheduler does; this one is silent."""
+
+    def event(self, kind: str, **details: Any) -> None:
+        """Something happened: "hit", "started", "finished", "failed", "skipped", "waiting", "run started" or "run ended"."""
+
+    def progressed(self, label: str, done: int, total: int, note: str) -> None:
+        """A running node is so far; called from any thread."""
+
+    def close(self) -> None:
+        """The run is over."""
+
+
+class Reporters(Reporter):
+    """Several reporters as one."""
+
+    def __init__(self, *reporters: Reporter) -> None:
+        self._reporters = reporters
+
+    def event(self, kind: str, **details: Any) -> None:
+        for reporter in self._reporters:
+            reporter.event(kind, **details)
+
+    def progressed(self, label: str, done: int, total: int, note: str) -> None:
+        for reporter in self._reporters:
+            reporter.progressed(label, done, total, note)
+
+    def close(self) -> None:
+        for reporter in self._reporters:
+            reporter.close()
+
+
+class JsonLines(Reporter):
+    """Appends every event to a file, one JSON document a line; a line is complete or absent."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._stream: IO[str] = path.open("a", encoding="utf-8", buffering=1)
+
+    def event(self, kind: str, **details: Any) -> None:
+        self._stream.write(json.dumps({"time": round(time.time(), 3), "event": kind, **details}) + "\n")
+
+    def close(self) -> None:
+        self._stream.close()

@@ -1,0 +1,55 @@
+"""Why a step ran: the first part of its key that differs from the last time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ss_flow.keys import Components
+
+
+def first_difference(before: Components, now: Components) -> str:
+    """One phrase that names the first part of a key that changed.
+
+    Ordered from cause to effect: the task's own parameters, its code, packages and machine come before its inputs,
+    which may have changed only because of another step. Returns "" when nothing differs.
+    """
+    for name in _changed(before["parameters"], now["parameters"]):
+        old, new = (_shown(side["parameters"], name) for side in (before, now))
+        return f"parameter {name} {old} -> {new}"
+    for name in _changed(before["code"], now["code"]):
+        word = "changed" if name in before["code"] and name in now["code"] else "is new or gone"
+        return f"code of {name.removeprefix('ss_flow.')} {word}"
+    for name in _changed(before["packages"], now["packages"]):
+        old, new = (_shown(side["packages"], name) for side in (before, now))
+        return f"package {name} {old} -> {new}"
+    for name in _changed(before["environment"], now["environment"]):
+        old, new = (_shown(side["environment"], name) for side in (before, now))
+        return f"{name} of this machine {old} -> {new}"
+    if before["task"] != now["task"]:
+        return "the format of keys changed"
+    for name in changed_inputs(before, now):
+        return f"input {name} changed{_which(before['inputs'].get(name), now['inputs'].get(name))}"
+    return ""
+
+
+def changed_inputs(before: Components, now: Components) -> list[str]:
+    """Names of the inputs that differ between two keys."""
+    return _changed(before["inputs"], now["inputs"])
+
+
+def _changed(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    missing = object()
+    return [n for n in {**now, **before} if before.get(n, missing) != now.get(n, missing)]
+
+
+def _shown(values: dict[str, Any], name: str) -> str:
+    return str(values[name]) if name in values else "(absent)"
+
+
+def _which(before: Any, now: Any) -> str:
+    """For a list, how many of its items differ."""
+    if not isinstance(before, list) or not isinstance(now, list):
+        return ""
+    if len(before) != len(now):
+        return f" ({len(before)} -> {len(now)} items)"
+    return f" ({sum(a != b for a, b in zip(before, now, strict=True))} of {len(now)} items)"

@@ -1,0 +1,197 @@
+"""Flows: ordinary functions in which calling a task adds a node to a graph instead of running it.
+
+A node stands for one artifact, or for a list of artifacts. `each` fans a list out, `expand` lets a result decide what
+comes next, a plain sequence of nodes passed to a task is a list.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from ss_flow.task import Task
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+OnError = Literal["fail", "skip"]
+
+
+@dataclass(eq=False)
+class Node:
+    """A place in the graph; its value is known only once the scheduler got to it."""
+
+    flow: Flow
+    step: str
+    item: str
+    """Which of the many nodes of a step this is (a frame's or an instance's name), "" for the only one."""
+
+    @property
+    def label(self) -> str:
+        return f"{self.step}[{self.item}]" if self.item else self.step
+
+    def __getitem__(self, index: int) -> Item:
+        """One artifact of a list."""
+        return self.flow.attach(Item(self.flow, self.step, str(index), self, index))
+
+
+@dataclass(eq=False)
+class Call(Node):
+    """A task applied to nodes."""
+
+    task: Task[..., Any]
+    inputs: dict[str, Node]
+    parameters: dict[str, Any]
+
+
+@dataclass(eq=False)
+class Item(Node):
+    """One artifact of a list."""
+
+    source: Node
+    index: int
+
+
+@dataclass(eq=False)
+class Gather(Node):
+    """Several artifacts as a list. With `on_error="skip"`, those that failed are left out."""
+
+    sources: list[Node]
+    on_error: OnError
+
+
+@dataclass(eq=False)
+class Expand(Node):
+    """A node that stands for what `build` makes of the values of `sources`, once they are known."""
+
+    sources: list[Node]
+    build: Callable[..., Node]
+    """Called in the flow. For `each`, with the lengths of the lists; for `expand`, with the loaded artifacts."""
+    loads: bool
+
+
+_current: ContextVar[Flow | None] = ContextVar("current_flow", default=None)
+_item: ContextVar[str] = ContextVar("current_item", default="")
+
+
+def current_flow() -> Flow | None:
+    """The flow that is being built in this context, if any."""
+    return _current.get()
+
+
+class Flow:
+    """A graph of nodes. It grows while it runs, as expansions resolve."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.nodes: list[Node] = []
+
+    @contextmanager
+    def building(self, item: str = "") -> Iterator[None]:
+        """Within this, calls of tasks add nodes to this flow, labelled with `item`."""
+        flow_token, item_token = _current.set(self), _item.set(item)
+        try:
+            yield
+        finally:
+            _current.reset(flow_token)
+            _item.reset(item_token)
+
+    def attach(self, node: Any) -> Any:
+        self.nodes.append(node)
+        return node
+
+    def add(self, task: Task[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
+        """The node of one call of a task.
+
+        Raises TypeError when the arguments do not fit the task, or an input is not a node.
+        """
+        bound = inspect.signature(task.function).bind(*args, **kwargs)
+        bound.apply_defaults()
+        inputs: dict[str, Node] = {}
+        for name in task.inputs:
+            value = bound.arguments.pop(name)
+            inputs[name] = value if isinstance(value, Node) else gather(value)
+        return self.attach(Call(self, task.name, _item.get(), task, inputs, dict(bound.arguments)))
+
+    def graph(self) -> nx.DiGraph:
+        """What feeds what, over all the nodes known so far."""
+        import networkx as nx
+
+        graph: nx.DiGraph = nx.DiGraph()
+        graph.add_nodes_from(self.nodes)
+        graph.add_edges_from((source, node) for node in self.nodes for source in sources_of(node))
+        return graph
+
+
+def sources_of(node: Node) -> list[Node]:
+    """The nodes that a node waits for."""
+    match node:
+        case Call():
+            return list(node.inputs.values())
+        case Item():
+            return [node.source]
+        case Gather() | Expand():
+            return list(node.sources)
+    return []
+
+
+def gather(nodes: Sequence[Node], *, on_error: OnError = "fail") -> Gather:
+    """A list of the artifacts of several nodes.
+
+    Raises TypeError when one of them is not a node.
+    """
+    flow = _building()
+    for node in nodes:
+        if not isinstance(node, Node):
+            raise TypeError(f"an input of a task in a flow must be a node, not {type(node).__name__}")
+    return flow.attach(Gather(flow, "gather", _item.get(), list(nodes), on_error))
+
+
+def each(
+    *lists: Any,
+    build: Callable[..., Any],
+    names: Sequence[str] | None = None,
+    on_error: OnError = "fail",
+) -> Any:
+    """Apply `build` to every item of one list, or of several lists of equal length side by side.
+
+    build: takes one node of every list, returns a node. names: what to call the items (say, the frames' names).
+    on_error: with "skip", an item that fails is left out of the result, and the run is degraded.
+    Returns a node that stands for the list of the results.
+    """
+    flow = _building()
+
+    def build_all(*lengths: int) -> Node:
+        if len(set(lengths)) != 1:
+            raise ValueError(f"lists of different lengths side by side: {lengths}")
+        results = []
+        for index in range(lengths[0]):
+            with flow.building(names[index] if names else str(index)):
+                results.append(build(*(source[index] for source in lists)))
+        return gather(results, on_error=on_error)
+
+    return flow.attach(Expand(flow, "each", _item.get(), list(lists), build_all, loads=False))
+
+
+def expand(plan: Any, build: Callable[[Any], Any]) -> Any:
+    """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes."""
+    flow = _building()
+    return flow.attach(Expand(flow, "expand", _item.get(), [plan], build, loads=True))
+
+
+@contextmanager
+def labelled(item: str) -> Iterator[None]:
+    """Within this, the nodes that are added are labelled with `item`."""
+    with _building().building(item):
+        yield
+
+
+def _building() -> Flow:
+    flow = current_flow()
+    if flow is None:
+        raise RuntimeError("each, expand and gather belong in a flow")
+    return flow

@@ -1,0 +1,83 @@
+"""Runs: what a flow was run on, and what happened, kept in the store so that a later run can say what changed.
+
+A run is a folder `roots/runs/<id>` with `run.json` (what was asked) and `events.jsonl` (what happened, line by line, so
+that a killed run is known up to its last step).
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ss_flow.cache.store import write_atomically
+
+DONE = ("hit", "finished")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run in the store."""
+
+    folder: Path
+    header: dict[str, Any]
+    """What was asked: at least "scene" and "started"."""
+
+    @property
+    def scene(self) -> str:
+        return str(self.header["scene"])
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """What happened, in order; the last line of a killed run may be cut, and is then left out."""
+        try:
+            with (self.folder / "events.jsonl").open(encoding="utf-8") as stream:
+                for line in stream:
+                    try:
+                        yield json.loads(line)
+                    except ValueError:
+                        return
+        except FileNotFoundError:
+            return
+
+    def nodes(self) -> list[dict[str, Any]]:
+        """The events of the nodes that have a result."""
+        return [event for event in self.events() if event["event"] in DONE]
+
+
+def start_run(runs: Path, header: dict[str, Any]) -> Run:
+    """Open a run: its folder, with what was asked."""
+    name = "".join(c if c.isalnum() else "-" for c in Path(header["scene"]).name)
+    folder = runs / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}-{uuid.uuid4().hex[:6]}"
+    folder.mkdir(parents=True)
+    header = header | {"started": time.time()}
+    write_atomically(folder / "run.json", json.dumps(header, indent=1))
+    return Run(folder, header)
+
+
+def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
+    """Runs, the latest first; of one scene (a resolved path), or of all."""
+    found = []
+    for file in runs.glob("*/run.json"):
+        try:
+            header = json.loads(file.read_text())
+        except ValueError:
+            continue
+        if scene is None or header["scene"] == scene:
+            found.append(Run(file.parent, header))
+    yield from sorted(found, key=lambda run: run.header["started"], reverse=True)
+
+
+def previous_keys(runs: Path, scene: str) -> dict[str, str]:
+    """The key under which the latest run of a scene found each label's result.
+
+    A label that the latest run never reached counts with the run before, so that `why` survives an interrupted run.
+    """
+    keys: dict[str, str] = {}
+    for run, _ in zip(latest_runs(runs, scene), range(5), strict=False):
+        for event in run.nodes():
+            keys.setdefault(event["label"], event["key"])
+    return keys

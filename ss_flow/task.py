@@ -1,0 +1,100 @@
+"""Tasks: plain functions with declared inputs, parameters and output.
+
+A task's positional parameters are artifacts (one `X`, or a list `tuple[X, ...]`); its keyword-only parameters are
+hashed into its key. It reads nothing else. Called in a flow, a task returns a `Node`; called anywhere else, it runs.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a task needs while it runs; the scheduler never hands out more than the machine has."""
+
+    cores: int = 1
+    memory_mb: int = 0
+    gpus: int = 0
+
+
+@dataclass(frozen=True)
+class FileRef:
+    """An input file: its content counts in the key, its place does not."""
+
+    path: Path = field(metadata={"key": False})
+    digest: str
+    """blake3 of the content, hexadecimal."""
+
+
+@dataclass(eq=False)
+class Task(Generic[P, R]):
+    """A declared task. `name` is its module below `ss_flow.tasks` and its function: "split.propagate"."""
+
+    function: Callable[P, R]
+    name: str
+    resources: Resources
+    uses: tuple[str, ...]
+    isolate: bool
+    environment: Callable[[], Mapping[str, str]] | None
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        from ss_flow import graph
+
+        flow = graph.current_flow()
+        return self.function(*args, **kwargs) if flow is None else typing.cast(R, flow.add(self, args, kwargs))
+
+    @functools.cached_property
+    def inputs(self) -> dict[str, bool]:
+        """Names of the artifact parameters, and whether each takes a list."""
+        hints = typing.get_type_hints(self.function)
+        positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        return {
+            p.name: typing.get_origin(hints[p.name]) is tuple
+            for p in inspect.signature(self.function).parameters.values()
+            if p.kind in positional
+        }
+
+    @functools.cached_property
+    def returns_list(self) -> bool:
+        return typing.get_origin(typing.get_type_hints(self.function)["return"]) is tuple
+
+
+def task(
+    *,
+    name: str | None = None,
+    resources: Resources = Resources(),  # noqa: B008 - frozen
+    uses: tuple[str, ...] = (),
+    isolate: bool = False,
+    environment: Callable[[], Mapping[str, str]] | None = None,
+) -> Callable[[Callable[P, R]], Task[P, R]]:
+    """Declare a function as a task.
+
+    name: the step's name; by default the module below `ss_flow.tasks`, and the function where the two differ.
+    uses: distributions whose versions count in the key, besides those of the code itself.
+    isolate: run in a process of its own (the library aborts on errors, or is not deterministic beside others).
+    environment: what else of this machine the result depends on (say, the instruction set); its items enter the key.
+    """
+
+    def declare(function: Callable[P, R]) -> Task[P, R]:
+        step = name or _default_name(function)
+        declared: Any = Task(function, step, resources, uses, isolate, environment)
+        functools.update_wrapper(declared, function)
+        return declared
+
+    return declare
+
+
+def _default_name(function: Callable[..., Any]) -> str:
+    module = function.__module__.removeprefix("ss_flow.tasks.")
+    last = module.rpartition(".")[2]
+    return module if last == function.__name__ else f"{module}.{function.__name__}"

@@ -1,0 +1,53 @@
+"""The live display of a run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import TaskID as RowId
+
+from ss_flow.events import Reporter
+
+
+class Terminal(Reporter):
+    """A live display: how many nodes are done, and how far each running one is."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._display = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("[dim]{task.fields[note]}"),
+            console=console,
+            transient=True,
+        )
+        self._all = self._display.add_task("[bold]all steps", total=None, note="")
+        self._rows: dict[str, RowId] = {}
+        self._done = 0
+        self._display.start()
+
+    def event(self, kind: str, **details: Any) -> None:
+        label = details.get("label", "")
+        if kind == "started":
+            self._rows[label] = self._display.add_task(label, total=None, note="")
+        elif kind in ("finished", "failed") and label in self._rows:
+            self._display.remove_task(self._rows.pop(label))
+        if kind in ("hit", "finished", "failed", "skipped"):
+            self._done += 1
+            self._display.update(self._all, completed=self._done, total=max(self._done, details.get("known", 0)))
+        if kind == "finished":
+            self._console.print(f"[green]done[/]  {label:<34} {details['seconds']:8.1f} s", highlight=False)
+        elif kind == "failed":
+            self._console.print(f"[red]failed[/] {label}: {details['error']}", highlight=False)
+
+    def progressed(self, label: str, done: int, total: int, note: str) -> None:
+        if label in self._rows:
+            self._display.update(self._rows[label], completed=done, total=total, note=note)
+
+    def close(self) -> None:
+        self._display.stop()

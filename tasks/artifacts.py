@@ -1,0 +1,260 @@
+"""What flows between the steps: frozen dataclasses of arrays, which the store keeps as Zarr groups.
+
+Conventions (said once, used everywhere):
+
+- The world frame is the one the poses use. A camera looks along +z, x right, y down (OpenCV).
+  Stored poses are world-to-camera.
+- Pixel centres lie at (i + 0.5, j + 0.5); the pixel that holds image point (u, v) is (floor(u), floor(v)).
+- Instance ids: 1..L, assigned once and never re-used; 0 is background or unlabelled.
+- Quaternions are (w, x, y, z). Images in memory are RGB.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view's photo, kept encoded (a decoded image is ten times the size)."""
+
+    name: str
+    """Stem of the input file; unique in a scene."""
+    width: int
+    height: int
+    encoded: UInt8
+    """[n] the bytes of a JPEG or PNG file of `width` x `height` pixels."""
+    valid: UInt8
+    """[m] the bytes of a one-channel PNG, 0 where a pixel is to be ignored; empty when all pixels count."""
+    source_width: int
+    source_height: int
+    """Size of the input photo; larger than `width`, `height` when it was scaled down on the way in."""
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """The pinhole cameras of all views, in the order of the frames."""
+
+    names: tuple[str, ...]
+    sizes: Int32
+    """[K, 2] width, height of the frame that the intrinsics refer to."""
+    intrinsics: Float64
+    """[K, 4] fx, fy, cx, cy in pixels."""
+    world_to_camera: Float64
+    """[K, 4, 4] rigid."""
+    metric: bool
+    """Whether one world unit is one metre."""
+    sparse_points: Float32 = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    """[S, 3] points triangulated by structure from motion; empty where the poses were given."""
+    radial: Float64 = field(default_factory=lambda: np.zeros(0, np.float64))
+    """[K] first radial distortion coefficient of the photos that these cameras were estimated from, which
+    `capture.registered` takes out of the frames; empty where there is none."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth of one view, registered to its frame's camera, possibly at a lower resolution.
+
+    Frame pixel (u, v) falls on depth pixel (u * depth width / frame width, v * depth height / frame height).
+    """
+
+    name: str
+    depth: Float32
+    """[h, w] z-depth in world units, 0 where unknown."""
+    source: str
+    """Where it came from: "sensor", "mvs" or "mono"."""
+
+
+@dataclass(frozen=True)
+class MaskSet:
+    """The 2D instance masks that a segmenter found in one view (Split&Splat, M_k); they may overlap."""
+
+    name: str
+    height: int
+    width: int
+    packed: UInt8
+    """[N, ceil(H * W / 8)] one bit a pixel, row-major (`np.packbits`)."""
+    predicted_iou: Float32
+    """[N] the segmenter's own estimate of each mask's quality."""
+    stability: Float32
+    """[N] IoU of the mask cut at a higher and at a lower threshold."""
+    grid: Int32
+    """[N] index of the prompt grid that gave the mask, 0 = coarsest."""
+    parent: Int32
+    """[N] index of the smallest mask that holds this one, -1 at the top."""
+    source: str
+    """Name of the segmenter."""
+
+    def __len__(self) -> int:
+        return len(self.packed)
+
+    def dense(self) -> Bool:
+        """The masks as [N, H, W] booleans."""
+        bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
+        return bits.reshape(-1, self.height, self.width).astype(bool)
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Dense points of the scene (Split&Splat, P_dense)."""
+
+    points: Float32
+    """[N, 3] world."""
+    colors: UInt8
+    """[N, 3] RGB."""
+    unit: float
+    """The length, in world units, that plays the part of one metre in an average room (1.0 when metric)."""
+    spacing: float
+    """Median distance to the nearest neighbour, in world units."""
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """The surface-consistent points of one view (Split&Splat, Eq. 1-2: P_k)."""
+
+    name: str
+    point_index: Int32
+    """[M] rows of the point cloud, ascending."""
+    pixel: Int32
+    """[M] flat index v * W + u of the frame pixel each point falls on."""
+    depth: Float32
+    """[M] z-depth of the point in this view."""
+    height: int
+    width: int
+    """Size of the frame."""
+
+
+@dataclass(frozen=True)
+class PointLabels:
+    """The labelled dense points (Split&Splat, P_labeled) and how each mask was matched."""
+
+    label: Int32
+    """[N] instance id of each dense point, 0 = unlabelled."""
+    confidence: Float32
+    """[N] the winning label's share of the point's votes, 0 where there were none."""
+    num_labels: int
+    """The highest id ever given; ids of labels that did not survive stay unused."""
+    match_view: Int32
+    """[A] view of each matched mask."""
+    match_mask: Int32
+    """[A] index of the mask in its view's MaskSet."""
+    match_label: Int32
+    """[A] id that the mask votes for."""
+    match_purity: Float32
+    """[A] share of the painted pixels under the mask that carry that id."""
+
+
+@dataclass(frozen=True)
+class PromptedMasks:
+    """Masks that the segmenter gave in one view when asked where labels are that it had not found by itself."""
+
+    name: str
+    height: int
+    width: int
+    label: Int32
+    """[N] instance id of each mask, ascending."""
+    packed: UInt8
+    """[N, ceil(H * W / 8)] one bit a pixel, row-major (`np.packbits`)."""
+
+    def dense(self) -> Bool:
+        """The masks as [N, H, W] booleans."""
+        bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
+        return bits.reshape(-1, self.height, self.width).astype(bool)
+
+
+@dataclass(frozen=True)
+class InstanceMasks:
+    """One instance after Split: its points and its view-consistent masks (Split&Splat, M~_{k,l}). Id 0 is the background."""
+
+    instance_id: int
+    points: Float32
+    """[N, 3] its labelled points, world."""
+    colors: UInt8
+    """[N, 3] RGB."""
+    point_confidence: Float32
+    """[N] share of votes."""
+    confidence: float
+    """Mean vote share, less what other labels contradict."""
+    height: int
+    width: int
+    view: Int32
+    """[V] ascending indices of the views in which it has a mask."""
+    packed: UInt8
+    """[V, ceil(H * W / 8)] one bit a pixel (`np.packbits`), exclusive between instances."""
+    prompted: UInt8
+    """[V] 1 where the mask came from re-prompting the segmenter, 0 where it came from Split."""
+    weak: bool
+    """Seen in too few views to be reconstructed: kept as points only."""
+
+    def dense(self) -> Bool:
+        """The masks as [V, H, W] booleans."""
+        bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
+        return bits.reshape(-1, self.height, self.width).astype(bool)
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """3D Gaussians with an instance id each."""
+
+    means: Float32
+    """[N, 3] world."""
+    quaternions: Float32
+    """[N, 4] w x y z, of unit length."""
+    log_scales: Float32
+    """[N, 3] natural logarithm of the standard deviations, world units."""
+    opacity_logits: Float32
+    """[N]."""
+    sh: Float32
+    """[N, (degree + 1)^2, 3] spherical-harmonic coefficients of the colour; colour = 0.5 + sum of basis * sh."""
+    instance_id: Int32
+    """[N] 0 = background."""
+    instance_conf: Float32
+    """[N] 0..1."""
+    part_id: Int32
+    """[N] 0 = the whole object."""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+@dataclass(frozen=True)
+class Descriptors:
+    """The semantic descriptor of one instance (Split&Splat, Sec. 4.2: f_obj)."""
+
+    instance_id: int
+    embedding: Float32
+    """[D] unit length; zeros when no view showed the instance well enough."""
+    views: Int32
+    """[V] the views that went in."""
+    weights: Float32
+    """[V] visible area of the instance in each of them, in pixels."""
+    encoder: str
+    """Name of the text-image encoder."""
+
+
+@dataclass(frozen=True)
+class LabelMap:
+    """Instance ids of one view: ground truth, or a rendering of labelled Gaussians."""
+
+    name: str
+    ids: NDArray[np.uint16]
+    """[H, W] 0 = background or not annotated."""
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Figures measured against ground truth, as fractions 0..1 unless the name says otherwise."""
+
+    values: dict[str, float]

@@ -1,0 +1,85 @@
+"""Pinhole projection, in the frames that `artifacts` declares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Cameras, Float32, Float64, Int32
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One view's pinhole camera."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: Float64
+    """[4, 4] rigid."""
+
+    @property
+    def center(self) -> Float64:
+        """[3] the camera's place in the world."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same camera with an image of another size (pixel borders map to pixel borders)."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    def cropped(self, x0: int, y0: int, x1: int, y1: int) -> Camera:
+        """The same camera with only the pixels x0 <= u < x1, y0 <= v < y1; the principal point may fall outside."""
+        return replace(self, width=x1 - x0, height=y1 - y0, cx=self.cx - x0, cy=self.cy - y0)
+
+
+def camera_of(cameras: Cameras, view: int) -> Camera:
+    """The camera of one view."""
+    width, height = (int(n) for n in cameras.sizes[view])
+    fx, fy, cx, cy = (float(x) for x in cameras.intrinsics[view])
+    return Camera(width, height, fx, fy, cx, cy, cameras.world_to_camera[view])
+
+
+def project(points: Float32 | Float64, camera: Camera) -> tuple[Float64, Float64]:
+    """Project world points (Split&Splat, Pi_k).
+
+    points: [N, 3] world. Returns uv: [N, 2] image points in pixels (meaningless where z <= 0), z: [N] depth.
+    """
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    z = local[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = local[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return uv, z
+
+
+def pixels_in_view(points: Float32 | Float64, camera: Camera) -> tuple[Int32, Int32, Int32, Float64]:
+    """The points in front of a camera and inside its image (Split&Splat, Eq. 1: P^_k).
+
+    points: [N, 3] world. Returns, for the M points that remain: their rows (ascending), pixel columns, pixel rows,
+    and z-depths.
+    """
+    uv, z = project(points, camera)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 0) & (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    rows = np.flatnonzero(inside).astype(np.int32)
+    column, row = np.floor(uv[rows]).astype(np.int32).T
+    return rows, column, row, z[rows]
+
+
+def backproject(depth: Float32, camera: Camera) -> Float64:
+    """World points of a depth map's pixels: [H * W, 3], row-major, at pixel centres.
+
+    depth: [H, W] z-depth in world units at the camera's own size (see `Camera.scaled`); unknown depth (0) gives the
+    camera's centre.
+    """
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    local = (rays * depth[..., None]).reshape(-1, 3) - camera.world_to_camera[:3, 3]
+    return local @ camera.world_to_camera[:3, :3]

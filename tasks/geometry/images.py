@@ -1,0 +1,47 @@
+"""Pixels of frames: decoding, and masks as bits."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Frame, UInt8
+
+
+def decode_rgb(frame: Frame) -> UInt8:
+    """The photo of a frame: [H, W, 3] uint8 RGB."""
+    import cv2
+
+    bgr = cv2.imdecode(frame.encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.ascontiguousarray(bgr[..., ::-1])
+
+
+def decode_valid(frame: Frame) -> Bool:
+    """[H, W] which pixels of a frame count."""
+    if not frame.valid.size:
+        return np.ones((frame.height, frame.width), bool)
+    import cv2
+
+    return cv2.imdecode(frame.valid, cv2.IMREAD_GRAYSCALE) > 0
+
+
+def encode_png(image: np.ndarray) -> UInt8:
+    """The bytes of a PNG file: image is [H, W] uint8 or uint16, or [H, W, 3] uint8 RGB."""
+    import cv2
+
+    ok, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    if not ok:
+        raise ValueError(f"cannot encode an image of shape {image.shape} and type {image.dtype}")
+    return data.ravel()
+
+
+def pack_masks(masks: Bool) -> UInt8:
+    """[N, H, W] booleans as [N, ceil(H * W / 8)] bits, the form of `MaskSet.packed`."""
+    return np.packbits(masks.reshape(len(masks), -1), axis=1)
+
+
+def depth_at_frame_size(depth: DepthMap, frame: Frame) -> Float32:
+    """The depth map at its frame's resolution, nearest neighbour (depth must not be blended across edges): [H, W]."""
+    h, w = depth.depth.shape
+    rows = (np.arange(frame.height) + 0.5) * h / frame.height
+    columns = (np.arange(frame.width) + 0.5) * w / frame.width
+    return depth.depth[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import importlib
+import sys
+import textwrap
+
+import pytest
+
+from ss_flow import closure
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Write modules of a package `probe`, and get the closure of `probe.step.run`."""
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = tmp_path / "probe"
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+
+    def closure_of(**modules: str) -> dict[str, str]:
+        for name, text in modules.items():
+            (folder / f"{name}.py").write_text(textwrap.dedent(text))
+        for name in [n for n in sys.modules if n.partition(".")[0] == "probe"]:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        closure._module.cache_clear()
+        closure._closure.cache_clear()
+        return closure.code_closure(importlib.import_module("probe.step").run)
+
+    return closure_of
+
+
+STEP = """
+from probe.maths import twice
+
+def run(x):
+    return twice(x)
+"""
+MATHS = """
+FACTOR = 2
+
+def twice(x):
+    return FACTOR * x
+
+def unrelated(x):
+    return x
+"""
+
+
+def test_the_closure_holds_helpers_and_constants_but_nothing_unrelated(package):
+    assert set(package(step=STEP, maths=MATHS)) == {"probe.step.run", "probe.maths.twice", "probe.maths.FACTOR"}
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda s: s.replace("def twice", "# a remark\ndef twice"),
+        lambda s: s.replace("    return FACTOR * x", '    """Says what it does."""\n    return (FACTOR\n  * x)'),
+        lambda s: s.replace("return x", "return -x"),
+    ],
+    ids=["comment", "docstring and layout", "unrelated function"],
+)
+def test_an_edit_that_cannot_change_the_result_changes_no_digest(package, edit):
+    assert package(step=STEP, maths=MATHS) == package(step=STEP, maths=edit(MATHS))
+
+
+@pytest.mark.parametrize(
+    ("edit", "changed"),
+    [
+        (lambda s: s.replace("FACTOR * x", "FACTOR + x"), "probe.maths.twice"),
+        (lambda s: s.replace("FACTOR = 2", "FACTOR = 3"), "probe.maths.FACTOR"),
+    ],
+    ids=["helper", "constant"],
+)
+def test_an_edited_helper_or_constant_is_named(package, edit, changed):
+    before, after = package(step=STEP, maths=MATHS), package(step=STEP, maths=edit(MATHS))
+    assert {name for name in before if before[name] != after[name]} == {changed}
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "def run(x):\n    from probe.maths import twice\n    return twice(x)\n",
+        "from probe import maths\n\ndef run(x):\n    return maths.twice(x)\n",
+        "from .maths import twice as double\n\ndef run(x):\n    return double(x)\n",
+        "import probe.maths as m\n\ndef run(x):\n    return m.twice(x)\n",
+    ],
+    ids=["local import", "module attribute", "relative import with alias", "module alias"],
+)
+def test_every_form_of_import_is_followed(package, step):
+    assert "probe.maths.FACTOR" in package(step=step, maths=MATHS)
+
+
+def test_what_only_a_type_checker_sees_does_not_count(package):
+    step = "from __future__ import annotations\nfrom typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from probe.maths import twice\n\ndef run(x: twice):\n    return x\n"
+    assert set(package(step=step, maths=MATHS)) == {"probe.step.run"}
+
+
+def test_the_task_decorator_does_not_count_but_other_decorators_do(package):
+    plain = package(step="from ss_flow.task import task, Resources\n\n@task()\ndef run(x: int) -> int:\n    return x\n")
+    more = package(
+        step="from ss_flow.task import task, Resources\n\n@task(resources=Resources(cores=2))\ndef run(x: int) -> int:\n    return x\n"
+    )
+    cached = package(step="import functools\n\n@functools.cache\ndef run(x: int) -> int:\n    return x\n")
+    assert plain == more != cached
+
+
+def test_native_sources_of_a_module_count(package, tmp_path):
+    (tmp_path / "probe" / "kernel.cpp").write_text("int f() { return 1; }")
+    module = 'NATIVE_SOURCES = ("kernel.cpp",)\n\ndef twice(x):\n    return x\n'
+    before = package(step=STEP, maths=module)
+    (tmp_path / "probe" / "kernel.cpp").write_text("int f() { return 2; }")
+    after = package(step=STEP, maths=module)
+    assert {name for name in before if before[name] != after[name]} == {"probe.maths:kernel.cpp"}
+
+
+def test_functions_that_call_each_other_end(package):
+    step = "def run(x):\n    return other(x)\n\ndef other(x):\n    return run(x)\n"
+    assert set(package(step=step)) == {"probe.step.run", "probe.step.other"}

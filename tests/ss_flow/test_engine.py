@@ -1,0 +1,235 @@
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import pytest
+import ss_flow_toy as toy
+
+from ss_flow.cache.claims import Claims
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+from ss_flow.events import Reporter
+from ss_flow.graph import Flow, each, gather
+from ss_flow.runs import latest_runs, previous_keys
+from ss_flow.scheduler import Failure
+
+
+def run(store, build, **kwargs):
+    return run_flow(build, store, scene="toy", header={}, **kwargs)
+
+
+def ran(report):
+    return [n["label"] for n in report.nodes if n["event"] == "finished"]
+
+
+def value(store, digest):
+    return float(store.get(digest).value[0])
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_a_flow_gives_the_same_result_on_every_executor(store, executor):
+    report = run(store, toy.flow, executor=executor)
+    assert value(store, report.values["total"]) == 14.0
+    assert [value(store, d) for d in report.values["squares"]] == [1.0, 4.0, 9.0]
+
+
+def test_a_second_run_computes_nothing(store):
+    run(store, toy.flow)
+    again = run(store, toy.flow)
+    assert ran(again) == []
+    assert len(again.nodes) == 8
+
+
+def test_a_changed_parameter_recomputes_only_what_depends_on_it(store):
+    run(store, toy.flow)
+    assert set(ran(run(store, lambda: toy.flow(limit=5.0)))) == {*(f"ss_flow_toy.clip[n{i}]" for i in range(3)), "ss_flow_toy.total"}
+
+
+def test_a_recomputation_with_an_equal_result_stops_there(store):
+    run(store, toy.flow)
+    report = run(store, lambda: toy.flow(limit=50.0))
+    assert ran(report) == [f"ss_flow_toy.clip[n{i}]" for i in range(3)]
+
+
+def test_a_changed_item_recomputes_only_its_own_branch(store):
+    run(store, toy.flow)
+    report = run(store, lambda: toy.flow(values=(1.0, 2.0, 5.0)))
+    assert ran(report) == ["ss_flow_toy.source", "ss_flow_toy.square[n2]", "ss_flow_toy.clip[n2]", "ss_flow_toy.total"]
+
+
+def test_until_runs_only_what_the_named_output_needs(store):
+    report = run(store, toy.flow, until="squares")
+    assert "ss_flow_toy.total" not in ran(report)
+    assert list(report.values) == ["squares"]
+
+
+def test_a_dry_run_names_what_would_run_and_computes_nothing(store):
+    run(store, toy.flow)
+    report = run(store, lambda: toy.flow(limit=5.0), dry=True)
+    would = [n for n in report.nodes if n["event"] == "would run"]
+    assert {n["label"] for n in would} == {f"ss_flow_toy.clip[n{i}]" for i in range(3)}
+    assert would[0]["why"] == "parameter limit 100.0 -> 5.0"
+    assert ran(report) == []
+
+
+def test_a_flow_may_grow_as_long_as_its_results_say_so(store):
+    report = run(store, lambda: {"end": toy.halving(toy.source(values=(20.0,))[0])})
+    assert value(store, report.values["end"]) == 0.625
+    assert len(ran(report)) == 6
+
+
+def test_a_failed_item_fails_what_depends_on_it_and_nothing_else(store):
+    def build():
+        numbers = toy.source(values=(4.0, -1.0))
+        return {"total": toy.total(each(numbers, build=toy.half)), "square": toy.square(numbers[1])}
+
+    report = run(store, build)
+    assert isinstance(report.values["total"], Failure)
+    assert value(store, report.values["square"]) == 1.0
+    assert [f.label for f in report.failures] == ["ss_flow_toy.half[1]"]
+
+
+def test_with_on_error_skip_the_run_goes_on_without_the_failed_item(store):
+    def build():
+        return {"total": toy.total(each(toy.source(values=(4.0, -1.0)), build=toy.half, on_error="skip"))}
+
+    report = run(store, build)
+    assert value(store, report.values["total"]) == 2.0
+    assert len(report.failures) == 1
+
+
+def test_when_every_item_failed_the_list_failed(store):
+    def build():
+        return {"total": toy.total(each(toy.source(values=(-4.0, -1.0)), build=toy.half, on_error="skip"))}
+
+    assert isinstance(run(store, build).values["total"], Failure)
+
+
+def test_an_isolated_task_runs_in_a_process_of_its_own(store):
+    import os
+
+    report = run(store, lambda: {"pid": toy.own_process(toy.source(values=(1.0,))[0])})
+    assert value(store, report.values["pid"]) != os.getpid()
+
+
+def test_a_task_that_aborts_fails_alone_and_says_how(store):
+    report = run(store, lambda: {"end": toy.abort(toy.source(values=(1.0,))[0])})
+    assert isinstance(report.values["end"], Failure)
+    assert "SIGABRT" in str(report.values["end"].error)
+
+
+def test_the_same_key_is_computed_once_for_all_its_nodes(store):
+    def build():
+        numbers = toy.source(values=(3.0, 3.0))
+        return {"squares": each(numbers, build=toy.square)}
+
+    report = run(store, build)
+    assert len(ran(report)) == 2  # the source, and one square
+    assert len(report.values["squares"]) == 2
+
+
+def test_two_runs_at_once_compute_every_key_once(tmp_path):
+    class Count(Reporter):
+        started = 0
+
+        def event(self, kind, **details):
+            Count.started += kind == "started"
+
+    reports = []
+    stores = [Store(tmp_path / "store") for _ in range(2)]
+    threads = [
+        threading.Thread(target=lambda s=s: reports.append(run(s, toy.flow, reporter=Count()))) for s in stores
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert Count.started == 8
+    assert reports[0].values == reports[1].values
+
+
+def test_progress_of_a_task_reaches_the_reporter(store):
+    heard = []
+
+    class Listen(Reporter):
+        def progressed(self, label, done, total, note):
+            heard.append((label, done, total, note))
+
+    run(store, toy.flow, reporter=Listen())
+    assert heard == [("ss_flow_toy.total", 1, 1, "adding")]
+
+
+def test_an_interrupted_run_keeps_what_was_finished_and_ends_its_claims(store):
+    class Interrupt(Reporter):
+        def progressed(self, label, done, total, note):
+            if done == 2:
+                interrupts.append(label)
+
+        def event(self, kind, **details):
+            if kind == "started" and "slow" in details["label"]:
+                raise KeyboardInterrupt
+
+    interrupts = []
+    numbers = lambda: {"slow": toy.slow(toy.square(toy.source(values=(2.0,))[0]))}  # noqa: E731
+    started = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run(store, numbers, reporter=Interrupt())
+    assert time.monotonic() - started < 5
+    assert list((store.root / "claims").iterdir()) == []
+    assert ran(run(store, lambda: {"square": toy.square(toy.source(values=(2.0,))[0])})) == []
+
+
+def test_why_names_the_first_changed_part_and_runs_are_kept_in_order(store):
+    run(store, toy.flow)
+    report = run(store, lambda: toy.flow(limit=5.0))
+    why = {n["label"]: n["why"] for n in report.nodes if n["event"] == "finished"}
+    assert why["ss_flow_toy.clip[n2]"] == "parameter limit 100.0 -> 5.0"
+    assert why["ss_flow_toy.total"] == "input xs changed (1 of 3 items)"
+    latest = next(latest_runs(store.root / "roots" / "runs", "toy"))
+    assert [e["event"] for e in latest.events()][0] == "run started"
+    assert len(previous_keys(store.root / "roots" / "runs", "toy")) == 8
+
+
+def test_a_cut_last_line_of_the_event_log_is_left_out(store):
+    run(store, toy.flow)
+    latest = next(latest_runs(store.root / "roots" / "runs"))
+    with (latest.folder / "events.jsonl").open("a") as stream:
+        stream.write('{"event": "fini')
+    assert len(latest.nodes()) == 8
+
+
+def test_a_result_gone_from_the_store_is_computed_again(store):
+    import shutil
+
+    report = run(store, toy.flow)
+    shutil.rmtree(store.object_path(report.values["total"]))
+    again = run(store, toy.flow)
+    assert ran(again) == ["ss_flow_toy.total"]
+    assert again.values == report.values
+    assert json.loads(json.dumps(again.nodes[-1]))["why"] == "its result is no longer in the store"
+
+
+def test_an_unknown_executor_is_refused_in_one_sentence(store):
+    from ss_flow.errors import InputError
+
+    with pytest.raises(InputError, match="threads, processes"):
+        run(store, toy.flow, executor="mesos")
+
+
+def test_an_input_that_is_no_node_is_refused():
+    flow = Flow("x")
+    with flow.building(), pytest.raises(TypeError, match="must be a node"):
+        gather([1.0])
+
+
+def test_a_stale_claim_of_a_dead_process_is_taken_over(tmp_path):
+    import socket
+
+    (tmp_path / "k").write_text(json.dumps({"host": socket.gethostname(), "pid": 2**22 + 1}))
+    claims = Claims(tmp_path)
+    assert claims.take("k")
+    assert not Claims(tmp_path).take("k")
+    claims.release_all()
+    assert not (tmp_path / "k").exists()

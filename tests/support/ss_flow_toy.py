@@ -1,0 +1,87 @@
+"""A flow over numbers, small enough to see through, for the tests of the engine."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.events import progress
+from ss_flow.graph import each, expand
+from ss_flow.task import task
+
+
+@dataclass(frozen=True)
+class Number:
+    value: np.ndarray
+
+
+def number(value: float) -> Number:
+    return Number(np.array([value]))
+
+
+@task()
+def source(*, values: tuple[float, ...]) -> tuple[Number, ...]:
+    return tuple(number(v) for v in values)
+
+
+@task()
+def square(x: Number) -> Number:
+    return number(helper(float(x.value[0])))
+
+
+def helper(x: float) -> float:
+    return x * x
+
+
+@task()
+def clip(x: Number, *, limit: float) -> Number:
+    return number(min(float(x.value[0]), limit))
+
+
+@task()
+def total(xs: tuple[Number, ...]) -> Number:
+    progress(1, 1, "adding")
+    return number(sum(float(x.value[0]) for x in xs))
+
+
+@task()
+def half(x: Number) -> Number:
+    if x.value[0] < 0:
+        raise ValueError("negative")
+    return number(float(x.value[0]) / 2)
+
+
+@task(isolate=True)
+def own_process(x: Number) -> Number:
+    return number(float(os.getpid()))
+
+
+@task(isolate=True)
+def abort(x: Number) -> Number:
+    os.abort()
+
+
+@task()
+def slow(x: Number) -> Number:
+    for i in range(200):
+        time.sleep(0.05)
+        progress(i, 200)
+    return x
+
+
+def halving(x, depth=0):
+    """Halve until below one: a flow whose length depends on its results."""
+
+    def build(now):
+        return x if now.value[0] < 1 else halving(half(x), depth + 1)
+
+    return expand(x, build)
+
+
+def flow(values=(1.0, 2.0, 3.0), limit=100.0, on_error="fail"):
+    numbers = source(values=values)
+    squares = each(numbers, build=lambda x: clip(square(x), limit=limit), names=[f"n{i}" for i in range(len(values))])
+    return {"squares": squares, "total": total(squares)}
