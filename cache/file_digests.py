@@ -10,10 +10,14 @@ Notes
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from ss_flow.cache.canonical import digest_file
 from ss_flow.cache.store import write_atomically
+
+T = TypeVar("T")
 
 
 class FileDigests:
@@ -40,6 +44,14 @@ class FileDigests:
         self._known[str(path)] = [*stamp, content]
         self._changed = True
         return content
+
+    def once(self, check: Callable[[T], None], subject: T, contents: Sequence[str]) -> None:
+        """Run a check of files' contents, unless it passed for the same contents before. What it raises passes through."""
+        name = f"checked {' '.join(contents)}"
+        if name not in self._known or self._verify:
+            check(subject)
+            self._known[name] = []
+            self._changed = True
 
     def save(self) -> None:
         if self._changed:

@@ -7,6 +7,9 @@ from typing import Any
 from ss_flow.keys import Components
 
 
+SHOWN_CHARACTERS = 60
+
+
 def first_difference(before: Components, now: Components) -> str:
     """One phrase that names the first part of a key that changed.
 
@@ -43,7 +46,8 @@ def _changed(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 
 def _shown(values: dict[str, Any], name: str) -> str:
-    return str(values[name]) if name in values else "(absent)"
+    text = str(values[name]) if name in values else "(absent)"
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
 
 
 def _which(before: Any, now: Any) -> str:

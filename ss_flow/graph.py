@@ -6,6 +6,7 @@ comes next, a plain sequence of nodes passed to a task is a list.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -58,10 +59,12 @@ class Item(Node):
 
 @dataclass(eq=False)
 class Gather(Node):
-    """Several artifacts as a list. With `on_error="skip"`, those that failed are left out."""
+    """Several artifacts as a list: the one at `position` of every row."""
 
-    sources: list[Node]
+    rows: list[tuple[Node, ...]]
+    position: int
     on_error: OnError
+    """With "skip", a row in which anything failed is left out."""
 
 
 @dataclass(eq=False)
@@ -72,6 +75,13 @@ class Expand(Node):
     build: Callable[..., Node]
     """Called in the flow. For `each`, with the lengths of the lists; for `expand`, with the loaded artifacts."""
     loads: bool
+
+
+@dataclass(eq=False)
+class Stored(Node):
+    """Something that is in the store already: the result of another run."""
+
+    value: str | tuple[str, ...]
 
 
 _current: ContextVar[Flow | None] = ContextVar("current_flow", default=None)
@@ -134,21 +144,27 @@ def sources_of(node: Node) -> list[Node]:
             return list(node.inputs.values())
         case Item():
             return [node.source]
-        case Gather() | Expand():
+        case Gather():
+            return [source for row in node.rows for source in row]
+        case Expand():
             return list(node.sources)
     return []
 
 
-def gather(nodes: Sequence[Node], *, on_error: OnError = "fail") -> Gather:
+def gather(nodes: Sequence[Node]) -> Any:
     """A list of the artifacts of several nodes.
 
     Raises TypeError when one of them is not a node.
     """
-    flow = _building()
     for node in nodes:
         if not isinstance(node, Node):
             raise TypeError(f"an input of a task in a flow must be a node, not {type(node).__name__}")
-    return flow.attach(Gather(flow, "gather", _item.get(), list(nodes), on_error))
+    return _gathered([(node,) for node in nodes], 0, "fail")
+
+
+def _gathered(rows: list[tuple[Node, ...]], position: int, on_error: OnError) -> Gather:
+    flow = _building()
+    return flow.attach(Gather(flow, "gather", _item.get(), rows, position, on_error))
 
 
 def each(
@@ -156,31 +172,50 @@ def each(
     build: Callable[..., Any],
     names: Sequence[str] | None = None,
     on_error: OnError = "fail",
+    outputs: int = 1,
 ) -> Any:
     """Apply `build` to every item of one list, or of several lists of equal length side by side.
 
-    build: takes one node of every list, returns a node. names: what to call the items (say, the frames' names).
-    on_error: with "skip", an item that fails is left out of the result, and the run is degraded.
-    Returns a node that stands for the list of the results.
+    build: takes one node of every list, returns a node, or a tuple of `outputs` nodes. names: what to call the items
+    (say, the frames' names). on_error: with "skip", an item of which anything fails is left out of every list of
+    results, and the run is degraded.
+    Returns a node that stands for the list of the results, or a tuple of such nodes.
     """
     flow = _building()
+    rows: list[tuple[Node, ...]] = []
 
-    def build_all(*lengths: int) -> Node:
+    def build_rows(lengths: tuple[int, ...]) -> None:
         if len(set(lengths)) != 1:
             raise ValueError(f"lists of different lengths side by side: {lengths}")
-        results = []
         for index in range(lengths[0]):
             with flow.building(names[index] if names else str(index)):
-                results.append(build(*(source[index] for source in lists)))
-        return gather(results, on_error=on_error)
+                result = build(*(source[index] for source in lists))
+            rows.append(result if isinstance(result, tuple) else (result,))
 
-    return flow.attach(Expand(flow, "each", _item.get(), list(lists), build_all, loads=False))
+    def build_list(position: int, *lengths: int) -> Node:
+        if not rows:
+            build_rows(lengths)
+        return _gathered(rows, position, on_error)
+
+    nodes = tuple(
+        flow.attach(
+            Expand(flow, "each", _item.get(), list(lists), functools.partial(build_list, position), loads=False)
+        )
+        for position in range(outputs)
+    )
+    return nodes if outputs > 1 else nodes[0]
 
 
 def expand(plan: Any, build: Callable[[Any], Any]) -> Any:
     """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes."""
     flow = _building()
     return flow.attach(Expand(flow, "expand", _item.get(), [plan], build, loads=True))
+
+
+def stored(name: str, value: str | Sequence[str]) -> Any:
+    """A node for one artifact, or a list of them, that the store holds under these digests."""
+    flow = _building()
+    return flow.attach(Stored(flow, name, _item.get(), value if isinstance(value, str) else tuple(value)))
 
 
 @contextmanager

@@ -55,11 +55,16 @@ def _flat(name: str, value: Any) -> dict[str, Any]:
         items = ((str(i), item) for i, item in enumerate(value))
     else:
         digest(value)  # refuses a type that has no canonical form, here where the parameter's name is known
-        return {name: list(value) if isinstance(value, tuple) else value}
+        return {name: _plain(value)}
     flat: dict[str, Any] = {}
     for inner, item in items:
         flat |= _flat(f"{name}.{inner}" if name else inner, item)
     return flat
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON gives it back, so that a key's parts compare equal after being stored."""
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
 def _is_nested(value: Any) -> bool:

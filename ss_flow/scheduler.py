@@ -21,7 +21,7 @@ from ss_flow.execute import Invocation
 from ss_flow.executors import Executor
 from ss_flow.executors.worker import WorkerDied
 from ss_flow.explain import first_difference
-from ss_flow.graph import Call, Expand, Flow, Gather, Item, Node, sources_of
+from ss_flow.graph import Call, Expand, Flow, Gather, Item, Node, Stored, sources_of
 from ss_flow.keys import Value, components, key_of
 from ss_flow.task import Resources
 
@@ -151,21 +151,28 @@ class Scheduler:
             return
         values = [self._values[source] for source in sources_of(node)]
         failed = next((value for value in values if isinstance(value, Failure)), None)
+        if isinstance(node, Gather):
+            self._settle(node, self._gathered(node, failed))
+            return
         match node:
-            case Gather(on_error="skip") if len(good := [v for v in values if not isinstance(v, Failure)]) or not values:
-                self._settle(node, _flattened(good))
             case _ if failed is not None:
                 if isinstance(node, Call):
                     self._tell("skipped", node, because=failed.label)
                 self._settle(node, failed)
-            case Gather():
-                self._settle(node, _flattened(values))
             case Item():
                 self._settle(node, values[0][node.index])
+            case Stored():
+                self._settle(node, node.value)
             case Expand():
                 self._expand(node, values)
             case Call():
                 self._call(node)
+
+    def _gathered(self, node: Gather, failed: Failure | None) -> Value | Failure:
+        whole = [row for row in node.rows if not any(isinstance(self._values[n], Failure) for n in row)]
+        if failed is not None and (node.on_error == "fail" or not whole):
+            return failed
+        return _flattened([self._values[row[node.position]] for row in whole])
 
     def _expand(self, node: Expand, values: Sequence[Any]) -> None:
         arguments = [self._store.get(v) if node.loads and isinstance(v, str) else len(v) for v in values]

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from ss_flow.cache import codec
+from ss_flow.cache.canonical import digest
+from ss_flow.cache.file_digests import FileDigests
+from ss_flow.cache.store import Action, Store, write_atomically
+from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, Metrics, PointCloud
+
+arrays = hnp.arrays(np.float32, hnp.array_shapes(min_dims=2, max_dims=2, min_side=0, max_side=5).map(lambda s: (s[0], 3)))
+
+
+@given(arrays, st.floats(allow_nan=False), st.floats(allow_nan=False))
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_is_stored_reads_back_equal_to_the_bit(store, points, unit, spacing):
+    cloud = PointCloud(points, np.zeros(points.shape, np.uint8), unit, spacing)
+    object_digest = store.put(cloud)
+    back = Store(store.root).get(object_digest)
+    assert digest(back) == object_digest
+    assert back.points.shape == points.shape
+    assert isinstance(back.unit, float)
+
+
+def test_texts_flags_tuples_and_tables_survive(store):
+    cameras = Cameras(("a", "ü"), np.ones((2, 2), np.int32), np.ones((2, 4)), np.ones((2, 4, 4)), True)
+    back = Store(store.root).get(store.put(cameras))
+    assert (back.names, back.metric) == (("a", "ü"), True)
+    metrics = Metrics({"miou": 0.5, "psnr": 30.0})
+    assert Store(store.root).get(store.put(metrics)) == metrics
+
+
+def test_arrays_come_back_read_only(store):
+    value = Store(store.root).get(store.put(LabelMap("x", np.ones((2, 2), np.uint16))))
+    with pytest.raises(ValueError, match="read-only"):
+        value.ids[0, 0] = 2
+
+
+def test_storing_the_same_twice_writes_once(store):
+    value = LabelMap("x", np.ones((2, 2), np.uint16))
+    first = store.put(value)
+    before = store.object_path(first).stat().st_mtime_ns
+    assert store.put(value) == first
+    assert store.object_path(first).stat().st_mtime_ns == before
+
+
+def test_a_writer_that_loses_the_race_takes_it_as_a_hit(store, monkeypatch):
+    value = LabelMap("x", np.ones((2, 2), np.uint16))
+    write = codec.write
+
+    def slow(content, folder):
+        write(content, folder)
+        monkeypatch.setattr(codec, "write", write)
+        Store(store.root).put(value)
+
+    monkeypatch.setattr(codec, "write", slow)
+    assert store.put(value) in store
+    assert list((store.root / "tmp").iterdir()) == []
+
+
+def test_a_failed_write_leaves_nothing_behind(store, monkeypatch):
+    def full(content, folder):
+        folder.mkdir()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(codec, "write", full)
+    value = LabelMap("x", np.ones((2, 2), np.uint16))
+    with pytest.raises(OSError, match="No space"):
+        store.put(value)
+    assert list((store.root / "tmp").iterdir()) == []
+    assert digest(value) not in store
+
+
+def test_an_action_counts_only_while_its_outputs_are_there(store):
+    import shutil
+
+    output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    action = Action("ab" * 32, "step", (output,), False, {"parameters": {"p": 1}}, 1.5, 10.0)
+    store.record(action)
+    assert store.action(action.key) == action
+    shutil.rmtree(store.object_path(output))
+    assert store.action(action.key) is None
+    assert store.action(action.key, whole=False) == action
+
+
+def test_an_unknown_object_is_a_key_error(store):
+    with pytest.raises(KeyError):
+        store.get("00" * 32)
+
+
+def test_an_object_of_a_foreign_type_is_refused():
+    with pytest.raises(ValueError, match="foreign"):
+        codec.type_named("subprocess:Popen")
+
+
+def test_only_dataclasses_of_arrays_and_plain_data_are_stored(store):
+    with pytest.raises(TypeError, match="only dataclasses"):
+        codec.write([1, 2], store.root / "tmp" / "x")
+    with pytest.raises(TypeError, match="neither an array nor plain"):
+        codec.write(Metrics({"a": object()}), store.root / "tmp" / "y")  # type: ignore[dict-item]
+
+
+def test_memory_holds_no_more_than_its_share(tmp_path):
+    store = Store(tmp_path, memory_bytes=40_000)
+    digests = [store.put(LabelMap(str(i), np.full((50, 50), i, np.uint16))) for i in range(20)]
+    for object_digest in digests:
+        store.get(object_digest)
+    assert store._held <= 40_000
+
+
+def test_large_arrays_are_chunked_and_gaussians_keep_their_ids(store):
+    n = 400_000
+    gaussians = Gaussians(
+        *(np.random.default_rng(0).random(s, np.float32) for s in ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3))),
+        np.arange(n, dtype=np.int32),
+        np.ones(n, np.float32),
+        np.zeros(n, np.int32),
+    )
+    object_digest = store.put(gaussians)
+    chunks = list((store.object_path(object_digest) / "means" / "c").rglob("*"))
+    assert sum(c.is_file() for c in chunks) == 2
+    assert np.array_equal(Store(store.root).get(object_digest).instance_id, gaussians.instance_id)
+
+
+def test_what_a_killed_writer_left_is_swept_by_age(store):
+    (store.root / "tmp" / "old").mkdir()
+    assert store.sweep_temporaries(60, time.time()) == 0
+    assert store.sweep_temporaries(60, time.time() + 120) == 1
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
+    target = tmp_path / "x.json"
+    write_atomically(target, "old")
+
+    def crash(handle):
+        raise OSError("power cut")
+
+    monkeypatch.setattr(os, "fsync", crash)
+    with pytest.raises(OSError, match="power cut"):
+        write_atomically(target, "new")
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["x.json"]
+
+
+def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
+    from ss_flow.cache import file_digests
+
+    reads = []
+    real = file_digests.digest_file
+    monkeypatch.setattr(file_digests, "digest_file", lambda p: reads.append(p) or real(p))
+    photo = tmp_path / "photo"
+    photo.write_text("one")
+    first = FileDigests(tmp_path / "files.json")
+    value = first(photo)
+    first.save()
+    again = FileDigests(tmp_path / "files.json")
+    assert again(photo) == value
+    assert len(reads) == 1
+    photo.write_text("another")
+    assert again(photo) != value
+    FileDigests(tmp_path / "files.json", verify=True)(photo)
+    assert len(reads) == 3
+
+
+def test_a_damaged_table_of_files_is_learnt_again(tmp_path):
+    (tmp_path / "files.json").write_text("{")
+    (tmp_path / "photo").write_text("one")
+    assert len(FileDigests(tmp_path / "files.json")(tmp_path / "photo")) == 64

@@ -1,0 +1,47 @@
+"""The four floors: imports go only downwards."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FLOORS = {"cache": "ss_flow.cache", "ss_flow": "ss_flow", "tasks": "ss_flow.tasks", "flows": "ss_flow.flows"}
+ORDER = list(FLOORS)
+HEAVY = {"torch", "cv2", "scipy", "open3d", "onnxruntime", "onnx", "pycolmap", "zarr", "matplotlib", "jinja2"}
+
+
+def floor_of(module: str) -> str | None:
+    """The floor that a module stands on; the longest prefix wins."""
+    for folder, package in sorted(FLOORS.items(), key=lambda item: -len(item[1])):
+        if module == package or module.startswith(package + "."):
+            return folder
+    return None
+
+
+def imported(tree: ast.AST):
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module
+
+
+SOURCES = [(folder, path) for folder in FLOORS for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+@pytest.mark.parametrize(("folder", "path"), SOURCES, ids=[str(p.relative_to(ROOT)) for _, p in SOURCES])
+def test_a_module_imports_only_from_its_own_floor_and_those_below(folder, path):
+    above = ORDER[ORDER.index(folder) + 1 :]
+    found = [m for m in imported(ast.parse(path.read_text())) if floor_of(m) in above]
+    assert not found, f"{path.name} on floor {folder} imports {found}"
+
+
+@pytest.mark.parametrize(("folder", "path"), SOURCES, ids=[str(p.relative_to(ROOT)) for _, p in SOURCES])
+def test_no_module_imports_a_heavy_library_when_it_is_imported(folder, path):
+    tree = ast.parse(path.read_text())
+    top = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
+    heavy = [m for m in imported(top) if m.partition(".")[0] in HEAVY]
+    assert not heavy, f"{path.name} imports {heavy} at its top"
