@@ -1,0 +1,135 @@
+"""The first part of the DAG: any layout of files -> frames, cameras, depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ss_flow.errors import InputError
+from ss_flow.graph import each
+from ss_flow.task import FileRef
+from ss_flow.tasks.capture import depth as depth_steps
+from ss_flow.tasks.capture import ingest, recordings
+from ss_flow.tasks.capture.mono import mono
+from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.capture.sfm import registered, sfm
+from ss_flow.tasks.models.catalogue import Model
+
+from ss_flow.flows.params import CaptureParams
+
+Reference = Callable[[Path], FileRef]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Nodes of a capture: what every later step starts from."""
+
+    frames: Any
+    """tuple[Frame, ...]"""
+    cameras: Any
+    depths: Any
+    """tuple[DepthMap, ...]"""
+    masks: Any | None
+    """tuple[MaskSet, ...] where the capture brought its own masks."""
+    truth: Any | None
+    """tuple[LabelMap, ...] where it is annotated."""
+    names: tuple[str, ...] | None
+    """Names of the views where they are known beforehand."""
+
+
+def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, monodepth: Model | None) -> Capture:
+    """Add the nodes that read a capture.
+
+    reference: turns a path into a file reference (digests are remembered outside the flow).
+    Raises InputError when the depth that the parameters ask for cannot be had.
+    """
+    frames = _frames(scene, reference, params)
+    if scene.poses is not None and scene.lenses is not None:
+        cameras = ingest.cameras(
+            frames,
+            names=scene.names,
+            lenses=scene.lenses,
+            poses=scene.poses,
+            metric=scene.metric,
+            sparse=reference(scene.sparse) if scene.sparse else None,
+        )
+    else:
+        cameras = sfm(frames, params=params.sfm)
+        frames = registered(frames, cameras)
+    names = scene.names if scene.poses is not None else None
+    masks = truth = None
+    if scene.ready_masks is not None:
+        masks = ingest.ready_masks(frames, names=scene.names, files=_all(reference, scene.ready_masks), lenses=scene.lenses)
+    if scene.ground_truth is not None:
+        truth = ingest.ground_truth(frames, names=scene.names, files=_all(reference, scene.ground_truth), lenses=scene.lenses)
+    depths = _depths(scene, reference, params, monodepth, frames, cameras, names)
+    return Capture(frames, cameras, depths, masks, truth, names)
+
+
+def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> Any:
+    if scene.kind == "video":
+        assert scene.recording is not None
+        return recordings.video_frames(video=reference(scene.recording), params=params.video)
+    if scene.kind == "sens":
+        assert scene.recording is not None
+        return recordings.sens_frames(
+            recording=reference(scene.recording), names=scene.names, entries=scene.entries, params=params.ingest
+        )
+    return ingest.frames(
+        names=scene.names,
+        photos=_all(reference, scene.photos),
+        valid=_all(reference, scene.valid),
+        lenses=scene.lenses,
+        params=params.ingest,
+    )
+
+
+def _depths(
+    scene: SceneFiles,
+    reference: Reference,
+    params: CaptureParams,
+    monodepth: Model | None,
+    frames: Any,
+    cameras: Any,
+    names: tuple[str, ...] | None,
+) -> Any:
+    """Sensor depth where there is some; otherwise a plane sweep over several views; or a network, when asked for."""
+    sensor = scene.depths is not None or scene.kind == "sens"
+    source = params.depth
+    if source == "auto":
+        source = "sensor" if sensor else "mvs"
+    if source == "sensor":
+        if scene.kind == "sens" and scene.recording is not None:
+            return recordings.sens_depth(
+                frames, recording=reference(scene.recording), names=scene.names, entries=scene.entries
+            )
+        if scene.depths is None:
+            raise InputError(f"{scene.root} has no depth files; set capture.depth to mvs or mono.")
+        return ingest.depth(
+            frames,
+            names=scene.names,
+            files=_all(reference, scene.depths),
+            scale=scene.depth_scale,
+            metric=scene.metric,
+            lenses=scene.lenses,
+            depth_lens=scene.depth_lens,
+        )
+    if source == "mono" and monodepth is None:
+        raise InputError("capture.depth=mono needs a monocular depth network; `ss-flow models list` names some.")
+    swept = each(
+        frames, names=names, build=lambda frame: depth_steps.sweep(frames, cameras, view=frame.index, params=params.sweep)
+    )
+    agreed = depth_steps.agree(swept, cameras, params=params.agreement)
+    if source == "mvs" or monodepth is None:
+        return agreed
+    # What several views agree on gives the network's depth its scale.
+    network = monodepth.file("model")
+    return each(
+        frames, names=names, build=lambda frame: mono(frame, cameras, agreed, model=network, params=params.mono)
+    )
+
+
+def _all(reference: Reference, paths: Sequence[Path | None]) -> tuple[Any, ...]:
+    return tuple(reference(path) if path else None for path in paths)

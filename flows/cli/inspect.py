@@ -1,0 +1,242 @@
+"""Looking at runs and at what they left: status, why, graph, cache ls, cache show."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from ss_flow.cache.store import Store
+from ss_flow.errors import InputError
+from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.runs import Run, latest_runs
+
+Options = tyro.conf.OmitArgPrefixes[StoreOptions]
+
+
+@dataclass(frozen=True)
+class Status:
+    """Tell what the latest run did, step by step; also while it runs."""
+
+    scene: Annotated[Path | None, tyro.conf.Positional] = None
+    """Only runs of this scene."""
+    json: bool = False
+    """Print one JSON document."""
+    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+
+    def run(self) -> int:
+        run = latest_run(self.store.open_store(), self.scene)
+        events = list(run.events())
+        steps: dict[str, dict[str, Any]] = defaultdict(
+            lambda: {"hit": 0, "finished": 0, "failed": 0, "skipped": 0, "running": 0, "seconds": 0.0}
+        )
+        for event in events:
+            row = steps[event["step"]] if "step" in event else {}
+            if event["event"] == "started":
+                row["running"] += 1
+            elif event["event"] in row:
+                row[event["event"]] += 1
+                row["running"] -= event["event"] in ("finished", "failed") and row["running"] > 0
+                row["seconds"] += event["seconds"] if event["event"] == "finished" else 0.0
+        ended = next((e for e in reversed(events) if e["event"] == "run ended"), None)
+        state = _state(ended, events)
+        document = {"scene": run.scene, "started": run.header["started"], "state": state, "steps": steps}
+        if self.json:
+            print(json.dumps(document, indent=1))
+            return 0
+        out = console(json=False)
+        out.print(f"{run.scene}: {state}, started {time.strftime('%F %T', time.localtime(run.header['started']))}")
+        table = Table("step", "reused", "computed", "running", "failed", "seconds", box=None)
+        for step, row in steps.items():
+            counts = (row["hit"], row["finished"], row["running"], row["failed"] + row["skipped"])
+            table.add_row(step, *(str(n or "") for n in counts), f"{row['seconds']:.1f}" if row["seconds"] else "")
+        out.print(table)
+        return 0
+
+
+def _state(ended: dict[str, Any] | None, events: list[dict[str, Any]]) -> str:
+    if ended is None:
+        silent = time.time() - events[-1]["time"] if events else 0.0
+        return f"running, or killed; last heard of {silent:.0f} s ago"
+    if ended.get("interrupted"):
+        return "interrupted"
+    return f"done, {ended['failed']} failed" if ended["failed"] else "done"
+
+
+@dataclass(frozen=True)
+class Why:
+    """Tell why a step ran in the latest run: the first part of its key that had changed, back to the first cause."""
+
+    step: Annotated[str, tyro.conf.Positional]
+    """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
+    scene: Annotated[Path | None, tyro.conf.Positional] = None
+    """The scene; the one that ran last, when left out."""
+    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+
+    def run(self) -> int:
+        run = latest_run(self.store.open_store(), self.scene)
+        nodes = [e for e in run.events() if e["event"] in ("hit", "finished", "failed", "started")]
+        asked = [n for n in nodes if _is_named(n, self.step)]
+        if not asked:
+            known = sorted({n["step"] for n in nodes})
+            raise InputError(f"the latest run of {run.scene} has no step {self.step!r}; it has {', '.join(known)}.")
+        out = console(json=False)
+        computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
+        if not computed:
+            out.print(f"{asked[0]['step']}: reused; nothing that it depends on changed")
+            return 0
+        reasons = list(dict.fromkeys(n["why"] for n in computed))
+        for reason in reasons[:5]:
+            these = [n for n in computed if n["why"] == reason]
+            out.print(f"{these[0]['label'] if len(these) == 1 else these[0]['step']}: {reason}{_times(these)}")
+            for cause in _causes(these[0], nodes):
+                out.print(f"  because {cause}")
+        return 0
+
+
+def _is_named(node: dict[str, Any], name: str) -> bool:
+    return name in (node["label"], node["step"]) or node["label"].endswith(f".{name}") or node["step"].endswith(f".{name}")
+
+
+def _times(nodes: list[dict[str, Any]]) -> str:
+    return f" ({len(nodes)} of them)" if len(nodes) > 1 else ""
+
+
+def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:
+    """From a changed input back, step by step, to the change that began it."""
+    found: list[str] = []
+    seen = {node["step"]}
+    while (why := node.get("why", "")).startswith("input "):
+        producer = node.get("inputs", {}).get(why.split()[1])
+        changed = [n for n in nodes if n["step"] == producer and "why" in n and n["event"] == "finished"]
+        if not changed or producer in seen:
+            break
+        node = changed[0]
+        seen.add(node["step"])
+        found.append(f"{node['step']}: {node['why']}")
+    return found
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Draw what feeds what in the latest run, a box a step, in Mermaid's notation."""
+
+    scene: Annotated[Path | None, tyro.conf.Positional] = None
+    """The scene; the one that ran last, when left out."""
+    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+
+    def run(self) -> int:
+        run = latest_run(self.store.open_store(), self.scene)
+        counts: dict[str, int] = defaultdict(int)
+        edges: dict[tuple[str, str, str], None] = {}
+        for node in run.nodes():
+            counts[node["step"]] += 1
+            for name, producer in node["inputs"].items():
+                edges[producer, name, node["step"]] = None
+        print("flowchart TD")
+        for step, count in counts.items():
+            print(f'  {step}["{step}{f" x {count}" if count > 1 else ""}"]')
+        for producer, name, step in edges:
+            if producer in counts and producer != step:
+                print(f"  {producer} -->|{name}| {step}")
+        return 0
+
+
+@dataclass(frozen=True)
+class CacheList:
+    """List what the latest run left in the store: a line a result."""
+
+    scene: Annotated[Path | None, tyro.conf.Positional] = None
+    """The scene; the one that ran last, when left out."""
+    json: bool = False
+    """Print one JSON document."""
+    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+
+    def run(self) -> int:
+        store = self.store.open_store()
+        rows = []
+        for node in latest_run(store, self.scene).nodes():
+            size = sum(f.stat().st_size for d in node["outputs"] for f in store.object_path(d).rglob("*") if f.is_file())
+            rows.append({k: node[k] for k in ("label", "key", "outputs", "seconds")} | {"bytes": size})
+        if self.json:
+            print(json.dumps(rows, indent=1))
+            return 0
+        table = Table("result", "digest", "items", "kB", "seconds", box=None)
+        for row in rows:
+            first = row["outputs"][0][:12] if row["outputs"] else ""
+            table.add_row(
+                row["label"], first, str(len(row["outputs"])), f"{row['bytes'] / 1000:.0f}", f"{row['seconds']:.1f}"
+            )
+        console(json=False).print(table)
+        return 0
+
+
+@dataclass(frozen=True)
+class CacheShow:
+    """Describe one result, or draw it as a picture."""
+
+    what: Annotated[str, tyro.conf.Positional]
+    """A step of the latest run (propagate, segment[0003]), or the first characters of a digest."""
+    png: Path | None = None
+    """Write a picture of it to this file."""
+    view: int = 0
+    """Draw points and Gaussians as this view's camera sees them."""
+    scene: Path | None = None
+    """The scene; the one that ran last, when left out."""
+    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+
+    def run(self) -> int:
+        store = self.store.open_store()
+        values = [store.get(digest) for digest in self._digests(store)]
+        out = console(json=False)
+        for value in values[:1] if len(values) > 8 else values:
+            out.print(f"[bold]{type(value).__name__}[/]")
+            for item in dataclasses.fields(value):
+                out.print(f"  {item.name}: {_described(getattr(value, item.name))}")
+        if len(values) > 8:
+            out.print(f"... and {len(values) - 1} more")
+        if self.png:
+            from ss_flow.flows.cli.drawing import draw_results
+
+            draw_results(store, latest_run(store, self.scene), values, self.view, self.png)
+            out.print(f"drawn to {self.png}")
+        return 0
+
+    def _digests(self, store: Store) -> list[str]:
+        try:
+            nodes = [n for n in latest_run(store, self.scene).nodes() if _is_named(n, self.what)]
+        except InputError:
+            nodes = []
+        if nodes:
+            return [digest for node in nodes for digest in node["outputs"]]
+        found = store.find(self.what)
+        if len(found) == 1:
+            return found
+        problem = f"stands for {len(found)} results" if found else "is neither a step of the latest run nor a digest"
+        raise InputError(f"{self.what!r} {problem}; `ss-flow cache ls` lists what there is.")
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        span = f", {value.min():.6g} .. {value.max():.6g}" if value.size and value.dtype.kind in "iuf" else ""
+        return f"{value.dtype} {list(value.shape)}{span}"
+    text = str(value)
+    return text if len(text) < 200 else f"{text[:197]}..."
+
+
+def latest_run(store: Store, scene: Path | None) -> Run:
+    """The latest run of a scene, or of any. Raises InputError when there is none."""
+    wanted = str(scene.resolve()) if scene else None
+    run = next(latest_runs(store.root / "roots" / "runs", wanted), None)
+    if run is None:
+        about = f" of {scene}" if scene else ""
+        raise InputError(f"the store {store.root} knows no run{about}; `ss-flow run SCENE` makes one.")
+    return run

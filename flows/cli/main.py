@@ -1,0 +1,89 @@
+"""The command line: `ss-flow COMMAND ...`.
+
+Exit codes: 0 done, 1 failed, 2 bad usage or bad input, 3 done but degraded, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+# Tasks run side by side, one a core: a library that starts threads of its own only gets in their way. To be set
+# before the first of them is imported.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+from ss_flow.errors import InputError  # noqa: E402
+from ss_flow.flows.cli.inspect import CacheList, CacheShow, Graph, Status, Why  # noqa: E402
+from ss_flow.flows.cli.query import Query  # noqa: E402
+from ss_flow.flows.cli.run import Demo, Run  # noqa: E402
+from ss_flow.flows.cli.setup import Doctor, ModelsFetch, ModelsList, ModelsVerify  # noqa: E402
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+_sub = tyro.conf.subcommand
+Cache = (
+    Annotated[CacheList, _sub("ls", description="List what the store holds.")]
+    | Annotated[CacheShow, _sub("show", description="Describe or draw one result.")]
+)
+Models = (
+    Annotated[ModelsList, _sub("list", description="List the networks that can be used, and which are here.")]
+    | Annotated[ModelsFetch, _sub("fetch", description="Download a network's weights.")]
+    | Annotated[ModelsVerify, _sub("verify", description="Check a network's weights against their digests.")]
+)
+
+
+def _commands() -> dict[str, object]:
+    return {
+        "demo": Demo,
+        "run": Run,
+        "status": Status,
+        "why": Why,
+        "graph": Graph,
+        "query": Query,
+        "cache": Cache,
+        "models": Models,
+        "doctor": Doctor,
+    }
+
+
+def main(arguments: list[str]) -> int:
+    """Run one command; return the exit code."""
+    errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    try:
+        command = tyro.extras.subcommand_cli_from_dict(
+            _commands(),  # type: ignore[arg-type]
+            prog="ss-flow",
+            description="From a capture to instance-labelled 3D Gaussians; nothing is computed twice.",
+            args=arguments,
+            sort_subcommands=False,
+        )
+        return int(command.run())  # type: ignore[attr-defined]
+    except InputError as error:
+        errors.print(f"[red]ss-flow:[/] {error}", markup=True)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        errors.print("[yellow]ss-flow: interrupted; what was finished is kept, and the next run goes on from it.[/]")
+        return INTERRUPTED
+    except BrokenPipeError:
+        return 0
+    except Exception as error:
+        if os.environ.get("SS_FLOW_DEBUG"):
+            raise
+        errors.print(f"[red]ss-flow:[/] failed: {type(error).__name__}: {error}", markup=False)
+        errors.print("Set SS_FLOW_DEBUG=1 to see where.")
+        return FAILED
+
+
+def entry() -> None:
+    """The console script."""
+    code = main(sys.argv[1:])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if code == INTERRUPTED:
+        os._exit(code)  # a task in the middle of native code cannot be told to stop; the store is safe
+    sys.exit(code)

@@ -1,0 +1,105 @@
+"""`ss-flow query`: which instances a text means."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.table import Table
+
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+from ss_flow.errors import InputError
+from ss_flow.flows.cli.context import StoreOptions, choose_model, console, file_digests
+from ss_flow.graph import stored
+from ss_flow.scheduler import Failure
+from ss_flow.tasks.deliver.output import RUN_FILE
+from ss_flow.tasks.semantics.query import query
+
+
+@dataclass(frozen=True)
+class Query:
+    """Find the instances of a result that a text describes."""
+
+    result: Annotated[Path, tyro.conf.Positional]
+    """The output folder of a run."""
+    text: Annotated[str, tyro.conf.Positional]
+    """What to look for, such as "red mug"."""
+    tau_corr: float | None = None
+    """How much further than the best an instance may be and still match; the run's own value when left out."""
+    json: bool = False
+    """Print one JSON document."""
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()  # noqa: RUF009 - frozen
+
+    def run(self) -> int:
+        document = read_run(self.result)
+        own_store = self.store if self.store.cache else StoreOptions(Path(document["store"]))
+        store = own_store.open_store()
+        descriptors = tuple(document["results"]["describe"])
+        if not all(value in store for value in descriptors):
+            raise InputError(f"the store {store.root} no longer holds the descriptors of {self.result}; run it again.")
+        tau_corr = document["params"]["semantics.query.tau_corr"] if self.tau_corr is None else self.tau_corr
+        if not 0 <= tau_corr <= 2:
+            raise InputError(f"--tau-corr {tau_corr} is out of range; it must be between 0 and 2.")
+        digests = file_digests(store)
+        encoder = choose_model("text-image", _encoder_name(store, descriptors), digests)
+        digests.save()
+        report = run_flow(
+            lambda: {
+                "query": query(stored("describe", descriptors), text=self.text, tau_corr=tau_corr, encoder=encoder)
+            },
+            store,
+            scene=f"{document['scene']}?{self.text}",
+            header={},
+        )
+        value = report.values["query"]
+        if isinstance(value, Failure):
+            raise value.error
+        assert isinstance(value, str)
+        self._tell(store.get(value), json.loads((self.result / "instances.json").read_text()))
+        return 0
+
+    def _tell(self, found: Any, instances: dict[str, Any]) -> None:
+        names = {entry["id"]: entry["name"] for entry in instances["instances"]}
+        rows = [
+            {
+                "id": int(found.instance_id[i]),
+                "name": names.get(int(found.instance_id[i]), ""),
+                "score": round(float(found.score[i]), 4),
+                "delta": round(float(found.delta[i]), 4),
+                "matched": bool(found.matched[i]),
+            }
+            for i in range(len(found.instance_id))
+        ]
+        if self.json:
+            print(json.dumps({"text": found.text, "encoder": found.encoder, "instances": rows}))
+            return
+        out = console(json=False)
+        if not found.accepted:
+            out.print(f"nothing in the scene matches {found.text!r} ({found.encoder}); the nearest are:")
+        table = Table("", "id", "name", "score", "delta", box=None)
+        for row in rows[:10]:
+            mark = "[green]match[/]" if row["matched"] else ""
+            table.add_row(mark, str(row["id"]), row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}")
+        out.print(table)
+
+
+def _encoder_name(store: Store, descriptors: tuple[str, ...]) -> str:
+    """The text must be read by the network that described the instances."""
+    from ss_flow.tasks.models.colour_words import ColourWords
+
+    name = store.get(descriptors[0]).encoder if descriptors else ColourWords.name
+    return "none" if name == ColourWords.name else str(name)
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """The document run.json of an output folder. Raises InputError when there is none."""
+    try:
+        return dict(json.loads((folder / RUN_FILE).read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        raise InputError(f"{folder} is not the output folder of a run: it has no {RUN_FILE}.") from None
+    except ValueError as error:
+        raise InputError(f"{folder / RUN_FILE} is damaged ({error}); run the scene again.") from None

@@ -1,0 +1,155 @@
+"""What this machine has: networks, libraries, compilers' work."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+from rich.table import Table
+
+from ss_flow.errors import InputError
+from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.tasks.models import catalogue
+
+
+@dataclass(frozen=True)
+class ModelsList:
+    """List the networks that can be used, and which are here."""
+
+    json: bool = False
+    """Print one JSON document."""
+
+    def run(self) -> int:
+        rows = []
+        for entry in catalogue.load_catalogue().values():
+            model = catalogue.find(entry.name)
+            where = str(model.files[0].ref.path.parent) if model else ""
+            rows.append(
+                {
+                    "name": entry.name,
+                    "kind": entry.kind,
+                    "licence": entry.licence,
+                    "about": entry.about,
+                    "source": entry.hub or f"npm:{entry.npm}",
+                    "here": where,
+                }
+            )
+        if self.json:
+            print(json.dumps(rows, indent=1))
+            return 0
+        table = Table("name", "kind", "licence", "source", "here", box=None)
+        for row in rows:
+            table.add_row(*(row[k] for k in ("name", "kind", "licence", "source")), row["here"] or "[dim]no[/]")
+        console(json=False).print(table)
+        return 0
+
+
+@dataclass(frozen=True)
+class ModelsFetch:
+    """Download a network's weights into the user's cache folder."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Name in the catalogue."""
+
+    def run(self) -> int:
+        from ss_flow.tasks.models.fetch import fetch
+
+        model = fetch(self.name)
+        console(json=False).print(f"{model.name} is in {model.files[0].ref.path.parent}")
+        return 0
+
+
+@dataclass(frozen=True)
+class ModelsVerify:
+    """Check the weights that are here against their digests."""
+
+    name: Annotated[str | None, tyro.conf.Positional] = None
+    """Name in the catalogue; all that are here, when left out."""
+
+    def run(self) -> int:
+        names = [self.name] if self.name else list(catalogue.load_catalogue())
+        found = [model for model in map(catalogue.find, names) if model]
+        if self.name and not found:
+            raise InputError(f"the weights of {self.name!r} are not on this machine.")
+        for model in found:
+            catalogue.verify(model)
+            console(json=False).print(f"{model.name}: as they should be")
+        return 0
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Tell whether this machine has all that runs need, and what to do where it has not."""
+
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()  # noqa: RUF009 - frozen
+
+    def run(self) -> int:
+        checks: list[tuple[str, Callable[[], str]]] = [
+            ("Python", lambda: sys.version.split()[0]),
+            ("store", lambda: str(self.store.open_store().root)),
+            ("rasterizer", _rasterizer),
+            ("CUDA", _cuda),
+            ("Open3D", lambda: str(_open3d())),
+            *((name, lambda n=name, m=module: _library(n, m)) for name, module in _LIBRARIES),
+            *((f"{kind} network", lambda k=kind: _model(k)) for kind in ("segmenter", "text-image", "monodepth")),
+        ]
+        table = Table("what", "state", box=None)
+        bad = 0
+        for name, check in checks:
+            try:
+                table.add_row(name, check())
+            except Exception as error:
+                bad += 1
+                table.add_row(name, f"[red]{error}[/]")
+        console(json=False).print(table)
+        return 1 if bad else 0
+
+
+_LIBRARIES = (
+    ("torch", "torch"),
+    ("pycolmap", "pycolmap"),
+    ("opencv-contrib-python-headless", "cv2"),
+    ("onnxruntime", "onnxruntime"),
+    ("zarr", "zarr"),
+)
+
+
+def _library(distribution: str, module: str) -> str:
+    import zlib  # noqa: F401 - must be loaded before pycolmap brings its own
+
+    importlib.import_module(module)
+    return importlib.metadata.version(distribution)
+
+
+def _open3d() -> str:
+    from ss_flow.tasks.geometry.open3d import load_open3d
+
+    return str(load_open3d().__version__)
+
+
+def _rasterizer() -> str:
+    from ss_flow.tasks.gaussians.rasterize import backend_identity
+
+    return ", ".join(f"{name} {value}" for name, value in backend_identity().items())
+
+
+def _cuda() -> str:
+    import torch
+
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "none; the CPU does everything"
+
+
+def _model(kind: str) -> str:
+    fallback = {
+        "segmenter": "none; colour, depth and normals segment instead",
+        "text-image": "none; colour words answer queries instead",
+        "monodepth": "none; depth comes from the sensor or from several views",
+    }
+    here = catalogue.available(kind)
+    return ", ".join(entry.name for entry in here) if here else fallback[kind]

@@ -1,0 +1,140 @@
+"""From the results in the store to run.json and the output folder."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ss_flow.cache.canonical import digest
+from ss_flow.cache.store import Store, write_atomically
+from ss_flow.closure import code_closure
+from ss_flow.engine import Report
+from ss_flow.flows import settings
+from ss_flow.flows.params import Params
+from ss_flow.flows.split_splat import Networks
+from ss_flow.scheduler import Failure
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, UInt8
+from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_cloud, write_masks, write_scene
+
+STATUS_EXIT = {"ok": 0, "degraded": 3, "failed": 1}
+METRICS = {"metrics_split": "split", "metrics_splat": "splat", "novel_view": "novel_view"}
+FALLBACKS = {
+    "segmenter": "colour, depth and normals (no network)",
+    "encoder": "colour words (no network)",
+    "monodepth": None,
+}
+
+
+def run_document(store: Store, scene: SceneFiles, params: Params, networks: Networks, report: Report) -> dict[str, Any]:
+    """The document run.json: what was run, with what, what came of it."""
+    wanted = {name: value for name, value in report.values.items() if not isinstance(value, Failure)}
+    status = "failed" if len(wanted) < len(report.values) else "degraded" if report.failures else "ok"
+    models = {
+        role: model.name if (model := getattr(networks, role)) else fallback for role, fallback in FALLBACKS.items()
+    }
+    if scene.ready_masks:
+        models["segmenter"] = "ready-made masks"
+    return {
+        "status": status,
+        "scene": str(scene.root),
+        "params": settings.flat(params),
+        "models": models,
+        "metrics": {
+            METRICS[name]: store.get(value).values
+            for name, value in wanted.items()
+            if name in METRICS and isinstance(value, str)
+        },
+        "nodes": [
+            {
+                "step": node["step"],
+                "item": node["item"],
+                "key": node["key"],
+                "outputs": node["outputs"],
+                "hit": node["event"] == "hit",
+                "seconds": node["seconds"],
+                "peak_rss_mb": node["peak_rss_mb"],
+                "warnings": node["warnings"],
+            }
+            for node in report.nodes
+            if node["event"] in ("hit", "finished")
+        ],
+        "failures": [
+            {"label": failure.label, "error": f"{type(failure.error).__name__}: {failure.error}"}
+            for failure in report.failures
+        ],
+        "results": {name: value if isinstance(value, str) else list(value) for name, value in wanted.items()},
+        "store": str(store.root),
+    }
+
+
+def deliver(folder: Path, store: Store, document: dict[str, Any], report: Report) -> None:
+    """Write the output folder; where it already holds these very results, only run.json is renewed."""
+    results = document["results"]
+    document["content"] = digest({"results": results, "code": code_closure(write_all)})
+    if _content_of(folder) == document["content"]:
+        write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
+        return
+    with replacing(folder) as filling:
+        write_all(filling, store, document)
+        document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
+
+
+def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
+    """Write everything but run.json."""
+    from ss_flow.tasks.deliver.instances_json import instances_document
+    from ss_flow.tasks.deliver.report import report_html
+
+    results = document["results"]
+
+    def one(name: str) -> Any:
+        return store.get(results[name])
+
+    def several(name: str) -> list[Any]:
+        return [store.get(value) for value in results[name]]
+
+    frames, cameras, scene = several("ingest"), one("cameras"), one("scene")
+    split_maps, maps = several("masks_split"), several("masks")
+    instances = instances_document(
+        several("refine"), [frame.name for frame in frames], gaussians=scene, names=one("names")
+    )
+    write_scene(folder, scene, instances)
+    write_cloud(folder, one("dense"), one("propagate"))
+    write_masks(folder / "masks_split", frames, split_maps)
+    write_masks(folder / "masks", frames, maps)
+    pictures = report_pictures(frames, cameras, several("depth"), split_maps, maps, scene)
+    (folder / "report.html").write_text(
+        report_html(document, pictures=pictures, instances=instances), encoding="utf-8"
+    )
+
+
+def report_pictures(
+    frames: Sequence[Frame],
+    cameras: Cameras,
+    depths: Sequence[DepthMap],
+    split_maps: Sequence[LabelMap],
+    maps: Sequence[LabelMap],
+    scene: Gaussians,
+) -> dict[str, UInt8]:
+    """What the report shows: photo, masks, rendering and depth of three views, evenly chosen."""
+    from ss_flow.tasks.deliver.draw import draw
+
+    pictures: dict[str, UInt8] = {}
+    for view in sorted({round(part * (len(frames) - 1)) for part in (1 / 6, 1 / 2, 5 / 6)}):
+        frame = frames[view]
+        shown = {"photo": frame, "masks_split": split_maps[view], "masks": maps[view], "depth": depths[view]}
+        for kind, value in shown.items():
+            pictures[f"{frame.name}/{kind}"] = draw(value, frame=frame)
+        pictures[f"{frame.name}/render"] = draw(scene, cameras=cameras, view=view)
+    return pictures
+
+
+def _content_of(folder: Path) -> str | None:
+    try:
+        return json.loads((folder / RUN_FILE).read_text()).get("content")
+    except (FileNotFoundError, ValueError):
+        return None

@@ -1,0 +1,190 @@
+"""Ray casting of a generated room: colour with shadows, exact depth, exact instance ids."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ss_flow.flows.generated_layout import Thing
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, UInt8
+from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.open3d import load_open3d
+
+_PATTERNS = ("noise", "checks", "stripes", "planks")
+_GAMMA = 2.2
+_SUN = np.array([0.42, -0.5, 0.76]) / np.linalg.norm([0.42, -0.5, 0.76])
+_FILL = np.array([-0.7, 0.45, 0.35]) / np.linalg.norm([-0.7, 0.45, 0.35])
+_SUN_LIGHT = np.array([0.78, 0.74, 0.66])
+_FILL_LIGHT = np.array([0.12, 0.14, 0.17])
+_AMBIENT = np.array([0.36, 0.38, 0.41])
+_SENSOR_NOISE = 1.5
+"""Standard deviation of the colour noise, in 8-bit steps."""
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """Where a bundle of N rays met the room."""
+
+    depth: Float32
+    """[N] z-depth, metres."""
+    thing: Int32
+    """[N] index of the thing that was hit."""
+    normal: Float64
+    """[N, 3] shading normal, towards the viewer."""
+    lit: Bool
+    """[N] whether the sun reaches the place."""
+    color: Float64
+    """[N, 3] linear light."""
+
+
+class Renderer:
+    """Casts rays into a furnished room. Deterministic: the same room, camera and generator give the same image."""
+
+    def __init__(self, things: Sequence[Thing], seed: int) -> None:
+        o3d = load_open3d()
+        sizes = [len(t.mesh.vertices) for t in things]
+        starts = np.cumsum([0, *sizes[:-1]])
+        triangles = [t.mesh.triangles + s for t, s in zip(things, starts, strict=True)]
+        self._triangles = np.concatenate(triangles)
+        self._thing = np.repeat(np.arange(len(things), dtype=np.int32), [len(t) for t in triangles])
+        self._normals = np.concatenate([t.mesh.normals for t in things])
+        self._texture = np.concatenate([t.mesh.texture for t in things])
+        self._ids = np.array([t.instance_id for t in things], np.uint16)
+        vertices = np.concatenate([t.mesh.vertices for t in things]).astype(np.float32)
+        self._scene = _scene(o3d, vertices, self._triangles)
+        # The sun shines through the walls and the ceiling.
+        self._blockers = _scene(o3d, vertices, self._triangles[self._ids[self._thing] > 0])
+        self._to_tensor = o3d.core.Tensor
+        self._pattern = np.array([_PATTERNS.index(t.material.pattern) for t in things])
+        self._scale = np.array([t.material.scale for t in things])
+        self._shades = (np.array([t.material.shades for t in things]) / 255.0) ** _GAMMA
+        rng = np.random.default_rng(seed)
+        self._lattice = rng.random((32, 32, 32)).astype(np.float32)
+        self._offset = rng.uniform(0, 7, (len(things), 3))
+
+    def render(self, camera: Camera, rng: np.random.Generator) -> tuple[UInt8, Float32, NDArray[np.uint16]]:
+        """One view: rgb [H, W, 3], z-depth [H, W] in metres, instance ids [H, W], all through pixel centres.
+
+        Colour is averaged over five rays where a pixel holds an edge; depth and ids are those of the centre.
+        """
+        h, w = camera.height, camera.width
+        row, column = (n.ravel() for n in np.mgrid[:h, :w])
+        hits = self._cast(camera, column + 0.5, row + 0.5)
+        color = hits.color
+        edge = np.flatnonzero(_edges(hits, h, w))
+        for du, dv in ((-0.3, -0.1), (0.1, -0.3), (0.3, 0.1), (-0.1, 0.3)):
+            color[edge] += self._cast(camera, column[edge] + 0.5 + du, row[edge] + 0.5 + dv).color
+        color[edge] /= 5
+        image = 255 * np.clip(color, 0, 1) ** (1 / _GAMMA) + rng.normal(0, _SENSOR_NOISE, color.shape)
+        rgb = np.clip(np.round(image), 0, 255).astype(np.uint8).reshape(h, w, 3)
+        return rgb, hits.depth.reshape(h, w), self._ids[hits.thing].reshape(h, w)
+
+    def _cast(self, camera: Camera, u: Float64, v: Float64) -> _Hits:
+        local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=1)
+        direction = local @ camera.world_to_camera[:3, :3]
+        rays = np.concatenate([np.broadcast_to(camera.center, direction.shape), direction], axis=1)
+        answer = self._scene.cast_rays(self._to_tensor(rays.astype(np.float32)))
+        # The rays' directions have z = 1 in the camera, so the distance along them is the z-depth.
+        depth = answer["t_hit"].numpy()
+        triangle = answer["primitive_ids"].numpy().astype(np.intp)
+        second, third = answer["primitive_uvs"].numpy().T
+        weights = np.stack([1 - second - third, second, third], axis=1)
+        corners = self._triangles[triangle]
+        normal = _blend(self._normals, corners, weights)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal *= -np.sign(np.einsum("nd,nd->n", normal, direction))[:, None]
+        thing = self._thing[triangle]
+        place = camera.center + direction * depth[:, None]
+        lit = self._sunlit(place, normal)
+        albedo = self._albedo(_blend(self._texture, corners, weights), thing, depth / camera.fx)
+        light = (
+            _AMBIENT * (0.8 + 0.2 * normal[:, 2:])
+            + _SUN_LIGHT * (np.maximum(normal @ _SUN, 0) * lit)[:, None]
+            + _FILL_LIGHT * np.maximum(normal @ _FILL, 0)[:, None]
+        )
+        return _Hits(depth, thing, normal, lit, albedo * light)
+
+    def _sunlit(self, place: Float64, normal: Float64) -> Bool:
+        rays = np.concatenate([place + 0.004 * normal, np.broadcast_to(_SUN, place.shape)], axis=1)
+        blocked = self._blockers.test_occlusions(self._to_tensor(rays.astype(np.float32)))
+        return ~blocked.numpy()
+
+    def _albedo(self, place: Float64, thing: Int32, footprint: Float64) -> Float64:
+        """Linear colour of the solid textures. place: [N, 3] in each thing's frame; footprint: [N] metres a pixel."""
+        scale = self._scale[thing]
+        cell = place / scale[:, None] + self._offset[thing]
+        sharpness = np.clip(0.35 * scale / footprint, 0.3, 8)
+        mix = np.empty(len(place))
+        for kind in range(len(_PATTERNS)):
+            of_kind = self._pattern[thing] == kind
+            if of_kind.any():
+                mix[of_kind] = self._mix(kind, cell[of_kind], sharpness[of_kind])
+        grain = 0.86 + 0.28 * self._noise(cell * 2.3 + 5)
+        shades = self._shades[thing]
+        return (shades[:, 0] + (shades[:, 1] - shades[:, 0]) * mix[:, None]) * grain[:, None]
+
+    def _mix(self, kind: int, cell: Float64, sharpness: Float64) -> Float64:
+        """Share of the second shade, 0..1; edges are as soft as a pixel is large."""
+        pattern = _PATTERNS[kind]
+        if pattern == "noise":
+            return np.clip(1.8 * (0.65 * self._noise(cell) + 0.35 * self._noise(2.1 * cell + 9)) - 0.4, 0, 1)
+        if pattern == "planks":
+            plank = np.floor(cell[:, 0])
+            seam = np.abs(cell[:, 0] - plank - 0.5) > 0.5 - np.minimum(0.2 / sharpness, 0.05)
+            grain = self._noise(cell * (9.0, 0.6, 3.0) + plank[:, None] * (0.0, 11.3, 5.1))
+            tone = (np.sin(plank * 12.9898) * 43758.5453) % 1.0
+            return np.clip(0.55 * grain + 0.4 * tone + 0.4 * seam - 0.05, 0, 1)
+        wave = np.sin(np.pi * cell)
+        product = np.sin(np.pi * (cell @ (0.35, 0.35, 0.87))) if pattern == "stripes" else wave.prod(axis=1) * 1.6
+        return 0.5 + 0.5 * np.clip(product * sharpness, -1, 1)
+
+    def _noise(self, place: Float64) -> Float64:
+        """Value noise in 0..1 with cells of size one: smooth interpolation of a random lattice."""
+        base = np.floor(place)
+        f = (place - base).astype(np.float32)
+        f = f * f * (3 - 2 * f)
+        n = len(self._lattice)
+        low = base.astype(np.int64) % n
+        high = (low + 1) % n
+        flat = self._lattice.ravel()
+        value = np.zeros(len(place), np.float32)
+        for dx in (0, 1):
+            x, wx = (high, f) if dx else (low, 1 - f)
+            for dy in (0, 1):
+                y, wy = (high, f) if dy else (low, 1 - f)
+                row = (x[:, 0] * n + y[:, 1]) * n
+                near, far = flat[row + low[:, 2]], flat[row + high[:, 2]]
+                value += wx[:, 0] * wy[:, 1] * (near + (far - near) * f[:, 2])
+        return value.astype(np.float64)
+
+
+def _scene(o3d: Any, vertices: Float32, triangles: Int32) -> Any:
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles.astype(np.uint32)))
+    return scene
+
+
+def _blend(values: Float64, corners: Int32, weights: Float64) -> Float64:
+    first, second, third = (values[corners[:, i]] * weights[:, i, None] for i in range(3))
+    return first + second + third
+
+
+def _edges(hits: _Hits, h: int, w: int) -> Bool:
+    """[h * w] the pixels that differ from a neighbour in thing, shadow, orientation or depth."""
+    thing, lit = hits.thing.reshape(h, w), hits.lit.reshape(h, w)
+    depth, normal = hits.depth.reshape(h, w), hits.normal.reshape(h, w, 3)
+    edge = np.zeros((h, w), bool)
+    for here, there in (
+        ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+    ):
+        differs = (thing[here] != thing[there]) | (lit[here] != lit[there])
+        differs |= (normal[here] * normal[there]).sum(axis=-1) < 0.85
+        differs |= np.abs(depth[here] - depth[there]) > 0.04 * depth[here]
+        edge[here] |= differs
+        edge[there] |= differs
+    return edge.ravel()

@@ -1,0 +1,116 @@
+"""All parameters of the DAG, grouped as the DAG is. The defaults are the preset "default"."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
+from ss_flow.tasks.capture.ingest import IngestParams
+from ss_flow.tasks.capture.mono import MonoParams
+from ss_flow.tasks.capture.recordings import VideoParams
+from ss_flow.tasks.capture.sfm import SfmParams
+from ss_flow.tasks.ranges import Count, NonNegative, Positive, Range
+from ss_flow.tasks.semantics.describe import DescribeParams
+from ss_flow.tasks.splat.merge import MergeParams
+from ss_flow.tasks.splat.plan import PlanParams
+from ss_flow.tasks.splat.reconstruct import ReconstructParams
+from ss_flow.tasks.splat.refine import RefineParams
+from ss_flow.tasks.split.dense import DenseParams
+from ss_flow.tasks.split.propagate import PropagateParams
+from ss_flow.tasks.split.reproject import ReprojectParams
+from ss_flow.tasks.split.reprompt import RepromptParams
+from ss_flow.tasks.split.segment import SegmentParams
+from ss_flow.tasks.split.segment_rgbd import SegmentRgbdParams
+
+
+@dataclass(frozen=True)
+class CaptureParams:
+    """Photos, poses, depth."""
+
+    stride: Count = 1
+    """Take every n-th view of a posed capture (ScanNet is evaluated at 20)."""
+    depth: Literal["auto", "sensor", "mvs", "mono"] = "auto"
+    """Where depth comes from; "auto" is the sensor where there is one, else several views (mvs)."""
+    monodepth: str = "auto"
+    """The network for depth=mono: a name of the catalogue, or "auto"."""
+    ingest: IngestParams = field(default_factory=IngestParams)
+    video: VideoParams = field(default_factory=VideoParams)
+    sfm: SfmParams = field(default_factory=SfmParams)
+    sweep: SweepParams = field(default_factory=SweepParams)
+    agreement: AgreementParams = field(default_factory=AgreementParams)
+    mono: MonoParams = field(default_factory=MonoParams)
+
+
+@dataclass(frozen=True)
+class VisibilityParams:
+    """Which dense points a view sees."""
+
+    tau_depth: Positive = 0.02
+    """How far a point may lie from the view's depth, in scene units (metres where the scale is known)."""
+    tau_relative: NonNegative = 0.0
+    """The same as a fraction of the depth; the larger of the two counts."""
+
+
+@dataclass(frozen=True)
+class SplitParams:
+    """Masks -> view-consistent instances."""
+
+    segmenter: str = "auto"
+    """The network that makes the masks: a name of the catalogue, "auto", or "none" for colour, depth and normals."""
+    segment: SegmentParams = field(default_factory=SegmentParams)
+    rgbd: SegmentRgbdParams = field(default_factory=SegmentRgbdParams)
+    dense: DenseParams = field(default_factory=DenseParams)
+    visibility: VisibilityParams = field(default_factory=VisibilityParams)
+    propagate: PropagateParams = field(default_factory=PropagateParams)
+    reprompt: RepromptParams = field(default_factory=RepromptParams)
+    reproject: ReprojectParams = field(default_factory=ReprojectParams)
+
+
+@dataclass(frozen=True)
+class SplatParams:
+    """Instances -> Gaussians -> one scene."""
+
+    reconstruct: ReconstructParams = field(default_factory=ReconstructParams)
+    refine: RefineParams = field(default_factory=RefineParams)
+    plan: PlanParams = field(default_factory=PlanParams)
+    merge: MergeParams = field(default_factory=MergeParams)
+
+
+@dataclass(frozen=True)
+class QueryParams:
+    """How a text finds instances."""
+
+    tau_corr: Annotated[float, Range(0.0, 2.0)] = 0.02
+    """How much further from the text than the best an instance may be and still match (cosine distance)."""
+    prompt: str = "{text}"
+    """What the encoder reads in the place of the text."""
+
+
+@dataclass(frozen=True)
+class SemanticsParams:
+    """Gaussians -> descriptors -> text."""
+
+    encoder: str = "auto"
+    """The network that compares texts and pictures: a name of the catalogue, "auto", or "none" for colour words."""
+    describe: DescribeParams = field(default_factory=DescribeParams)
+    query: QueryParams = field(default_factory=QueryParams)
+
+
+@dataclass(frozen=True)
+class EvaluateParams:
+    """Measuring against ground truth, where there is some."""
+
+    zero_is_void: bool = True
+    """Whether 0 in the ground truth means "not annotated" and does not count; otherwise it is background."""
+
+
+@dataclass(frozen=True)
+class Params:
+    """Every parameter there is."""
+
+    capture: CaptureParams = field(default_factory=CaptureParams)
+    split: SplitParams = field(default_factory=SplitParams)
+    splat: SplatParams = field(default_factory=SplatParams)
+    semantics: SemanticsParams = field(default_factory=SemanticsParams)
+    evaluate: EvaluateParams = field(default_factory=EvaluateParams)

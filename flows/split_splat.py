@@ -1,0 +1,188 @@
+"""The DAG of Split&Splat: a capture -> view-consistent instances -> Gaussians -> one labelled scene -> descriptors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ss_flow.flows.capture import Capture
+from ss_flow.flows.params import Params, SplitParams
+from ss_flow.graph import Node, each, expand, gather, labelled
+from ss_flow.tasks.evaluate.instances import evaluate_masks
+from ss_flow.tasks.evaluate.novel_view import novel_view
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.semantics.describe import describe
+from ss_flow.tasks.semantics.name import name
+from ss_flow.tasks.splat.collisions import MergePlan
+from ss_flow.tasks.splat.merge import assemble, global_pass, merge_pair
+from ss_flow.tasks.splat.plan import plan
+from ss_flow.tasks.splat.reconstruct import reconstruct, retrain
+from ss_flow.tasks.splat.refine import refine
+from ss_flow.tasks.splat.resolve import exclusive, resolve
+from ss_flow.tasks.split.dense import dense
+from ss_flow.tasks.split.propagate import propagate
+from ss_flow.tasks.split.reproject import reproject
+from ss_flow.tasks.split.reprompt import reprompt
+from ss_flow.tasks.split.segment import segment
+from ss_flow.tasks.split.segment_rgbd import segment_rgbd
+from ss_flow.tasks.split.visibility import visibility
+
+
+@dataclass(frozen=True)
+class Networks:
+    """The networks of a run; None stands for the stated fallback."""
+
+    segmenter: Model | None
+    encoder: Model | None
+    monodepth: Model | None
+
+
+@dataclass(frozen=True)
+class Split:
+    """Nodes of the first half."""
+
+    points: Any
+    visibility: Any
+    masks: Any
+    labels: Any
+    instances: Any
+    """tuple[InstanceMasks, ...], the background first."""
+
+
+def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Node]:
+    """The whole DAG. Returns its results by step; `--until` takes these names."""
+    halved = split(capture, networks, params.split)
+    masks_split = resolve(capture.cameras, halved.instances)
+    results: dict[str, Any] = {
+        "ingest": capture.frames,
+        "cameras": capture.cameras,
+        "depth": capture.depths,
+        "dense": halved.points,
+        "segment": halved.masks,
+        "propagate": halved.labels,
+        "reproject": halved.instances,
+        "masks_split": masks_split,
+    }
+    if capture.truth is not None:
+        results["metrics_split"] = evaluate_masks(
+            masks_split, capture.truth, zero_is_void=params.evaluate.zero_is_void
+        )
+    results |= splat(capture, halved, networks, params)
+    if capture.truth is not None:
+        results["metrics_splat"] = evaluate_masks(
+            results["masks"], capture.truth, zero_is_void=params.evaluate.zero_is_void
+        )
+    if held_out is not None:
+        results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])
+    results["describe"] = each(
+        results["refine"],
+        build=lambda instance: describe(
+            capture.frames, instance, encoder=networks.encoder, params=params.semantics.describe
+        ),
+    )
+    results["names"] = name(results["describe"], encoder=networks.encoder)
+    return results
+
+
+def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
+    """Photos and depth -> view-consistent instances (Split&Splat, Sec. 3.1)."""
+    points = dense(capture.frames, capture.cameras, capture.depths, params=params.dense)
+    segmenter = networks.segmenter
+    if capture.masks is not None:
+        masks = capture.masks
+    elif segmenter is not None:
+        masks = each(
+            capture.frames,
+            names=capture.names,
+            build=lambda frame: segment(frame, params=params.segment, model=segmenter),
+        )
+    else:
+        masks = each(
+            capture.frames,
+            capture.depths,
+            names=capture.names,
+            build=lambda frame, depth: segment_rgbd(frame, depth, capture.cameras, params=params.rgbd),
+        )
+    seen = each(
+        capture.depths,
+        names=capture.names,
+        build=lambda depth: visibility(
+            points,
+            capture.cameras,
+            depth,
+            view=depth.index,
+            **vars(params.visibility),
+        ),
+    )
+    labels = propagate(points, seen, masks, params=params.propagate)
+    prompted: Any = ()
+    if segmenter is not None and capture.masks is None:
+        prompted = each(
+            capture.frames,
+            seen,
+            masks,
+            names=capture.names,
+            build=lambda frame, visible, pool: reprompt(
+                frame,
+                visible,
+                pool,
+                labels,
+                model=segmenter,
+                params=params.reprompt,
+                selection=params.reproject.selection,
+            ),
+        )
+    instances = reproject(points, seen, masks, labels, prompted, params=params.reproject)
+    return Split(points, seen, masks, labels, instances)
+
+
+def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -> dict[str, Any]:
+    """Instances -> Gaussians, each on its own; refined masks; one scene (Split&Splat, Sec. 3.2)."""
+    views = (capture.frames, capture.cameras, capture.depths)
+    tau = vars(params.split.visibility)
+    settings = params.splat
+
+    def build(instance: Any) -> tuple[Any, Any]:
+        gaussians = reconstruct(*views, instance, params=settings.reconstruct, **tau)
+        better = refine(
+            *views, instance, gaussians, model=networks.segmenter, params=settings.refine, **tau
+        )
+        return gaussians, better
+
+    def again(instance: Any, gaussians: Any) -> Any:
+        return retrain(*views, exclusive(instance, masks), gaussians, params=settings.reconstruct, **tau)
+
+    first, better = each(halved.instances, build=build, outputs=2, on_error="skip")
+    masks = resolve(capture.cameras, better)
+    groups = each(better, first, build=again, on_error="skip")
+    merged = merge_rounds(views, groups, masks, params, 0)
+    scene = global_pass(*views, assemble(merged), masks, params=settings.merge)
+    return {"reconstruct": first, "refine": better, "masks": masks, "merge": merged, "scene": scene}
+
+
+def merge_rounds(views: Any, groups: Any, masks: Any, params: Params, number: int) -> Any:
+    """Merge the pairs that collide, disjoint pairs side by side, until none is left (spec P4)."""
+
+    def build(planned: MergePlan) -> Any:
+        if not len(planned.pairs):
+            return groups
+        merged = []
+        for a, b in planned.pairs.tolist():
+            with labelled(f"{number}.{a}+{b}"):
+                merged.append(
+                    merge_pair(
+                        *views,
+                        groups[a],
+                        groups[b],
+                        masks,
+                        params=params.splat.merge,
+                        w_mask=planned.mask_weight,
+                        **vars(params.split.visibility),
+                    )
+                )
+        rest = [groups[i] for i in planned.singles.tolist()]
+        return merge_rounds(views, gather([*merged, *rest]), masks, params, number + 1)
+
+    with labelled(str(number)):
+        planned = plan(groups, params=params.splat.plan, round=number)
+    return expand(planned, build)

@@ -1,0 +1,105 @@
+"""Novel-view evaluation: renders of held-out views against their photos (spec 2.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.events import progress
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, Gaussians, Metrics, UInt8
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+
+_SIGMA = 1.5
+_RADIUS = 5
+_C1, _C2 = 0.01**2, 0.03**2
+_PSNR_OF_EQUALS = 100.0
+"""dB given where two images agree exactly, so that a mean over views stays finite."""
+
+
+def _rasterizer() -> Mapping[str, str]:
+    from ss_flow.tasks.gaussians.rasterize import backend_identity
+
+    return backend_identity()
+
+
+@task(
+    resources=Resources(cores=1),
+    uses=("opencv-contrib-python-headless", "scipy", "torch"),
+    environment=_rasterizer,
+)
+def novel_view(
+    frames_held_out: tuple[Frame, ...],
+    cameras_held_out: Cameras,
+    scene: Gaussians,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    antialias: bool = False,
+) -> Metrics:
+    """Render the scene from the held-out cameras and compare with the photos, as 8-bit images.
+
+    background: colour where nothing is, 0..1. Pixels that a frame's `valid` mask excludes count in neither measure.
+    Returns psnr (dB) and ssim, each the mean over the views. Raises InputError when there is no view, when frames
+    and cameras do not belong together, or when a view has no valid pixel.
+    """
+    from ss_flow.tasks.gaussians.render import render
+
+    names = tuple(f.name for f in frames_held_out)
+    if not names:
+        raise InputError("There is no held-out view; at least one is needed to evaluate novel views.")
+    if names != cameras_held_out.names:
+        raise InputError("The held-out frames and cameras are not the same views in the same order.")
+    values = []
+    for view, frame in enumerate(frames_held_out):
+        valid = decode_valid(frame)
+        if not valid.any():
+            raise InputError(f"The mask of held-out view {frame.name} leaves no pixel to compare; drop the view.")
+        camera = camera_of(cameras_held_out, view).scaled(frame.width, frame.height)
+        image = to_8bit(render(scene, camera, background=background, antialias=antialias).rgb)
+        photo = decode_rgb(frame)
+        values.append((psnr(image, photo, valid), ssim(image, photo, valid)))
+        progress(view + 1, len(names), frame.name)
+    mean = np.mean(values, axis=0)
+    return Metrics({"psnr": float(mean[0]), "ssim": float(mean[1])})
+
+
+def to_8bit(image: Float32) -> UInt8:
+    """An image as it would be saved. image: [..., 3] float, 0..1, clipped."""
+    return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
+
+
+def psnr(image: UInt8, reference: UInt8, valid: Bool | None = None) -> float:
+    """Peak signal-to-noise ratio in dB: -10 log10 of the mean squared error over all channels, peak 1.
+
+    image, reference: [H, W, 3]; valid: [H, W] the pixels that count. Images that agree exactly give 100 dB.
+    """
+    error = ((image.astype(np.float64) - reference) / 255) ** 2
+    mse = float(error.mean() if valid is None else error[valid].mean())
+    return min(-10 * float(np.log10(mse)), _PSNR_OF_EQUALS) if mse > 0 else _PSNR_OF_EQUALS
+
+
+def ssim(image: UInt8, reference: UInt8, valid: Bool | None = None) -> float:
+    """Structural similarity (Wang et al., IEEE TIP 2004): 11 x 11 Gaussian window, sigma 1.5, data range 1.
+
+    Per channel, black beyond the border, mean over pixels and channels, as the 3DGS literature computes it.
+    image, reference: [H, W, 3]; valid: [H, W] the pixels that count; the others agree by definition, so that what a
+    render shows there does not reach its neighbours.
+    """
+    a, b = (x.astype(np.float64) / 255 for x in (image, reference))
+    if valid is not None:
+        a = np.where(valid[..., None], a, b)
+    mean_a, mean_b = _blurred(a), _blurred(b)
+    var_a, var_b = _blurred(a * a) - mean_a**2, _blurred(b * b) - mean_b**2
+    covariance = _blurred(a * b) - mean_a * mean_b
+    similarity = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
+    similarity /= (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
+    return float(similarity.mean() if valid is None else similarity[valid].mean())
+
+
+def _blurred(image: Float64) -> Float64:
+    from scipy.ndimage import gaussian_filter
+
+    return gaussian_filter(image, _SIGMA, mode="constant", radius=_RADIUS, axes=(0, 1))

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+
+from ss_flow.errors import InputError
+from ss_flow.flows import settings
+from ss_flow.flows.params import Params
+from ss_flow.tasks.ranges import Count, Fraction
+
+
+@dataclass(frozen=True)
+class Inner:
+    share: Fraction = 0.7
+    grids: tuple[Count, ...] = (1, 4)
+    rule: Literal["child", "union"] = "child"
+    limit: float | None = None
+    on: bool = True
+    name: str = "auto"
+
+
+@dataclass(frozen=True)
+class Group:
+    inner: Inner = field(default_factory=Inner)
+    other: Inner = field(default_factory=Inner)
+
+
+@dataclass(frozen=True)
+class Top:
+    group: Group = field(default_factory=Group)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("group.inner.share=0.5", {"group.inner.share": 0.5}),
+        ("inner.share=1", {"group.inner.share": 1.0}),
+        ("inner.grids=2,8", {"group.inner.grids": (2, 8)}),
+        ("inner.grids=(2)", {"group.inner.grids": (2,)}),
+        ("inner.rule=union", {"group.inner.rule": "union"}),
+        ("inner.limit=3", {"group.inner.limit": 3.0}),
+        ("inner.limit=none", {"group.inner.limit": None}),
+        ("inner.on=false", {"group.inner.on": False}),
+        ("inner.name=sam", {"group.inner.name": "sam"}),
+    ],
+)
+def test_a_parameter_is_set_by_name(text, expected):
+    before, after = settings.flat(Top()), settings.flat(settings.apply(Top(), [text]))
+    assert {name: after[name] for name in after if after[name] != before[name] or name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("inner.share", "not of the form"),
+        ("inner.shard=1", "did you mean 'group.inner.share'"),
+        ("inner.share=1.5", "between 0 and 1"),
+        ("inner.share=much", "a number"),
+        ("inner.share=nan", "a number"),
+        ("inner.grids=0", "at least 1"),
+        ("inner.grids=1.5", "a whole number"),
+        ("inner.rule=or", "'child' or 'union'"),
+        ("inner.on=maybe", "true or false"),
+        ("group.share=0.5", "ambiguous"),
+        ("zzz.qqq=1", "they begin with group"),
+    ],
+)
+def test_a_bad_assignment_is_refused_in_one_sentence(text, sentence):
+    with pytest.raises(InputError, match=sentence) as caught:
+        settings.apply(Top(), [text])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["default", "paper", "reference", "fast"])
+def test_every_preset_names_only_parameters_that_exist(name):
+    settings.preset(Params(), name)
+
+
+def test_an_unknown_preset_is_refused_with_the_known_ones():
+    with pytest.raises(InputError, match="default, fast, paper, reference"):
+        settings.preset(Params(), "papre")
+
+
+@pytest.mark.parametrize("name", ["split.tau_depth", "split.tau_label", "propagate.tau_label", "semantics.tau_corr"])
+def test_the_short_names_of_the_thresholds_stand_for_one_parameter(name):
+    assert settings.find(Params(), name)

@@ -1,0 +1,47 @@
+"""Counting label pairs: against the obvious way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from ss_flow.tasks.evaluate.contingency import contingency
+
+_LABELS = hnp.arrays(np.int64, 40, elements=st.sampled_from([-1, 0, 1, 2, 7, 65535]))
+
+
+@given(_LABELS, _LABELS)
+def test_counts_and_ious_are_those_of_masks_compared_one_by_one(truth: np.ndarray, predicted: np.ndarray) -> None:
+    table = contingency(truth, predicted)
+    np.testing.assert_array_equal(table.truth_ids, np.unique(truth))
+    np.testing.assert_array_equal(table.predicted_ids, np.unique(predicted))
+    for i, g in enumerate(table.truth_ids):
+        for j, p in enumerate(table.predicted_ids):
+            a, b = truth == g, predicted == p
+            assert table.intersection[i, j] == (a & b).sum()
+            assert table.iou[i, j] == pytest.approx((a & b).sum() / (a | b).sum())
+
+
+def test_labels_far_apart_are_counted_without_a_table_of_their_range() -> None:
+    table = contingency(np.array([0, 2**40, 2**40]), np.array([5, 5, -(2**40)]))
+    assert table.truth_ids.tolist() == [0, 2**40] and table.predicted_ids.tolist() == [-(2**40), 5]
+    assert table.intersection.tolist() == [[0, 1], [1, 1]]
+
+
+def test_taking_a_label_out_leaves_its_elements_in_the_areas_of_the_others() -> None:
+    table = contingency(np.array([0, 1, 1, 1]), np.array([3, 3, 3, 0])).without(truth=0, predicted=0)
+    assert table.predicted_area.tolist() == [3] and table.truth_area.tolist() == [3]
+    assert table.iou.tolist() == [[0.5]]
+
+
+def test_no_elements_give_an_empty_table() -> None:
+    table = contingency(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    assert table.iou.shape == (0, 0) and table.best_iou().shape == (0,)
+
+
+def test_labellings_of_different_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match="different shapes"):
+        contingency(np.zeros(3, int), np.zeros(4, int))

@@ -1,0 +1,67 @@
+"""One-to-one measures: hand-counted examples and their bounds."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from ss_flow.tasks.evaluate.contingency import Contingency, contingency
+from ss_flow.tasks.evaluate.panoptic import hungarian_miou, over_segmentation, panoptic_quality, under_segmentation
+
+_IDS = hnp.arrays(np.int64, 24, elements=st.integers(0, 4))
+
+
+def _table(truth: list[int] | np.ndarray, predicted: list[int] | np.ndarray) -> Contingency:
+    return contingency(np.asarray(truth), np.asarray(predicted)).without(truth=0, predicted=0)
+
+
+def test_an_iou_of_exactly_one_half_is_no_match() -> None:
+    assert panoptic_quality(_table([1, 1], [3, 0])).matched == 0
+    assert panoptic_quality(_table([1, 1, 1], [3, 3, 0])) == pytest.approx((2 / 3, 2 / 3, 1, 1, 0, 0))
+
+
+def test_an_ignored_prediction_is_no_false_positive() -> None:
+    table = _table([1, 1, 0], [3, 3, 4])
+    assert panoptic_quality(table).rq == pytest.approx(1 / 1.5)
+    assert panoptic_quality(table, np.array([False, True])).rq == 1
+
+
+@given(_IDS, _IDS)
+def test_matches_are_one_to_one_and_quality_lies_between_zero_and_one(truth: np.ndarray, predicted: np.ndarray) -> None:
+    table = _table(truth, predicted)
+    quality = panoptic_quality(table)
+    matches = table.iou > 0.5
+    assert (matches.sum(axis=0) <= 1).all() and (matches.sum(axis=1) <= 1).all()
+    assert quality.matched + quality.false_negatives == len(table.truth_ids)
+    assert quality.matched + quality.false_positives == len(table.predicted_ids)
+    assert 0 <= quality.pq <= 1
+
+
+@given(_IDS.filter(lambda x: x.any()), _IDS)
+def test_hungarian_miou_is_the_best_of_all_assignments(truth: np.ndarray, predicted: np.ndarray) -> None:
+    table = _table(truth, predicted)
+    g, p = table.iou.shape
+    iou = np.pad(table.iou, ((0, 0), (0, g)))
+    best = max(sum(iou[i, j] for i, j in enumerate(way)) for way in itertools.permutations(range(p + g), g))
+    assert hungarian_miou(table) == pytest.approx(best / g)
+    assert hungarian_miou(table) <= table.best_iou().mean() + 1e-12
+
+
+def test_over_and_under_segmentation_count_shares_of_a_tenth_and_more() -> None:
+    truth = [1] * 20 + [2] * 20
+    split = [3] * 18 + [4] * 2 + [5] * 20
+    assert over_segmentation(_table(truth, split)) == 0.5
+    assert over_segmentation(_table(truth, [3] * 19 + [4] + [5] * 20)) == 0, "a twentieth does not count"
+    assert under_segmentation(_table(truth, split)) == 0
+    assert under_segmentation(_table(truth, [3] * 40)) == 1
+
+
+def test_an_empty_prediction_scores_zero_everywhere() -> None:
+    table = _table([1, 2], [0, 0])
+    assert panoptic_quality(table) == (0, 0, 0, 0, 0, 2)
+    assert hungarian_miou(table) == over_segmentation(table) == under_segmentation(table) == 0
