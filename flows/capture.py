@@ -11,7 +11,8 @@ from ss_flow.errors import InputError
 from ss_flow.graph import each
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture import depth as depth_steps
-from ss_flow.tasks.capture import ingest, recordings
+from ss_flow.tasks.capture import ingest, recordings, sensor_depth
+from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.sfm import registered, sfm
@@ -61,9 +62,9 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     names = scene.names if scene.poses is not None else None
     masks = truth = None
     if scene.ready_masks is not None:
-        masks = ingest.ready_masks(frames, names=scene.names, files=_all(reference, scene.ready_masks), lenses=scene.lenses)
+        masks = ready_masks(frames, names=scene.names, files=_all(reference, scene.ready_masks), lenses=scene.lenses)
     if scene.ground_truth is not None:
-        truth = ingest.ground_truth(frames, names=scene.names, files=_all(reference, scene.ground_truth), lenses=scene.lenses)
+        truth = ground_truth(frames, names=scene.names, files=_all(reference, scene.ground_truth), lenses=scene.lenses)
     depths = _depths(scene, reference, params, monodepth, frames, cameras, names)
     return Capture(frames, cameras, depths, masks, truth, names)
 
@@ -107,7 +108,7 @@ def _depths(
             )
         if scene.depths is None:
             raise InputError(f"{scene.root} has no depth files; set capture.depth to mvs or mono.")
-        return ingest.depth(
+        return sensor_depth.depth(
             frames,
             names=scene.names,
             files=_all(reference, scene.depths),
@@ -125,7 +126,7 @@ def _depths(
     if source == "mvs" or monodepth is None:
         return agreed
     # What several views agree on gives the network's depth its scale.
-    network = monodepth.file("model")
+    network = monodepth.file("network")
     return each(
         frames, names=names, build=lambda frame: mono(frame, cameras, agreed, model=network, params=params.mono)
     )

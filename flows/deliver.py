@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from ss_flow.flows import settings
 from ss_flow.flows.params import Params
 from ss_flow.flows.split_splat import Networks
 from ss_flow.scheduler import Failure
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, UInt8
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_cloud, write_masks, write_scene
 
@@ -87,7 +85,7 @@ def deliver(folder: Path, store: Store, document: dict[str, Any], report: Report
 def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
     """Write everything but run.json."""
     from ss_flow.tasks.deliver.instances_json import instances_document
-    from ss_flow.tasks.deliver.report import report_html
+    from ss_flow.tasks.deliver.report import report_html, report_pictures
 
     results = document["results"]
 
@@ -99,9 +97,7 @@ def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
 
     frames, cameras, scene = several("ingest"), one("cameras"), one("scene")
     split_maps, maps = several("masks_split"), several("masks")
-    instances = instances_document(
-        several("refine"), [frame.name for frame in frames], gaussians=scene, names=one("names")
-    )
+    instances = instances_document(several("refine"), scene, one("names"), frames)
     write_scene(folder, scene, instances)
     write_cloud(folder, one("dense"), one("propagate"))
     write_masks(folder / "masks_split", frames, split_maps)
@@ -110,27 +106,6 @@ def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
     (folder / "report.html").write_text(
         report_html(document, pictures=pictures, instances=instances), encoding="utf-8"
     )
-
-
-def report_pictures(
-    frames: Sequence[Frame],
-    cameras: Cameras,
-    depths: Sequence[DepthMap],
-    split_maps: Sequence[LabelMap],
-    maps: Sequence[LabelMap],
-    scene: Gaussians,
-) -> dict[str, UInt8]:
-    """What the report shows: photo, masks, rendering and depth of three views, evenly chosen."""
-    from ss_flow.tasks.deliver.draw import draw
-
-    pictures: dict[str, UInt8] = {}
-    for view in sorted({round(part * (len(frames) - 1)) for part in (1 / 6, 1 / 2, 5 / 6)}):
-        frame = frames[view]
-        shown = {"photo": frame, "masks_split": split_maps[view], "masks": maps[view], "depth": depths[view]}
-        for kind, value in shown.items():
-            pictures[f"{frame.name}/{kind}"] = draw(value, frame=frame)
-        pictures[f"{frame.name}/render"] = draw(scene, cameras=cameras, view=view)
-    return pictures
 
 
 def _content_of(folder: Path) -> str | None:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Literal
 
 from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
 from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.sfm import SfmParams
-from ss_flow.tasks.ranges import Count, NonNegative, Positive, Range
+from ss_flow.tasks.ranges import Count, NonNegative, Positive
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.splat.merge import MergeParams
 from ss_flow.tasks.splat.plan import PlanParams
 from ss_flow.tasks.splat.reconstruct import ReconstructParams
 from ss_flow.tasks.splat.refine import RefineParams
+from ss_flow.tasks.semantics.query import QueryParams
 from ss_flow.tasks.split.dense import DenseParams
 from ss_flow.tasks.split.propagate import PropagateParams
 from ss_flow.tasks.split.reproject import ReprojectParams
@@ -75,16 +76,6 @@ class SplatParams:
     refine: RefineParams = field(default_factory=RefineParams)
     plan: PlanParams = field(default_factory=PlanParams)
     merge: MergeParams = field(default_factory=MergeParams)
-
-
-@dataclass(frozen=True)
-class QueryParams:
-    """How a text finds instances."""
-
-    tau_corr: Annotated[float, Range(0.0, 2.0)] = 0.02
-    """How much further from the text than the best an instance may be and still match (cosine distance)."""
-    prompt: str = "{text}"
-    """What the encoder reads in the place of the text."""
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ class Task(Generic[P, R]):
 def task(
     *,
     name: str | None = None,
-    resources: Resources = Resources(),  # noqa: B008 - frozen
+    resources: Resources = Resources(),
     uses: tuple[str, ...] = (),
     isolate: bool = False,
     environment: Callable[[], Mapping[str, str]] | None = None,

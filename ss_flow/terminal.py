@@ -11,6 +11,10 @@ from rich.progress import TaskID as RowId
 from ss_flow.events import Reporter
 
 
+WORTH_SECONDS = 1.0
+"""Shorter steps leave no line behind."""
+
+
 class Terminal(Reporter):
     """A live display: how many nodes are done, and how far each running one is."""
 
@@ -40,7 +44,7 @@ class Terminal(Reporter):
         if kind in ("hit", "finished", "failed", "skipped"):
             self._done += 1
             self._display.update(self._all, completed=self._done, total=max(self._done, details.get("known", 0)))
-        if kind == "finished":
+        if kind == "finished" and details["seconds"] >= WORTH_SECONDS:
             self._console.print(f"[green]done[/]  {label:<34} {details['seconds']:8.1f} s", highlight=False)
         elif kind == "failed":
             self._console.print(f"[red]failed[/] {label}: {details['error']}", highlight=False)

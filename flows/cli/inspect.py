@@ -30,7 +30,8 @@ class Status:
     """Only runs of this scene."""
     json: bool = False
     """Print one JSON document."""
-    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+    store: Options = StoreOptions()
+    """Where results are kept."""
 
     def run(self) -> int:
         run = latest_run(self.store.open_store(), self.scene)
@@ -79,7 +80,8 @@ class Why:
     """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
     scene: Annotated[Path | None, tyro.conf.Positional] = None
     """The scene; the one that ran last, when left out."""
-    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+    store: Options = StoreOptions()
+    """Where results are kept."""
 
     def run(self) -> int:
         run = latest_run(self.store.open_store(), self.scene)
@@ -131,7 +133,8 @@ class Graph:
 
     scene: Annotated[Path | None, tyro.conf.Positional] = None
     """The scene; the one that ran last, when left out."""
-    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+    store: Options = StoreOptions()
+    """Where results are kept."""
 
     def run(self) -> int:
         run = latest_run(self.store.open_store(), self.scene)
@@ -158,7 +161,8 @@ class CacheList:
     """The scene; the one that ran last, when left out."""
     json: bool = False
     """Print one JSON document."""
-    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+    store: Options = StoreOptions()
+    """Where results are kept."""
 
     def run(self) -> int:
         store = self.store.open_store()
@@ -191,7 +195,8 @@ class CacheShow:
     """Draw points and Gaussians as this view's camera sees them."""
     scene: Path | None = None
     """The scene; the one that ran last, when left out."""
-    store: Options = StoreOptions()  # noqa: RUF009 - frozen
+    store: Options = StoreOptions()
+    """Where results are kept."""
 
     def run(self) -> int:
         store = self.store.open_store()

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -26,43 +27,58 @@ from ss_flow.flows.cli.setup import Doctor, ModelsFetch, ModelsList, ModelsVerif
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 _sub = tyro.conf.subcommand
-Cache = (
-    Annotated[CacheList, _sub("ls", description="List what the store holds.")]
-    | Annotated[CacheShow, _sub("show", description="Describe or draw one result.")]
-)
-Models = (
-    Annotated[ModelsList, _sub("list", description="List the networks that can be used, and which are here.")]
-    | Annotated[ModelsFetch, _sub("fetch", description="Download a network's weights.")]
-    | Annotated[ModelsVerify, _sub("verify", description="Check a network's weights against their digests.")]
-)
 
 
-def _commands() -> dict[str, object]:
-    return {
-        "demo": Demo,
-        "run": Run,
-        "status": Status,
-        "why": Why,
-        "graph": Graph,
-        "query": Query,
-        "cache": Cache,
-        "models": Models,
-        "doctor": Doctor,
-    }
+@dataclass(frozen=True)
+class Cache:
+    """Look into the store."""
+
+    command: Annotated[CacheList, _sub("ls")] | Annotated[CacheShow, _sub("show")]
+
+    def run(self) -> int:
+        return self.command.run()
+
+
+@dataclass(frozen=True)
+class Models:
+    """The networks that can be used."""
+
+    command: (
+        Annotated[ModelsList, _sub("list")]
+        | Annotated[ModelsFetch, _sub("fetch")]
+        | Annotated[ModelsVerify, _sub("verify")]
+    )
+
+    def run(self) -> int:
+        return self.command.run()
+
+
+Command = tyro.conf.OmitSubcommandPrefixes[
+    tyro.conf.FlagCreatePairsOff[
+        Annotated[Demo, _sub("demo")]
+        | Annotated[Run, _sub("run")]
+        | Annotated[Status, _sub("status")]
+        | Annotated[Why, _sub("why")]
+        | Annotated[Graph, _sub("graph")]
+        | Annotated[Query, _sub("query")]
+        | Annotated[Cache, _sub("cache")]
+        | Annotated[Models, _sub("models")]
+        | Annotated[Doctor, _sub("doctor")]
+    ]
+]
 
 
 def main(arguments: list[str]) -> int:
     """Run one command; return the exit code."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
-        command = tyro.extras.subcommand_cli_from_dict(
-            _commands(),  # type: ignore[arg-type]
+        command: Any = tyro.cli(
+            Command,  # type: ignore[arg-type]
             prog="ss-flow",
             description="From a capture to instance-labelled 3D Gaussians; nothing is computed twice.",
             args=arguments,
-            sort_subcommands=False,
         )
-        return int(command.run())  # type: ignore[attr-defined]
+        return int(command.run())
     except InputError as error:
         errors.print(f"[red]ss-flow:[/] {error}", markup=True)
         return BAD_INPUT

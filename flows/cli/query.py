@@ -32,7 +32,8 @@ class Query:
     """How much further than the best an instance may be and still match; the run's own value when left out."""
     json: bool = False
     """Print one JSON document."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()  # noqa: RUF009 - frozen
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    """Where results are kept."""
 
     def run(self) -> int:
         document = read_run(self.result)

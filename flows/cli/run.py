@@ -52,7 +52,8 @@ class RunOptions:
     """Read all input files again, instead of trusting their size and time of change."""
     json: bool = False
     """Print one JSON document on stdout, and nothing else there."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()  # noqa: RUF009 - frozen
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    """Where results are kept."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,8 @@ class Run:
     """The folder to write; by default ss-flow-out/NAME of the scene."""
     masks: Path | None = None
     """A folder of ready-made instance masks (uint16 PNG files named like the photos), in the place of a segmenter."""
-    options: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()  # noqa: RUF009 - frozen
+    options: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
+    """How to run."""
 
     def run(self) -> int:
         params = settings.preset(Params(), self.options.preset)
@@ -88,7 +90,8 @@ class Demo:
     """How many photos are taken of it."""
     seed: int = 0
     """Another seed is another room."""
-    options: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions(preset="fast")  # noqa: RUF009 - frozen
+    options: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions(preset="fast")
+    """How to run."""
 
     def run(self) -> int:
         from ss_flow.flows.demo import demo_scene

@@ -60,8 +60,7 @@ class ModelsFetch:
     def run(self) -> int:
         from ss_flow.tasks.models.fetch import fetch
 
-        model = fetch(self.name)
-        console(json=False).print(f"{model.name} is in {model.files[0].ref.path.parent}")
+        console(json=False).print(f"{self.name} is in {fetch(self.name)}")
         return 0
 
 
@@ -87,7 +86,8 @@ class ModelsVerify:
 class Doctor:
     """Tell whether this machine has all that runs need, and what to do where it has not."""
 
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()  # noqa: RUF009 - frozen
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    """Where results are kept."""
 
     def run(self) -> int:
         checks: list[tuple[str, Callable[[], str]]] = [

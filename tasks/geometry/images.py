@@ -36,7 +36,7 @@ def encode_png(image: np.ndarray) -> UInt8:
 
 def pack_masks(masks: Bool) -> UInt8:
     """[N, H, W] booleans as [N, ceil(H * W / 8)] bits, the form of `MaskSet.packed`."""
-    return np.packbits(masks.reshape(len(masks), -1), axis=1)
+    return np.packbits(masks.reshape(len(masks), masks.shape[1] * masks.shape[2]), axis=1)
 
 
 def depth_at_frame_size(depth: DepthMap, frame: Frame) -> Float32:

@@ -1,0 +1,160 @@
+"""From files to artifacts: frames and cameras.
+
+File contents come as `FileRef`s; a reference's place is no part of a step's key, hence views are named apart.
+Masks and depth follow the frames they belong to by name, so that frames may have been dropped in between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.events import progress
+from ss_flow.task import FileRef, task
+from ss_flow.tasks.artifacts import Bool, Cameras, Frame
+from ss_flow.tasks.capture.layout_colmap import read_points
+from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map
+from ss_flow.tasks.capture.photo_files import Photo, decode, read_gray, read_photo
+from ss_flow.tasks.capture.scene_files import Pose
+from ss_flow.tasks.geometry.images import encode_png
+
+_USES = ("opencv-contrib-python-headless",)
+_UPRIGHT = {2: "flip", 3: "180", 4: "flip 180", 5: "flip 270", 6: "90", 7: "flip 90", 8: "270"}
+
+
+@dataclass(frozen=True)
+class IngestParams:
+    """How photos are read."""
+
+    max_side: int = 1600
+    """Photos whose longer side is above this are scaled down to it, in pixels (1600 is what 3DGS trains at)."""
+    jpeg_quality: int = 95
+    """Quality at which photos are encoded again when they must be; 0 keeps them lossless as PNG."""
+
+
+@task(name="capture.ingest", uses=_USES)
+def frames(
+    *,
+    names: tuple[str, ...],
+    photos: tuple[FileRef, ...],
+    valid: tuple[FileRef | None, ...] = (),
+    lenses: tuple[Lens, ...] | None = None,
+    params: IngestParams = IngestParams(),
+) -> tuple[Frame, ...]:
+    """The photos as frames: upright, without distortion, not above `params.max_side`.
+
+    A photo that is all this already keeps its bytes. Where intrinsics are known, a photo is turned upright (EXIF) only
+    if they refer to the turned one. Pixels that the lens does not reach after undistortion become invalid.
+    Raises InputError when a photo is damaged, or its size or that of its valid mask is not the stated one.
+    """
+    result = []
+    sizes: dict[Lens, tuple[int, int, str]] = {}
+    for i, (name, ref) in enumerate(zip(names, photos, strict=True)):
+        photo, mask = read_photo(ref.path), valid[i] if valid else None
+        lens = lenses[i] if lenses else None
+        frame = frame_of(name, photo, str(ref.path), mask, lens, params)
+        if lens is not None:
+            size = (frame.source_width, frame.source_height)
+            *first, where = sizes.setdefault(lens, (*size, str(ref.path)))
+            if tuple(first) != size:
+                raise InputError(
+                    f"{ref.path} is {size[0]}x{size[1]} but {where} is {first[0]}x{first[1]}, while both share one "
+                    "camera's intrinsics; photos of one camera must have one size."
+                )
+        result.append(frame)
+        progress(i + 1, len(photos), name)
+    return tuple(result)
+
+
+def frame_of(
+    name: str, photo: Photo, where: str, mask: FileRef | None, lens: Lens | None, params: IngestParams
+) -> Frame:
+    import cv2
+
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = decode(photo.data, where, flags)
+    stored = image.shape[1::-1]
+    turn = _UPRIGHT.get(photo.orientation, "")
+    if lens is not None and lens.width and stored == (lens.width, lens.height):
+        turn = ""
+    image = _turned(image, turn)
+    height, width = image.shape[:2]
+    if lens is not None and lens.width and (width, height) != (lens.width, lens.height):
+        raise InputError(
+            f"{where} is {stored[0]}x{stored[1]} pixels, but its intrinsics are those of a photo of "
+            f"{lens.width}x{lens.height}; the two must agree."
+        )
+    keep = np.ones((height, width), bool) if mask is None else _valid_mask(mask, width, height)
+    distorted = lens is not None and not lens.pinhole
+    if lens is not None and distorted:
+        source = undistortion_map(lens.scaled(width, height))
+        image = cv2.remap(image, source, None, cv2.INTER_LINEAR)
+        keep = cv2.remap(keep.astype(np.uint8), source, None, cv2.INTER_NEAREST) > 0
+        keep &= inside_source(source)
+    scale = min(1.0, params.max_side / max(width, height))
+    w, h = (max(1, round(width * scale)), max(1, round(height * scale)))
+    if scale < 1:
+        image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
+        # A pixel counts only where all that it averages does.
+        keep = cv2.resize(keep.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.999
+    if turn or distorted or scale < 1 or photo.format == "other":
+        if params.jpeg_quality:
+            encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
+        else:
+            encoded = cv2.imencode(".png", image)[1].ravel()
+    else:
+        encoded = np.frombuffer(photo.data, np.uint8)
+    packed = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
+    return Frame(name, w, h, encoded, packed, width, height)
+
+
+def _turned(image: np.ndarray, turn: str) -> np.ndarray:
+    if "flip" in turn:
+        image = image[:, ::-1]
+    quarter_turns = {"90": 3, "180": 2, "270": 1}.get(turn.removeprefix("flip").strip(), 0)
+    return np.ascontiguousarray(np.rot90(image, quarter_turns)) if turn else image
+
+
+def _valid_mask(ref: FileRef, width: int, height: int) -> Bool:
+    mask = read_gray(ref.path)
+    if mask.shape != (height, width):
+        raise InputError(
+            f"{ref.path} is {mask.shape[1]}x{mask.shape[0]} pixels, but its photo is {width}x{height}; a valid mask "
+            "must have its photo's size."
+        )
+    return mask > 0
+
+
+@task(name="capture.cameras")
+def cameras(
+    frames: tuple[Frame, ...],
+    *,
+    names: tuple[str, ...],
+    lenses: tuple[Lens, ...],
+    poses: tuple[Pose, ...],
+    metric: bool,
+    sparse: FileRef | None = None,
+) -> Cameras:
+    """The cameras that came with the capture, scaled to the frames.
+
+    names, lenses, poses: of the capture's views, of which the frames are some.
+    sparse: COLMAP's points3D file.
+    Raises InputError when that file is damaged.
+    """
+    row = {name: i for i, name in enumerate(names)}
+    intrinsics = []
+    for frame in frames:
+        lens = lenses[row[frame.name]]
+        sized = lens if lens.width else lens.scaled(frame.source_width, frame.source_height)
+        scaled = sized.scaled(frame.width, frame.height)
+        intrinsics.append((scaled.fx, scaled.fy, scaled.cx, scaled.cy))
+    return Cameras(
+        names=tuple(f.name for f in frames),
+        sizes=np.array([(f.width, f.height) for f in frames], np.int32).reshape(-1, 2),
+        intrinsics=np.array(intrinsics, np.float64).reshape(-1, 4),
+        world_to_camera=np.array([poses[row[f.name]] for f in frames], np.float64).reshape(-1, 4, 4),
+        metric=metric,
+        sparse_points=np.zeros((0, 3), np.float32) if sparse is None else read_points(sparse.path),
+    )

@@ -1,0 +1,125 @@
+"""nerfstudio's `transforms.json`, which Polycam, Record3D and many others write too."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.capture.lens import Lens
+from ss_flow.tasks.capture.photo_files import header_size
+from ss_flow.tasks.capture.scene_files import SceneFiles, check_lens, natural_key, read_text, rigid_inverse
+
+_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
+
+
+def open_nerfstudio(path: Path) -> SceneFiles:
+    """The capture that a `transforms.json` describes.
+
+    Its poses are camera-to-world with OpenGL's axes (y up, looking along -z). A unit of its depth files is
+    `depth_unit_scale_factor` world units (0.001 unless said). The scene counts as metric exactly when it has depth
+    maps: those of a sensor come in metres, while poses alone are mostly structure from motion's.
+    Raises InputError when the file or a file that it lists is missing or makes no sense.
+    """
+    root = path.parent
+    document = _document(path)
+    frames = sorted(document["frames"], key=lambda f: (natural_key(f["file_path"]), f["file_path"]))
+    photos = tuple(_photo(root, frame["file_path"], path) for frame in frames)
+    with_depth = [f for f in frames if f.get("depth_file_path")]
+    if with_depth and len(with_depth) < len(frames):
+        lacking = next(f["file_path"] for f in frames if not f.get("depth_file_path"))
+        raise InputError(f"{path} gives no depth_file_path for {lacking}; give one for every frame, or for none.")
+    poses = []
+    for frame in frames:
+        where = f"{path} for {frame['file_path']}"
+        try:
+            matrix = np.array(frame["transform_matrix"], np.float64)
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{where} has no transform_matrix of numbers; a 4x4 matrix is expected.") from error
+        if matrix.shape != (4, 4):
+            raise InputError(f"{where} has a transform_matrix of shape {matrix.shape}; a 4x4 matrix is expected.")
+        poses.append(rigid_inverse(matrix @ _OPENGL_TO_OPENCV, where))
+    return SceneFiles(
+        kind="nerfstudio",
+        root=root,
+        name=root.resolve().name,
+        names=tuple(p.stem for p in photos),
+        photos=photos,
+        valid=tuple(_listed(root, f.get("mask_path"), path) for f in frames),
+        depths=tuple(root / f["depth_file_path"] for f in frames) if with_depth else None,
+        depth_scale=_number(document.get("depth_unit_scale_factor", 1e-3), "depth_unit_scale_factor", path),
+        lenses=tuple(_lens({**document, **f}, p, path) for f, p in zip(frames, photos, strict=True)),
+        poses=tuple(poses),
+        metric=bool(with_depth),
+    )
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path} is not valid JSON ({error}).") from error
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):
+        raise InputError(
+            f"{path} lacks a list `frames` whose items have a `file_path`; nerfstudio's layout is expected."
+        )
+    if not frames:
+        raise InputError(f"{path} lists no frame; at least one photo is needed.")
+    return document
+
+
+def _photo(root: Path, name: str, path: Path) -> Path:
+    photo = root / name
+    if photo.is_file():
+        return photo
+    if not photo.suffix and photo.with_suffix(".png").is_file():
+        return photo.with_suffix(".png")
+    raise InputError(f"{photo}, which {path.name} lists, does not exist; put the photo there or drop the frame.")
+
+
+def _listed(root: Path, name: str | None, path: Path) -> Path | None:
+    if name is None:
+        return None
+    if not (root / name).is_file():
+        raise InputError(f"{root / name}, which {path.name} lists, does not exist; put it there or drop the entry.")
+    return root / name
+
+
+def _lens(values: dict[str, Any], photo: Path, path: Path) -> Lens:
+    model = str(values.get("camera_model", "OPENCV")).upper()
+    fisheye = model == "OPENCV_FISHEYE"
+    if not fisheye and model not in _PERSPECTIVE:
+        raise InputError(f"{path} has cameras of model {model}; OPENCV, PINHOLE or OPENCV_FISHEYE is expected.")
+
+    def number(key: str) -> float:
+        return _number(values[key], key, path) if key in values else 0.0
+
+    width, height = int(number("w")), int(number("h"))
+    if not (width and height):
+        width, height = header_size(photo)
+    if "fl_x" in values:
+        fx = number("fl_x")
+        fy = number("fl_y") if "fl_y" in values else fx
+    elif "camera_angle_x" in values:
+        fx = fy = 0.5 * width / math.tan(0.5 * number("camera_angle_x"))
+        if "camera_angle_y" in values:
+            fy = 0.5 * height / math.tan(0.5 * number("camera_angle_y"))
+    else:
+        raise InputError(f"{path} has no intrinsics; give fl_x, fl_y, cx, cy, w and h in pixels.")
+    cx = number("cx") if "cx" in values else width / 2
+    cy = number("cy") if "cy" in values else height / 2
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    return check_lens(Lens(width, height, fx, fy, cx, cy, tuple(number(k) for k in keys), fisheye), str(path))
+
+
+def _number(value: Any, key: str, path: Path) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} has `{key}` {value!r}; a number is expected.") from error

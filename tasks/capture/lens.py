@@ -1,0 +1,77 @@
+"""The lens of a photo: its intrinsics, and how to take its distortion out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float32
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of one photo as the capture states them, pixel centres at (i + 0.5, j + 0.5)."""
+
+    width: int
+    height: int
+    """Size of the photo that the intrinsics refer to; 0, 0 when the capture does not say (then the photo's own)."""
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    """OpenCV's order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of a fisheye; empty for a pinhole."""
+    fisheye: bool = False
+
+    @property
+    def pinhole(self) -> bool:
+        """Whether straight lines stay straight."""
+        return not self.fisheye and not any(self.distortion)
+
+    def scaled(self, width: int, height: int) -> Lens:
+        """The same lens for an image of another size (pixel borders map to pixel borders)."""
+        sx = width / self.width if self.width else 1.0
+        sy = height / self.height if self.height else 1.0
+        return Lens(
+            width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.distortion, self.fisheye
+        )
+
+
+def undistortion_map(lens: Lens) -> Float32:
+    """Where each pixel of the undistorted image lies in the photo.
+
+    The undistorted image is a pinhole's with the lens's own fx, fy, cx, cy and size, so that intrinsics stay as stated.
+    Returns [H, W, 2] integer-centred (u, v), as `cv2.remap` takes them.
+    """
+    import cv2
+
+    matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
+    coefficients = np.array(lens.distortion or (0.0,) * 4)
+    if lens.fisheye:
+        size = (lens.width, lens.height)
+        u, v = cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
+    else:
+        u, v = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, (lens.width, lens.height), cv2.CV_32FC1)
+    return np.stack([u, v], axis=-1).astype(np.float32)
+
+
+def inside_source(source_map: Float32) -> Bool:
+    """[H, W] which pixels of an undistorted image the photo really shows."""
+    height, width = source_map.shape[:2]
+    u, v = source_map[..., 0], source_map[..., 1]
+    return (u > -0.5) & (v > -0.5) & (u < width - 0.5) & (v < height - 0.5)
+
+
+def depth_to_color_map(depth: Lens, color: Lens) -> Float32:
+    """Where each pixel of a depth map registered to the colour camera lies in the depth camera's own image.
+
+    Both cameras share their optical centre and axes, so z-depth carries over and only pixels move.
+    depth: lens of the depth camera, with its size. color: lens of the colour photo, with its size.
+    Returns [h, w, 2] integer-centred (u, v) at the depth camera's resolution.
+    """
+    target = color.scaled(depth.width, depth.height)
+    v, u = np.mgrid[: depth.height, : depth.width] + 0.5
+    x = (u - target.cx) / target.fx * depth.fx + depth.cx - 0.5
+    y = (v - target.cy) / target.fy * depth.fy + depth.cy - 0.5
+    return np.stack([x, y], axis=-1).astype(np.float32)

@@ -1,0 +1,171 @@
+"""Frames out of one file: a video, or ScanNet's `.sens`."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.events import progress
+from ss_flow.task import FileRef, task
+from ss_flow.tasks.artifacts import DepthMap, Frame, UInt8
+from ss_flow.tasks.capture.ingest import IngestParams, frame_of
+from ss_flow.tasks.capture.layout_scannet import read_sens_index
+from ss_flow.tasks.capture.photo_files import inspect
+from ss_flow.tasks.capture.sensor_depth import registered_depth
+
+_USES = ("opencv-contrib-python-headless",)
+
+
+@dataclass(frozen=True)
+class VideoParams:
+    """Which frames of a video are used."""
+
+    max_frames: int = 120
+    """The most frames that are taken, spread evenly over the video."""
+    stride: int = 0
+    """Take one frame out of so many; 0 = as many as `max_frames` asks for."""
+    candidates: int = 5
+    """Out of each stride, so many frames are compared and the sharpest is taken."""
+    min_sharpness: float = 0.3
+    """A frame is dropped when its sharpness is below this share of the median over the frames taken."""
+    max_side: int = 1600
+    """Frames whose longer side is above this are scaled down to it, in pixels."""
+    jpeg_quality: int = 95
+    """Quality at which frames are encoded."""
+
+
+@task(name="capture.video_frames", uses=_USES)
+def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tuple[Frame, ...]:
+    """Sharp frames spread over a video, named `frame-000000` and on by their place in it.
+
+    Sharpness is the variance of the Laplacian at a width of 320 pixels, compared within each stride, since it depends
+    on what is seen as much as on blur.
+    Raises InputError when the video cannot be opened or shows nothing.
+    """
+    import cv2
+
+    where = str(video.path)
+    total = _count_frames(where)
+    stride = params.stride or max(1, -(-total // params.max_frames))
+    step = max(1, stride // max(1, params.candidates))
+    reader = cv2.VideoCapture(where)
+    best: list[tuple[float, int, Frame]] = []
+    window: tuple[float, int, np.ndarray] | None = None
+    for i in range(total):
+        if not reader.grab():
+            break
+        if (i % stride) % step == 0:
+            ok, image = reader.retrieve()
+            if ok:
+                sharpness = _sharpness(image)
+                if window is None or sharpness > window[0]:
+                    window = (sharpness, i, image)
+        if window is not None and (i % stride == stride - 1 or i == total - 1):
+            best.append((window[0], window[1], _encode(window[2], window[1], params)))
+            window = None
+        progress(i + 1, total)
+    reader.release()
+    floor = params.min_sharpness * float(np.median([s for s, _, _ in best]))
+    kept = [frame for sharpness, _, frame in best if sharpness >= floor]
+    return tuple(kept[: params.max_frames])
+
+
+def _count_frames(where: str) -> int:
+    import cv2
+
+    reader = cv2.VideoCapture(where)
+    if not reader.isOpened():
+        raise InputError(f"{where} cannot be opened as a video; an MP4, MOV, AVI, MKV or WebM file is expected.")
+    # The container's own count is often wrong.
+    total = 0
+    while reader.grab():
+        total += 1
+    reader.release()
+    if total == 0:
+        raise InputError(f"{where} holds no frame that can be decoded; a video with at least one is needed.")
+    return total
+
+
+def _sharpness(image: UInt8) -> float:
+    import cv2
+
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    height = max(1, round(320 * gray.shape[0] / gray.shape[1]))
+    small = cv2.resize(gray, (320, height), interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(small, cv2.CV_64F).var())
+
+
+def _encode(image: UInt8, index: int, params: VideoParams) -> Frame:
+    import cv2
+
+    height, width = image.shape[:2]
+    scale = min(1.0, params.max_side / max(width, height))
+    w, h = max(1, round(width * scale)), max(1, round(height * scale))
+    if scale < 1:
+        image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
+    encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
+    return Frame(f"frame-{index:06d}", w, h, encoded, np.zeros(0, np.uint8), width, height)
+
+
+@task(name="capture.sens_frames", uses=_USES)
+def sens_frames(
+    *,
+    recording: FileRef,
+    names: tuple[str, ...],
+    entries: tuple[int, ...],
+    params: IngestParams = IngestParams(),
+) -> tuple[Frame, ...]:
+    """The colour photos of some views of a ScanNet `.sens` file.
+
+    entries: places in the file, from 0.
+    Raises InputError when the file is damaged.
+    """
+    index = read_sens_index(recording.path)
+    result = []
+    with recording.path.open("rb") as file:
+        for i, (name, entry) in enumerate(zip(names, entries, strict=True)):
+            start, length, _, _ = index.offsets[entry]
+            file.seek(start)
+            where = f"{recording.path}, frame {entry},"
+            result.append(frame_of(name, inspect(file.read(length), where), where, None, index.color_lens, params))
+            progress(i + 1, len(entries), name)
+    return tuple(result)
+
+
+@task(name="capture.sens_depth", uses=_USES)
+def sens_depth(
+    frames: tuple[Frame, ...], *, recording: FileRef, names: tuple[str, ...], entries: tuple[int, ...]
+) -> tuple[DepthMap, ...]:
+    """The depth maps of some views of a ScanNet `.sens` file, registered to its colour camera.
+
+    names, entries: of the capture's views, of which the frames are some.
+    Raises InputError when the file is damaged.
+    """
+    index = read_sens_index(recording.path)
+    lens = index.depth_lens
+    place = dict(zip(names, entries, strict=True))
+    result = []
+    with recording.path.open("rb") as file:
+        for i, frame in enumerate(frames):
+            entry = place[frame.name]
+            _, _, start, length = index.offsets[entry]
+            where = f"{recording.path}, frame {entry},"
+            file.seek(start)
+            raw = _depth_values(file.read(length), index.depth_compression, lens.width, lens.height, where)
+            values = raw.astype(np.float32) * np.float32(index.depth_scale)
+            result.append(registered_depth(frame, values, where, True, index.color_lens, lens))
+            progress(i + 1, len(frames), frame.name)
+    return tuple(result)
+
+
+def _depth_values(data: bytes, compression: int, width: int, height: int, where: str) -> np.ndarray:
+    try:
+        raw = zlib.decompress(data) if compression else data
+    except zlib.error as error:
+        raise InputError(f"{where} has damaged depth ({error}); copy the recording again.") from error
+    if len(raw) != 2 * width * height:
+        raise InputError(f"{where} has {len(raw)} bytes of depth; {width}x{height} pixels of 2 bytes are expected.")
+    return np.frombuffer(raw, "<u2").reshape(height, width)

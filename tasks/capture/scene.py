@@ -1,0 +1,124 @@
+"""Open a capture: find out its layout and list its files. Nothing is decoded here, as every command does this first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.capture.layout_colmap import is_colmap, open_colmap
+from ss_flow.tasks.capture.layout_nerfstudio import open_nerfstudio
+from ss_flow.tasks.capture.layout_scannet import is_scannet, open_scannet, open_sens
+from ss_flow.tasks.capture.layout_tum import open_tum
+from ss_flow.tasks.capture.scene_files import PHOTO_SUFFIXES, VIDEO_SUFFIXES, SceneFiles, by_stem, files_in
+
+ACCEPTED = (
+    "a folder of photos, a video, a COLMAP workspace (sparse/ and images/), a nerfstudio transforms.json, a ScanNet "
+    "export (color/ depth/ pose/ intrinsic/) or .sens file, or a TUM RGB-D sequence (rgb.txt)"
+)
+_MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff"})
+
+
+def open_scene(path: Path, masks: Path | None = None) -> SceneFiles:
+    """The files of a capture, whatever its layout.
+
+    path: a folder, a video, a `.sens` file or a `transforms.json`.
+    masks: a folder of ready-made instance masks, one image of ids a view, named by the view's stem; by default
+        `instance_masks/` in the scene's folder, where that exists. Likewise `instance/` is ground truth, and `valid/`
+        (or what the layout itself lists) holds masks that are 0 where a pixel is to be ignored.
+    Raises InputError when nothing is recognised, or a file that the layout needs is missing or makes no sense.
+    """
+    scene = _open_layout(path)
+    if scene.kind != "video":
+        _check_files(scene)
+    if masks is not None and not masks.is_dir():
+        raise InputError(f"{masks} is no folder; ready-made instance masks come as a folder of images named by view.")
+    if scene.kind == "video" and masks is not None:
+        raise InputError(f"{masks} cannot go with a video, whose frames have no names yet; extract the frames first.")
+    in_folder = path.is_dir() and scene.kind != "video"
+    if masks is None and in_folder and (path / "instance_masks").is_dir():
+        masks = path / "instance_masks"
+    if masks is not None:
+        scene = replace(scene, ready_masks=_all_by_name(masks, scene.names))
+    if in_folder and (path / "instance").is_dir():
+        scene = replace(scene, ground_truth=_some_by_name(path / "instance", scene.names))
+    if in_folder and (path / "valid").is_dir() and not any(scene.valid):
+        scene = replace(scene, valid=_some_by_name(path / "valid", scene.names))
+    if not scene.valid:
+        scene = replace(scene, valid=(None,) * len(scene.names))
+    return scene
+
+
+def _open_layout(path: Path) -> SceneFiles:
+    if not path.exists():
+        raise InputError(f"{path} does not exist; give the path of a scene: {ACCEPTED}.")
+    if path.is_file():
+        if path.suffix.lower() in VIDEO_SUFFIXES:
+            return SceneFiles(kind="video", root=path.parent, name=path.stem, recording=path)
+        if path.suffix.lower() == ".sens":
+            return open_sens(path)
+        if path.name == "transforms.json":
+            return open_nerfstudio(path)
+        raise InputError(f"{path} is no scene; give {ACCEPTED}.")
+    if (path / "transforms.json").is_file():
+        return open_nerfstudio(path / "transforms.json")
+    if is_scannet(path):
+        return open_scannet(path)
+    if (path / "rgb.txt").is_file():
+        return open_tum(path)
+    if is_colmap(path):
+        return open_colmap(path)
+    return _open_loose(path)
+
+
+def _open_loose(path: Path) -> SceneFiles:
+    photos = files_in(path) or files_in(path / "images")
+    recordings = files_in(path, VIDEO_SUFFIXES | {".sens"})
+    if photos:
+        return SceneFiles(
+            kind="photos",
+            root=path,
+            name=path.resolve().name,
+            names=tuple(p.stem for p in photos),
+            photos=tuple(photos),
+        )
+    if len(recordings) > 1:
+        raise InputError(f"{path} holds {len(recordings)} recordings; give the path of one of them.")
+    if recordings:
+        return _open_layout(recordings[0])
+    raise InputError(f"{path} holds no photo and no capture that is known; give {ACCEPTED}.")
+
+
+def _check_files(scene: SceneFiles) -> None:
+    by_stem(list(scene.photos))
+    if len(set(scene.names)) < len(scene.names):
+        raise InputError(f"{scene.root} has two views of one name; every view needs a stem of its own.")
+    # One listing a folder is far cheaper than asking for each file.
+    listings: dict[Path, set[str]] = {}
+    listed: list[Path | None] = [*scene.photos, *(scene.depths or ())]
+    for file in listed:
+        if file is None:
+            continue
+        if file.parent not in listings:
+            listings[file.parent] = {p.name for p in file.parent.iterdir()} if file.parent.is_dir() else set()
+        if file.name not in listings[file.parent]:
+            raise InputError(f"{file}, which the scene lists, does not exist; put it there or drop the view.")
+        if file.suffix.lower() not in PHOTO_SUFFIXES:
+            raise InputError(f"{file} is no image file by its name; JPEG or PNG is expected.")
+
+
+def _some_by_name(folder: Path, names: Sequence[str]) -> tuple[Path | None, ...]:
+    found = by_stem(files_in(folder, _MASK_SUFFIXES))
+    matched = tuple(found.get(name) for name in names)
+    if not any(matched):
+        raise InputError(f"{folder} holds no image named after a view; {names[0]}.png, for one, is expected.")
+    return matched
+
+
+def _all_by_name(folder: Path, names: Sequence[str]) -> tuple[Path, ...]:
+    matched = _some_by_name(folder, names)
+    for name, file in zip(names, matched, strict=True):
+        if file is None:
+            raise InputError(f"{folder} lacks the masks of view {name}; {name}.png is expected there.")
+    return tuple(file for file in matched if file is not None)

@@ -1,0 +1,189 @@
+"""What a capture consists of on disk, whatever its layout."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import Float64
+from ss_flow.tasks.capture.lens import Lens
+
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+
+Pose = tuple[float, ...]
+"""World-to-camera, 16 numbers row by row (plain numbers, so that a step's key can hold it)."""
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """The files of a capture, in the order of the views; `tuple[... | None, ...]` fields have one entry a view."""
+
+    kind: str
+    """"photos", "video", "colmap", "nerfstudio", "scannet", "sens" or "tum"."""
+    root: Path
+    name: str
+    """Name of the folder, or the file's stem."""
+    names: tuple[str, ...] = ()
+    """Name of each view; unique. Empty for a video, whose frames are chosen later."""
+    photos: tuple[Path, ...] = ()
+    """The photos; empty for a video and for a .sens file."""
+    recording: Path | None = None
+    """The video or the .sens file."""
+    entries: tuple[int, ...] = ()
+    """For a .sens file: which of its frames each view is."""
+    valid: tuple[Path | None, ...] = ()
+    """One-channel images, 0 where a pixel is to be ignored."""
+    depths: tuple[Path, ...] | None = None
+    depth_scale: float = 0.001
+    """World units per unit of the depth files."""
+    depth_lens: Lens | None = None
+    """The depth camera where it is not the colour camera at another resolution."""
+    lenses: tuple[Lens, ...] | None = None
+    poses: tuple[Pose, ...] | None = None
+    metric: bool = False
+    """Whether one world unit is one metre."""
+    sparse: Path | None = None
+    """COLMAP's points3D file."""
+    ready_masks: tuple[Path, ...] | None = None
+    """Instance masks that stand in for a segmenter: uint16 images of ids, 0 = none."""
+    ground_truth: tuple[Path | None, ...] | None = None
+    """Annotated instances: uint16 images of ids, 0 = not annotated or background."""
+    skipped: tuple[str, ...] = ()
+    """Views of the capture that are left out, for lack of a pose or a depth map."""
+
+    @property
+    def world_to_camera(self) -> Float64 | None:
+        """[K, 4, 4], or None where the capture has no poses."""
+        return None if self.poses is None else np.array(self.poses, np.float64).reshape(-1, 4, 4)
+
+    def every(self, stride: int) -> SceneFiles:
+        """Every `stride`-th view, from the first on (spec, row 1)."""
+        if stride < 1:
+            raise InputError(f"frame stride {stride} is not possible; it must be 1 or more.")
+        return self.pick(range(0, len(self.names), stride))
+
+    def pick(self, views: range | list[int]) -> SceneFiles:
+        """Only these views, in this order."""
+        per_view = ("names", "photos", "entries", "valid", "depths", "lenses", "poses", "ready_masks", "ground_truth")
+        kept = {}
+        for field in per_view:
+            values = getattr(self, field)
+            kept[field] = tuple(values[i] for i in views) if values else values
+        return replace(self, **kept)
+
+
+def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key under which "2.jpg" comes before "10.jpg"."""
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"([0-9]+)", text) if part)
+
+
+def files_in(folder: Path, suffixes: frozenset[str] = PHOTO_SUFFIXES) -> list[Path]:
+    """The files of a folder that carry one of these suffixes, naturally sorted; hidden files do not count."""
+    if not folder.is_dir():
+        return []
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    return sorted(found, key=lambda p: (natural_key(p.name), p.name))
+
+
+def by_stem(paths: list[Path]) -> dict[str, Path]:
+    """Files by their stem.
+
+    Raises InputError when two share one.
+    """
+    counts = Counter(p.stem for p in paths)
+    twice = [stem for stem, n in counts.items() if n > 1]
+    if twice:
+        clash = " and ".join(p.name for p in paths if p.stem == twice[0])
+        raise InputError(
+            f"{paths[0].parent} holds {clash}, whose stems are the same; every view needs a stem of its own."
+        )
+    return {p.stem: p for p in paths}
+
+
+def read_text(path: Path) -> str:
+    """The text of a small file.
+
+    Raises InputError when it is absent or no text.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError(f"{path} is missing; the capture needs it.") from error
+    except (UnicodeDecodeError, OSError) as error:
+        raise InputError(f"{path} cannot be read as text ({error}); a plain text file is expected.") from error
+
+
+def read_matrix(path: Path) -> Float64:
+    """A 4x4 matrix of numbers from a text file; they may be infinite or not numbers.
+
+    Raises InputError when the file does not hold 16 numbers.
+    """
+    try:
+        values = [float(word) for word in read_text(path).split()]
+    except ValueError as error:
+        raise InputError(f"{path} holds a word that is no number ({error}); a 4x4 matrix is expected.") from error
+    if len(values) != 16:
+        raise InputError(f"{path} holds {len(values)} numbers; a 4x4 matrix of 16 is expected.")
+    return np.array(values).reshape(4, 4)
+
+
+def rigid_inverse(camera_to_world: Float64, where: str) -> Pose:
+    """World-to-camera of a camera-to-world matrix, checked.
+
+    where: what to name in a message.
+    Raises InputError when the matrix is not finite or not rigid (R^T R off the identity by more than 1e-3, a mirror
+    image, or a last row other than 0 0 0 1).
+    """
+    checked = check_rigid(camera_to_world, where)
+    inverse = np.eye(4)
+    inverse[:3, :3] = checked[:3, :3].T
+    inverse[:3, 3] = -checked[:3, :3].T @ checked[:3, 3]
+    return tuple(float(x) for x in inverse.ravel())
+
+
+def check_rigid(matrix: Float64, where: str) -> Float64:
+    """[4, 4] the rigid matrix nearest to a pose (its rotation made orthonormal to the last bit).
+
+    Raises InputError as `rigid_inverse` does.
+    """
+    if matrix.shape != (4, 4):
+        raise InputError(f"the pose in {where} has shape {matrix.shape}; a 4x4 matrix is expected.")
+    if not np.isfinite(matrix).all():
+        raise InputError(f"the pose in {where} holds NaN or infinite numbers; give a rigid 4x4 matrix of numbers.")
+    rotation = matrix[:3, :3]
+    if (
+        np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3
+        or np.linalg.det(rotation) < 0
+        or np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-3
+    ):
+        raise InputError(
+            f"the pose in {where} is not rigid; its upper left 3x3 block must be a rotation, without scale or "
+            "mirroring, and its last row 0 0 0 1."
+        )
+    left, _, right = np.linalg.svd(rotation)
+    rigid = np.eye(4)
+    rigid[:3, :3] = left @ right
+    rigid[:3, 3] = matrix[:3, 3]
+    return rigid
+
+
+def check_lens(lens: Lens, where: str) -> Lens:
+    """The lens itself.
+
+    Raises InputError when a focal length is not positive or a number is not finite.
+    """
+    if not all(map(math.isfinite, (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion))):
+        raise InputError(f"the intrinsics in {where} hold NaN or infinite numbers; fx fy cx cy in pixels are expected.")
+    if lens.fx <= 0 or lens.fy <= 0 or lens.width < 0 or lens.height < 0:
+        raise InputError(
+            f"the intrinsics in {where} have a focal length or size that is not positive (fx {lens.fx:g}, fy "
+            f"{lens.fy:g}, {lens.width}x{lens.height}); pixels are expected."
+        )
+    return lens

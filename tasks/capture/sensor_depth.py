@@ -1,0 +1,107 @@
+"""Depth that came with the capture, registered to the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.events import progress
+from ss_flow.task import FileRef, task
+from ss_flow.tasks.artifacts import DepthMap, Frame
+from ss_flow.tasks.capture.lens import Lens, depth_to_color_map, undistortion_map
+from ss_flow.tasks.capture.photo_files import read_gray
+from ss_flow.tasks.geometry.images import decode_valid
+
+
+@task(name="capture.sensor_depth", uses=("opencv-contrib-python-headless",))
+def depth(
+    frames: tuple[Frame, ...],
+    *,
+    names: tuple[str, ...],
+    files: tuple[FileRef, ...],
+    scale: float,
+    metric: bool,
+    lenses: tuple[Lens, ...] | None = None,
+    depth_lens: Lens | None = None,
+) -> tuple[DepthMap, ...]:
+    """Sensor depth, registered to the frames' cameras, at the sensor's own resolution.
+
+    files: one-channel images, 16 bit in units of `scale` world units, or 32-bit floats in world units.
+    depth_lens: the depth camera, where it is not the colour camera at another resolution; same centre and axes.
+    Pixels that the frame's valid mask leaves out, and those that are not finite, become unknown (0).
+    Raises InputError when a file is damaged, not depth, or implausible for a metric scene.
+    """
+    row = {name: i for i, name in enumerate(names)}
+    result = []
+    for i, frame in enumerate(frames):
+        ref = files[row[frame.name]]
+        lens = lenses[row[frame.name]] if lenses else None
+        raw = read_gray(ref.path)
+        if raw.dtype not in (np.uint16, np.float32):
+            raise InputError(
+                f"{ref.path} holds {raw.dtype} pixels; depth of 16 bits a pixel (or 32-bit floats) is expected."
+            )
+        values = raw.astype(np.float32) * np.float32(scale if raw.dtype == np.uint16 else 1.0)
+        result.append(registered_depth(frame, values, str(ref.path), metric, lens, depth_lens))
+        progress(i + 1, len(frames), frame.name)
+    _check_not_all_empty(result, str(files[0].path.parent))
+    return tuple(result)
+
+
+def registered_depth(
+    frame: Frame, values: np.ndarray, where: str, metric: bool, lens: Lens | None, depth_lens: Lens | None
+) -> DepthMap:
+    """One view's depth map from what its sensor read.
+
+    values: [h, w] float32, world units. Raises InputError as `depth` does.
+    """
+    import cv2
+
+    values = np.where(np.isfinite(values) & (values > 0), values, np.float32(0))
+    known = values[values > 0]
+    if metric and known.size and not 0.01 <= float(np.median(known)) <= 100:
+        raise InputError(
+            f"{where} has a median depth of {float(np.median(known)):.4g} m; between 0.01 and 100 m is plausible, so "
+            "its unit (the depth scale) is probably wrong."
+        )
+    h, w = values.shape
+    color = None if lens is None else lens.scaled(frame.source_width, frame.source_height) if not lens.width else lens
+    if depth_lens is not None and color is not None and not _same_camera(depth_lens, color, w, h):
+        sized = depth_lens if depth_lens.width else Lens(w, h, *_focal_and_center(depth_lens))
+        values = cv2.remap(values, depth_to_color_map(sized, color), None, cv2.INTER_NEAREST)
+    elif abs(w * frame.source_height / (h * frame.source_width) - 1) > 0.02:
+        raise InputError(
+            f"{where} is {w}x{h} pixels and its photo {frame.source_width}x{frame.source_height}; depth must have the "
+            "photo's proportions, or an intrinsic_depth.txt of its own."
+        )
+    if color is not None and not color.pinhole:
+        values = cv2.remap(values, undistortion_map(color.scaled(w, h)), None, cv2.INTER_NEAREST)
+    if frame.valid.size:
+        keep = decode_valid(frame)
+        values = np.where(resampled(keep, h, w), values, np.float32(0))
+    return DepthMap(frame.name, np.ascontiguousarray(values, np.float32), "sensor")
+
+
+def _focal_and_center(lens: Lens) -> tuple[float, float, float, float]:
+    return lens.fx, lens.fy, lens.cx, lens.cy
+
+
+def _same_camera(depth_lens: Lens, color: Lens, width: int, height: int) -> bool:
+    scaled = color.scaled(width, height)
+    return bool(np.abs(np.subtract(_focal_and_center(depth_lens), _focal_and_center(scaled))).max() < 0.1)
+
+
+def _check_not_all_empty(maps: Sequence[DepthMap], where: str) -> None:
+    if maps and not any(m.depth.any() for m in maps):
+        raise InputError(
+            f"the depth maps in {where} are 0 everywhere; leave depth out, or give maps with known pixels."
+        )
+
+
+def resampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """[height, width] an image at another size, nearest neighbour (ids and depths must not be blended)."""
+    rows = ((np.arange(height) + 0.5) * image.shape[0] / height).astype(np.intp)
+    columns = ((np.arange(width) + 0.5) * image.shape[1] / width).astype(np.intp)
+    return image[np.ix_(rows, columns)]

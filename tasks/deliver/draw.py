@@ -1,0 +1,281 @@
+"""Any artifact as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import singledispatch
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import (
+    Cameras,
+    DepthMap,
+    Descriptors,
+    Float32,
+    Frame,
+    Gaussians,
+    InstanceMasks,
+    LabelMap,
+    MaskSet,
+    Metrics,
+    PointCloud,
+    PointLabels,
+    UInt8,
+    Visibility,
+)
+from ss_flow.tasks.deliver.contact_sheet import FAINT, INK, as_picture, blank, caption, contact_sheet, table_picture
+from ss_flow.tasks.deliver.palette import depth_colors, instance_colors, paint_ids, turbo
+from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
+from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.models.colour_words import TERMS, ColourWords
+from ss_flow.tasks.semantics.query import QueryResult
+
+_MOST_ON_A_SHEET = 24
+_TERM_COLORS = dict(grey="#8a8a8a", white="#e8e8e4", green="#2e8b45", yellow="#eac520", brown="#7b4a21", pink="#f08cb4")
+
+
+@dataclass(frozen=True)
+class Context:
+    """What may help to draw an artifact; nothing is needed."""
+
+    frame: Frame | None
+    frames: Sequence[Frame]
+    cameras: Cameras | None
+    view: int
+    points: PointCloud | None
+
+    def photo(self, height: int, width: int, view: int | None = None) -> UInt8 | None:
+        """The photo behind a picture of this size; None where there is none of this size."""
+        if view is None:
+            frame = self.frame
+        else:
+            frame = self.frames[view] if view < len(self.frames) else self.frame if view == self.view else None
+        return decode_rgb(frame) if frame is not None and (frame.height, frame.width) == (height, width) else None
+
+    def camera(self, points: Float32) -> Camera:
+        """The view's camera, or one that shows all the points."""
+        return orbit_camera(points) if self.cameras is None else camera_of(self.cameras, self.view)
+
+
+def draw(
+    value: object,
+    *,
+    frame: Frame | None = None,
+    frames: Sequence[Frame] = (),
+    cameras: Cameras | None = None,
+    view: int = 0,
+    points: PointCloud | None = None,
+) -> UInt8:
+    """A picture of an artifact, or of a list of them: [H, W, 3] RGB.
+
+    frame: the photo behind masks, labels or points of one view. frames: all photos, where an artifact (or a list of
+    them) is about several views. cameras, view: the camera that looks at points and Gaussians; without cameras, one
+    that shows all of them from outside. points: the dense points, which labels refer to.
+    """
+    return _draw(value, Context(frame, frames, cameras, view, points))
+
+
+@singledispatch
+def _draw(value: object, context: Context) -> UInt8:
+    if not is_dataclass(value):
+        return table_picture(type(value).__name__, [("value", _said(value))])
+    return table_picture(type(value).__name__, [(f.name, _said(getattr(value, f.name))) for f in fields(value)])
+
+
+def _said(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} [{', '.join(map(str, value.shape))}]"
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 70 else text[:69] + "…"
+
+
+@_draw.register(tuple)
+@_draw.register(list)
+def _(value: Sequence[object], context: Context) -> UInt8:
+    if not value:
+        return table_picture("an empty list", [])
+    shown = value[:_MOST_ON_A_SHEET]
+    of_views = len(context.frames) == len(value)
+    pictures = []
+    for i, item in enumerate(shown):
+        frame, view = (context.frames[i], i) if of_views else (context.frame, context.view)
+        pictures.append(_draw(item, replace(context, frame=frame, view=view)))
+    captions = [_caption(item, i) for i, item in enumerate(shown)]
+    if len(value) > len(shown):
+        captions[-1] += f"   (and {len(value) - len(shown)} more)"
+    return contact_sheet(pictures, captions)
+
+
+def _caption(item: object, index: int) -> str:
+    instance = getattr(item, "instance_id", None)
+    if isinstance(instance, int):
+        return f"instance {instance}"
+    return str(getattr(item, "name", index))
+
+
+@_draw.register
+def _(value: Frame, context: Context) -> UInt8:
+    return decode_rgb(value)
+
+
+@_draw.register
+def _(value: MaskSet, context: Context) -> UInt8:
+    dense = value.dense()
+    ids = np.zeros((value.height, value.width), np.int32)
+    for index in np.argsort(-dense.sum(axis=(1, 2)), kind="stable"):
+        ids[dense[index]] = index + 1
+    return paint_ids(ids, context.photo(value.height, value.width))
+
+
+@_draw.register
+def _(value: LabelMap, context: Context) -> UInt8:
+    return paint_ids(value.ids.astype(np.int32), context.photo(*value.ids.shape))
+
+
+@_draw.register
+def _(value: DepthMap, context: Context) -> UInt8:
+    colors, low, high = depth_colors(value.depth)
+    known = float((value.depth > 0).mean())
+    return np.concatenate([colors, _depth_legend(colors.shape[1], low, high, f"{value.source}, {known:.0%} known")])
+
+
+def _depth_legend(width: int, low: float, high: float, note: str) -> UInt8:
+    ramp = np.repeat(turbo()[None, np.linspace(255, 0, width).astype(np.intp)], 10, axis=0)
+    line = caption(f"{low:.3g}   to   {high:.3g}   ({note})", width)
+    return np.concatenate([np.full((4, width, 3), 34, np.uint8), ramp, line])
+
+
+@_draw.register
+def _(value: InstanceMasks, context: Context) -> UInt8:
+    pictures, captions = [], []
+    order = np.argsort(-np.bitwise_count(value.packed).sum(axis=1, dtype=np.int64), kind="stable")[:12]
+    masks = value.dense()
+    for row in np.sort(order):
+        ids = np.where(masks[row], value.instance_id, 0)
+        view = int(value.view[row])
+        pictures.append(paint_ids(ids, context.photo(value.height, value.width, view), 0.45))
+        name = context.frames[view].name if view < len(context.frames) else f"view {view}"
+        captions.append(name + (" (re-prompted)" if value.prompted[row] else ""))
+    if pictures:
+        return contact_sheet(pictures, captions)
+    if len(value.points):
+        return _points_picture(value.points, value.colors, _spacing(value.points), context)
+    return table_picture(f"instance {value.instance_id}", [("masks", "0"), ("points", "0")])
+
+
+@_draw.register
+def _(value: PointCloud, context: Context) -> UInt8:
+    return _points_picture(value.points, value.colors, value.spacing, context)
+
+
+@_draw.register
+def _(value: PointLabels, context: Context) -> UInt8:
+    if context.points is None or len(context.points.points) != len(value.label):
+        counts = np.bincount(value.label)
+        rows = [(f"label {i}" if i else "unlabelled", f"{counts[i]} points") for i in np.flatnonzero(counts)]
+        return table_picture("PointLabels", rows)
+    colors = instance_colors(int(value.label.max(initial=0)) + 1)
+    colors[0] = (190, 190, 190)
+    return _points_picture(context.points.points, colors[value.label], context.points.spacing, context)
+
+
+def _points_picture(points: Float32, colors: UInt8, spacing: float, context: Context) -> UInt8:
+    if not len(points):
+        return table_picture("points", [])
+    return draw_points(points, colors, context.camera(points), spacing)
+
+
+def _spacing(points: Float32) -> float:
+    """A rough spacing of points on surfaces: the extent over the root of the count."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)) / max(1.0, len(points) ** 0.5))
+
+
+@_draw.register
+def _(value: Visibility, context: Context) -> UInt8:
+    photo = context.photo(value.height, value.width)
+    image = np.full((value.height, value.width, 3), 34, np.uint8) if photo is None else (photo * 0.45).astype(np.uint8)
+    colors, low, high = depth_colors(value.depth)
+    v, u = np.divmod(value.pixel, value.width)
+    for dy, dx in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        image[np.minimum(v + dy, value.height - 1), np.minimum(u + dx, value.width - 1)] = colors
+    return np.concatenate([image, _depth_legend(value.width, low, high, f"{len(value.pixel)} points")])
+
+
+@_draw.register
+def _(value: Gaussians, context: Context) -> UInt8:
+    if not len(value):
+        return table_picture("Gaussians", [])
+    from ss_flow.tasks.gaussians.render import render
+
+    rendering = render(value, context.camera(value.means), background=(0.957, 0.961, 0.969))
+    return np.rint(255 * rendering.rgb.clip(0, 1)).astype(np.uint8)
+
+
+@_draw.register
+def _(value: Cameras, context: Context) -> UInt8:
+    poses = value.world_to_camera
+    if not len(value):
+        return table_picture("Cameras", [])
+    centers = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
+    up = -poses[:, 1, :3].mean(axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-9)
+    east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    east /= np.linalg.norm(east)
+    plane = np.stack([east, np.cross(up, east)], axis=1)
+    seen, looks = centers @ plane, poses[:, 2, :3] @ plane
+    figure = blank(900, 800)
+    axes = figure.add_axes((0.1, 0.08, 0.85, 0.84))
+    axes.set_facecolor("white")
+    background = context.points.points if context.points is not None else value.sparse_points
+    if len(background):
+        thinned = background[:: max(1, len(background) // 20_000)] @ plane
+        axes.scatter(thinned[:, 0], thinned[:, 1], s=1, color="#c9ccd4", linewidths=0)
+        low, high = np.percentile(thinned, (1, 99), axis=0)
+    else:
+        low, high = seen.min(axis=0), seen.max(axis=0)
+    order = np.linspace(0, 1, len(value))
+    axes.plot(*seen.T, color=FAINT, linewidth=0.6, zorder=2)
+    axes.quiver(*seen.T, *looks.T, order, cmap="viridis", width=0.004, scale=22, zorder=3)
+    low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
+    pad = 0.08 * max(float((high - low).max()), 1e-6)
+    axes.set(xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad), aspect="equal")
+    axes.set_title(f"{len(value)} cameras from above, first dark to last light", fontsize=11, color=INK, loc="left")
+    axes.set_xlabel("metres" if value.metric else "world units", fontsize=9, color=INK)
+    axes.tick_params(labelsize=8, colors=INK)
+    axes.spines[["top", "right"]].set_visible(False)
+    return as_picture(figure)
+
+
+@_draw.register
+def _(value: Descriptors, context: Context) -> UInt8:
+    title = f"instance {value.instance_id}: {value.encoder}, {len(value.views)} views"
+    if value.encoder != ColourWords.name:
+        rows = [("dimensions", str(len(value.embedding))), ("length", f"{np.linalg.norm(value.embedding):.3f}")]
+        seen = zip(value.views, value.weights, strict=True)
+        return table_picture(title, [*rows, *((f"view {view}", f"{area:.0f} px") for view, area in seen)])
+    figure = blank(800, 420)
+    axes = figure.add_axes((0.12, 0.1, 0.84, 0.76))
+    colors = [_TERM_COLORS.get(term, term) for term in TERMS]
+    axes.barh(TERMS, value.embedding**2, color=colors, edgecolor="#b8bac0", linewidth=0.6)
+    axes.invert_yaxis()
+    axes.set(xlim=(0, 1))
+    axes.set_title(title, fontsize=11, color=INK, loc="left")
+    axes.tick_params(labelsize=9, colors=INK)
+    axes.spines[["top", "right"]].set_visible(False)
+    return as_picture(figure)
+
+
+@_draw.register
+def _(value: QueryResult, context: Context) -> UInt8:
+    rows: list[tuple[str, ...]] = [("instance", "score", "delta", "relevancy", "matches")]
+    for i, instance in enumerate(value.instance_id[:20]):
+        figures = (f"{x[i]:.3f}" for x in (value.score, value.delta, value.relevancy))
+        rows.append((str(instance), *figures, "yes" if value.matched[i] else "no"))
+    return table_picture(f"“{value.text}” ({value.encoder})", rows)
+
+
+@_draw.register
+def _(value: Metrics, context: Context) -> UInt8:
+    return table_picture("Metrics", [(name, f"{figure:.4f}") for name, figure in value.values.items()])

@@ -1,0 +1,96 @@
+"""instances.json: what each instance is called, where it is, and which file holds it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Float32, Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.deliver.palette import instance_color
+from ss_flow.tasks.semantics.name import InstanceNames
+
+
+def instances_document(
+    instances: Sequence[InstanceMasks],
+    gaussians: Gaussians | None,
+    names: InstanceNames | None,
+    frames: Sequence[Frame],
+    *,
+    parents: Mapping[int, int] | None = None,
+) -> dict[str, Any]:
+    """The content of instances.json, ready for `json.dumps`.
+
+    instances: after Split or refinement; the background (id 0) is left out. gaussians: the whole scene; without them an
+    instance has no Gaussians and its box is that of its points. names: without them, or where they know nothing, an
+    instance is "object 7" by its id. frames: of all views, in the scene's order. parents: id of a part -> id of the
+    whole.
+
+    Each instance has: id, name, named_by (the encoder, or null), color [r, g, b], parent (id or null), bbox {min, max}
+    and centroid in world units (null without points and Gaussians), views (names), confidence, num_points,
+    num_gaussians, weak, and file ("instances/0007.ply", null where it has no Gaussians). Names are unique: of several
+    "red object" the later ones, by id, are "red object 2" and so on.
+    """
+    known = sorted((i for i in instances if i.instance_id != 0), key=lambda i: i.instance_id)
+    called = _unique_names([i.instance_id for i in known], names)
+    rows_of = _rows_by_instance(gaussians)
+    entries = []
+    for instance in known:
+        rows = rows_of.get(instance.instance_id, np.zeros(0, np.intp))
+        places = gaussians.means[rows] if gaussians is not None and len(rows) else instance.points
+        entry = {
+            "id": instance.instance_id,
+            "name": called[instance.instance_id],
+            "named_by": names.encoder if names is not None and instance.instance_id in names.instance_id else None,
+            "color": list(instance_color(instance.instance_id)),
+            "parent": (parents or {}).get(instance.instance_id),
+            **_place(places),
+            "views": [frames[view].name for view in instance.view],
+            "confidence": round(float(instance.confidence), 4),
+            "num_points": len(instance.points),
+            "num_gaussians": len(rows),
+            "weak": bool(instance.weak),
+            "file": instance_file(instance.instance_id) if len(rows) else None,
+        }
+        entries.append(entry)
+    return {"version": 1, "background_id": 0, "instances": entries}
+
+
+def instance_file(instance_id: int) -> str:
+    """Where an instance's own PLY lies in the output folder: "instances/0007.ply"."""
+    return f"instances/{instance_id:04d}.ply"
+
+
+def _unique_names(ids: Sequence[int], names: InstanceNames | None) -> dict[int, str]:
+    given = {} if names is None else dict(zip(names.instance_id.tolist(), names.names, strict=True))
+    taken: Counter[str] = Counter()
+    called = {}
+    for instance_id in ids:
+        word = given.get(instance_id, "object")
+        taken[word] += 1
+        if word == "object":
+            called[instance_id] = f"object {instance_id}"
+        else:
+            called[instance_id] = word if taken[word] == 1 else f"{word} {taken[word]}"
+    return called
+
+
+def _rows_by_instance(gaussians: Gaussians | None) -> dict[int, np.ndarray]:
+    if gaussians is None or not len(gaussians):
+        return {}
+    order = np.argsort(gaussians.instance_id, kind="stable")
+    ids, starts = np.unique(gaussians.instance_id[order], return_index=True)
+    return dict(zip(ids.tolist(), np.split(order, starts[1:]), strict=True))
+
+
+def _place(points: Float32) -> dict[str, Any]:
+    if not len(points):
+        return {"bbox": None, "centroid": None}
+    corners = {"min": _rounded(points.min(axis=0)), "max": _rounded(points.max(axis=0))}
+    return {"bbox": corners, "centroid": _rounded(points.mean(axis=0, dtype=np.float64))}
+
+
+def _rounded(point: np.ndarray) -> list[float]:
+    return [round(float(x), 6) for x in point]

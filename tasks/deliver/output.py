@@ -1,0 +1,88 @@
+"""The output folder: everything a user takes away, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap, PointCloud, PointLabels
+from ss_flow.tasks.deliver import ply
+from ss_flow.tasks.geometry.images import encode_png
+
+RUN_FILE = "run.json"
+
+
+def check_place(folder: Path) -> None:
+    """Raises InputError unless an output folder can be written here: a new one, or in the place of an earlier one."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; --out must name a folder.")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / RUN_FILE).is_file():
+        raise InputError(f"{folder} holds something else than an earlier result; name another folder with --out.")
+    parent = next(p for p in folder.absolute().parents if p.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError(f"{folder} cannot be written: {parent} is not writable; name another folder with --out.")
+
+
+@contextmanager
+def replacing(folder: Path) -> Iterator[Path]:
+    """Yield a folder to fill, beside `folder`; when all went well it takes `folder`'s place.
+
+    A reader sees the old content or the new. After a crash the unfinished folder, whose name begins with a dot, may
+    remain; the next run takes it away.
+    """
+    folder = folder.absolute()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    for stale in folder.parent.glob(f".{folder.name}.*.partial"):
+        shutil.rmtree(stale, ignore_errors=True)
+    filling = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}.partial"
+    filling.mkdir()
+    try:
+        yield filling
+        if folder.exists():
+            old = filling.with_suffix(".old.partial")
+            folder.rename(old)
+            filling.rename(folder)
+            shutil.rmtree(old)
+        else:
+            filling.rename(folder)
+    finally:
+        shutil.rmtree(filling, ignore_errors=True)
+
+
+def write_scene(folder: Path, scene: Gaussians, instances: Mapping[str, Any]) -> None:
+    """Write scene.ply, scene_labeled.ply, instances.json, and a PLY file for every instance."""
+    ply.write_gaussians(folder / "scene.ply", scene)
+    ply.write_gaussians(folder / "scene_labeled.ply", scene, labelled=True)
+    (folder / "instances.json").write_text(json.dumps(instances, indent=1), encoding="utf-8")
+    (folder / "instances").mkdir()
+    from ss_flow.tasks.gaussians.initialise import select
+
+    for instance_id in np.unique(scene.instance_id):
+        if instance_id > 0:
+            one = select(scene, scene.instance_id == instance_id)
+            ply.write_gaussians(folder / "instances" / f"{instance_id:04d}.ply", one, labelled=True)
+
+
+def write_cloud(folder: Path, cloud: PointCloud, labels: PointLabels) -> None:
+    """Write cloud_labeled.ply."""
+    ply.write_cloud(folder / "cloud_labeled.ply", cloud, labels)
+
+
+def write_masks(folder: Path, frames: Sequence[Frame], maps: Sequence[LabelMap]) -> None:
+    """Write one uint16 PNG of instance ids per frame, at the size of the input photo."""
+    import cv2
+
+    folder.mkdir()
+    for frame, ids in zip(frames, maps, strict=True):
+        size = (frame.source_width, frame.source_height)
+        full = cv2.resize(ids.ids, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        (folder / f"{frame.name}.png").write_bytes(encode_png(full).tobytes())

@@ -1,0 +1,209 @@
+"""report.html: one file that shows a run, with its pictures inside; it loads nothing from anywhere."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, UInt8
+from ss_flow.tasks.deliver.draw import draw
+from ss_flow.tasks.deliver.palette import instance_colors
+from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
+from ss_flow.tasks.geometry.images import encode_png
+
+_KINDS = {
+    "photo": "Photo",
+    "masks_split": "Masks after Split",
+    "masks": "Masks after Splat",
+    "render": "Rendering",
+    "depth": "Depth",
+}
+_METRIC_NAMES = {
+    "miou": "mIoU",
+    "macc25": "mAcc @ 0.25",
+    "macc50": "mAcc @ 0.5",
+    "pq": "PQ",
+    "sq": "SQ",
+    "rq": "RQ",
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "ap": "AP",
+    "ap50": "AP @ 0.5",
+    "ap25": "AP @ 0.25",
+}
+_STAGES = {"split": "After Split", "splat": "After Splat", "novel_view": "Novel views", "openvocab": "Open vocabulary"}
+_WIDEST = 960
+
+
+def report_html(
+    run: Mapping[str, Any], *, pictures: Mapping[str, UInt8 | bytes], instances: Mapping[str, Any] | None = None
+) -> str:
+    """The report of a run.
+
+    run: the document of run.json ("status", "scene", "params", "models", "metrics", "nodes", "failures"; any may be
+    missing). pictures: each [H, W, 3] RGB or the bytes of a PNG or JPEG, under "view/kind" with the kinds photo,
+    masks_split, masks, render, depth, which are shown in one row a view; any other name is the picture's caption.
+    instances: the document of instances.json.
+    """
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = resources.files(__package__ or "").joinpath("report.html.jinja").read_text(encoding="utf-8")
+    views, others = _views(pictures)
+    nodes = list(run.get("nodes") or ())
+    return environment.from_string(template).render(
+        scene=PurePath(str(run.get("scene") or "")).name or "scene",
+        status=run.get("status") or "unknown",
+        models=_flat(run.get("models") or {}),
+        metrics=_metrics(run.get("metrics") or {}),
+        params=_flat(run.get("params") or {}),
+        failures=[_failure(failure) for failure in run.get("failures") or ()],
+        steps=_steps(nodes),
+        hits=sum(bool(node.get("hit")) for node in nodes),
+        misses=sum(not node.get("hit") for node in nodes),
+        seconds=_duration(sum(float(node.get("seconds") or 0) for node in nodes if not node.get("hit"))),
+        peak=max((float(node.get("peak_rss_mb") or 0) for node in nodes), default=0.0),
+        views=views,
+        others=others,
+        instances=(instances or {}).get("instances", []),
+    )
+
+
+def report_pictures(
+    frames: Sequence[Frame],
+    cameras: Cameras,
+    depths: Sequence[DepthMap],
+    split_maps: Sequence[LabelMap],
+    maps: Sequence[LabelMap],
+    scene: Gaussians,
+    *,
+    count: int = 3,
+) -> dict[str, UInt8]:
+    """The pictures of a report: `count` views, evenly chosen, and the scene's Gaussians and cameras.
+
+    All lists are in the order of the frames. An empty scene has no renderings.
+    """
+    chosen = sorted({int(k) for k in (np.arange(count) + 0.5) * len(frames) / count})
+    pictures: dict[str, UInt8] = {}
+    for k in chosen:
+        name = frames[k].name
+        pictures[f"{name}/photo"] = draw(frames[k])
+        pictures[f"{name}/masks_split"] = draw(split_maps[k], frame=frames[k])
+        pictures[f"{name}/masks"] = draw(maps[k], frame=frames[k])
+        if len(scene):
+            pictures[f"{name}/render"] = draw(scene, cameras=cameras, view=k)
+        pictures[f"{name}/depth"] = draw(depths[k])
+    if len(scene):
+        colors = instance_colors(int(scene.instance_id.max()) + 1)[scene.instance_id]
+        camera = orbit_camera(scene.means, cameras)
+        spacing = 2 * float(np.exp(np.median(scene.log_scales)))
+        pictures["Instances"] = draw_points(scene.means, colors, camera, spacing)
+    pictures["Cameras"] = draw(cameras)
+    return pictures
+
+
+def _views(pictures: Mapping[str, UInt8 | bytes]) -> tuple[list[dict[str, Any]], list[dict[str, str]]]:
+    rows: dict[str, dict[str, str]] = {}
+    others = []
+    for name, picture in pictures.items():
+        view, _, kind = name.rpartition("/")
+        if view and kind in _KINDS:
+            rows.setdefault(view, {})[kind] = data_uri(picture)
+        else:
+            others.append({"caption": name, "uri": data_uri(picture)})
+    views = [
+        {"name": view, "pictures": [{"caption": _KINDS[kind], "uri": found[kind]} for kind in _KINDS if kind in found]}
+        for view, found in rows.items()
+    ]
+    return views, others
+
+
+def data_uri(picture: UInt8 | bytes) -> str:
+    """A picture as a data URI; arrays are scaled down to 960 px and become PNG or JPEG, whichever is smaller."""
+    import cv2
+
+    if isinstance(picture, bytes):
+        data = picture
+    else:
+        scale = _WIDEST / picture.shape[1]
+        if scale < 1:
+            size = (_WIDEST, max(1, round(picture.shape[0] * scale)))
+            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        jpeg = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 88])[
+            1
+        ].tobytes()
+        data = min(encode_png(picture).tobytes(), jpeg, key=len)
+    kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def _metrics(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
+    groups: list[dict[str, Any]] = []
+    loose = []
+    for stage, values in metrics.items():
+        if isinstance(values, Mapping):
+            figures = [(_METRIC_NAMES.get(name, name), _figure(name, value)) for name, value in values.items()]
+            groups.append({"stage": _STAGES.get(stage, stage), "figures": figures})
+        else:
+            loose.append((_METRIC_NAMES.get(stage, stage), _figure(stage, values)))
+    return groups + ([{"stage": "Measured", "figures": loose}] if loose else [])
+
+
+def _figure(name: str, value: object) -> str:
+    if not isinstance(value, int | float):
+        return "–" if value is None else str(value)
+    return f"{value:.2f} dB" if name == "psnr" else f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _steps(nodes: list[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Nodes of one step together, in the order in which the steps first appear."""
+    found: dict[str, dict[str, Any]] = {}
+    for node in nodes:
+        step = found.setdefault(str(node.get("step", "?")), {"hits": 0, "misses": 0, "seconds": 0.0})
+        if node.get("hit"):
+            step["hits"] += 1
+        else:
+            step["misses"] += 1
+            step["seconds"] += float(node.get("seconds") or 0)
+    longest = max((step["seconds"] for step in found.values()), default=0.0)
+    return [
+        {
+            "name": name,
+            "nodes": step["hits"] + step["misses"],
+            "hits": step["hits"],
+            "time": _duration(step["seconds"]) if step["misses"] else "from the cache",
+            "share": 100 * step["seconds"] / longest if longest > 0 else 0.0,
+        }
+        for name, step in found.items()
+    ]
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.2f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def _flat(values: object, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested parameters as dotted names and text, in their own order."""
+    if isinstance(values, Mapping):
+        rows = []
+        for name, value in values.items():
+            rows += _flat(value, f"{prefix}.{name}" if prefix else str(name))
+        return rows
+    text = "–" if values is None else f"{values:g}" if isinstance(values, float) else str(values)
+    return [(prefix, text)]
+
+
+def _failure(failure: object) -> str:
+    if not isinstance(failure, Mapping):
+        return str(failure)
+    place = " ".join(str(failure[key]) for key in ("label", "step", "item") if failure.get(key) not in (None, ""))
+    reason = str(failure.get("error") or failure.get("reason") or failure.get("message") or "failed")
+    return f"{place}: {reason}" if place else reason

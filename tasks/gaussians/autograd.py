@@ -1,0 +1,57 @@
+"""The native rasterizer as a torch function (imports torch: import it inside functions)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
+from ss_flow.tasks.gaussians.rasterize import NAMES, GaussianTensors, Rendered
+from ss_flow.tasks.geometry.cameras import Camera
+
+
+def rasterize_cpu(
+    gaussians: GaussianTensors,
+    camera: Camera,
+    background: Tensor,
+    labels: Tensor | None,
+    num_labels: int,
+    sh_degree: int,
+    near_plane: float,
+    antialias: bool,
+    winners: bool,
+) -> Rendered:
+    """`rasterize` on the CPU, its arguments checked."""
+    red, green, blue = background.detach().tolist()
+    settings = Settings((red, green, blue), num_labels, sh_degree, near_plane, antialias, winners)
+    channels = None if labels is None else np.ascontiguousarray(labels.numpy())
+    centers = torch.zeros(len(gaussians), 2)
+    rgb, alpha, depth, masks, top, radii, strongest = _Rasterize.apply(
+        *gaussians.tensors(), background, channels, camera, settings, centers
+    )
+    return Rendered(rgb, alpha, depth, masks, top, radii, strongest, centers)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        channels, camera, settings, centers = arguments[6:]
+        parameters = tuple(np.ascontiguousarray(t.detach().numpy()) for t in arguments[:5])
+        done = NativePass(parameters, channels, camera, settings)  # type: ignore[arg-type]
+        ctx.done, ctx.centers = done, centers
+        ctx.set_materialize_grads(False)
+        images = (done.rgb, done.alpha, done.depth, done.masks, done.top, done.radii, done.strongest)
+        outputs = tuple(torch.from_numpy(a) for a in images)
+        ctx.mark_non_differentiable(*outputs[4:])
+        return outputs
+
+    @staticmethod
+    def backward(ctx: Any, *towards: Tensor | None) -> tuple[Any, ...]:
+        given = [None if t is None else np.ascontiguousarray(t.numpy()) for t in towards[:4]]
+        out = ctx.done.backward(*given)
+        ctx.centers += torch.from_numpy(out["centers"])
+        gradients = [torch.from_numpy(out[name]) for name in (*NAMES, "background")]
+        return (*gradients, None, None, None, None)

@@ -1,0 +1,102 @@
+"""The same rendering by gsplat on CUDA (imports torch and gsplat: import it inside functions)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered
+from ss_flow.tasks.geometry.cameras import Camera
+
+
+def rasterize_cuda(
+    gaussians: GaussianTensors,
+    camera: Camera,
+    background: Tensor,
+    labels: Tensor | None,
+    num_labels: int,
+    sh_degree: int,
+    near_plane: float,
+    antialias: bool,
+    winners: bool,
+) -> Rendered:
+    """`rasterize` on CUDA, its arguments checked.
+
+    gsplat ends a pixel and cuts small contributions by its own thresholds, so results agree with the CPU's to about a
+    grey level. It gives no winners: with `winners` this raises NotImplementedError.
+    """
+    if winners:
+        raise NotImplementedError("top contributors are found on the CPU only: render with CPU tensors")
+    from gsplat import rasterization
+    from gsplat.cuda._wrapper import spherical_harmonics
+
+    device = gaussians.means.device
+    pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32, device=device)
+    intrinsics = torch.tensor(
+        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=device
+    )
+    center = -pose[:3, :3].T @ pose[:3, 3]
+    used = (sh_degree + 1) ** 2
+    colors = spherical_harmonics(sh_degree, gaussians.means - center, gaussians.sh[:, :used].contiguous())
+    channels = [torch.clamp(colors + 0.5, min=0)]
+    if labels is not None:
+        one_hot = torch.zeros(len(gaussians), num_labels, device=device)
+        rows = torch.nonzero(labels >= 0)[:, 0]
+        one_hot[rows, labels[rows].long()] = 1
+        channels.append(one_hot)
+    images, alphas, info = _render(rasterization, gaussians, channels, pose, intrinsics, camera, near_plane, antialias)
+    image, alpha = images[0], alphas[0, :, :, 0]
+    radii = info["radii"][0].float()
+    size = (camera.height, camera.width)
+    return Rendered(
+        rgb=image[..., :3] + (1 - alpha)[..., None] * background,
+        alpha=alpha,
+        depth=image[..., -1],
+        label_masks=image[..., 3:-1].permute(2, 0, 1),
+        top_contributor=torch.full(size, -1, dtype=torch.int32, device=device),
+        radii=radii.amax(dim=-1) if radii.dim() == 2 else radii,
+        max_contribution=torch.zeros(len(gaussians), device=device),
+        center_gradient=_center_gradient(info["means2d"]),
+    )
+
+
+def _render(
+    rasterization: Any,
+    gaussians: GaussianTensors,
+    channels: list[Tensor],
+    pose: Tensor,
+    intrinsics: Tensor,
+    camera: Camera,
+    near_plane: float,
+    antialias: bool,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    images, alphas, info = rasterization(
+        means=gaussians.means,
+        quats=torch.nn.functional.normalize(gaussians.quaternions, dim=1),
+        scales=torch.exp(gaussians.log_scales),
+        opacities=torch.sigmoid(gaussians.opacity_logits),
+        colors=torch.cat(channels, dim=1),
+        viewmats=pose[None],
+        Ks=intrinsics[None],
+        width=camera.width,
+        height=camera.height,
+        near_plane=near_plane,
+        render_mode="RGB+D",
+        rasterize_mode="antialiased" if antialias else "classic",
+        packed=False,
+    )
+    return images, alphas, info
+
+
+def _center_gradient(means2d: Tensor) -> Tensor:
+    """[N, 2], filled when a backward pass reaches the projected means ([1, N, 2])."""
+    out = torch.zeros(means2d.shape[-2:], device=means2d.device)
+    if means2d.requires_grad:
+
+        def collect(gradient: Tensor) -> None:
+            out.add_(gradient.reshape(out.shape))
+
+        means2d.register_hook(collect)
+    return out

@@ -1,0 +1,76 @@
+"""Gaussians from points, and rows of Gaussians joined and picked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ss_flow.tasks.artifacts import Float32, Gaussians, Int32, UInt8
+
+SH_ZERO = 0.28209479177387814
+"""The constant basis function, sqrt(1 / (4 pi))."""
+
+
+def initialise(
+    points: Float32,
+    colors: UInt8,
+    instance_id: int | Int32,
+    confidence: float | Float32,
+    *,
+    sh_degree: int = 0,
+    opacity: float = 0.1,
+) -> Gaussians:
+    """Round Gaussians at points (spec P1).
+
+    points: [N, 3] world, N >= 1. colors: [N, 3] RGB. instance_id, confidence: one for all, or [N]. The standard
+    deviation is the root of the mean squared distance to the three nearest other points. Raises ValueError when the
+    shapes do not fit.
+    """
+    from scipy.spatial import cKDTree
+
+    n = len(points)
+    if n == 0 or points.shape != (n, 3) or colors.shape != (n, 3):
+        raise ValueError(f"points {points.shape} and colors {colors.shape} must both be [N, 3] with N >= 1")
+    spread = np.full(n, 0.01)
+    if n > 1:
+        near, _ = cKDTree(points).query(points, k=min(4, n), workers=1)
+        spread = np.sqrt(np.square(near[:, 1:]).mean(axis=1))
+        # Coincident points would give a scale of 0, a logarithm without end.
+        spread = np.maximum(spread, 1e-3 * max(float(np.median(spread)), 1e-6))
+    sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = (colors / 255.0 - 0.5) / SH_ZERO
+    return Gaussians(
+        means=np.ascontiguousarray(points, np.float32),
+        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        log_scales=np.repeat(np.log(spread).astype(np.float32)[:, None], 3, axis=1),
+        opacity_logits=np.full(n, np.log(opacity / (1 - opacity)), np.float32),
+        sh=sh,
+        instance_id=np.broadcast_to(np.asarray(instance_id, np.int32), (n,)).copy(),
+        instance_conf=np.broadcast_to(np.asarray(confidence, np.float32), (n,)).copy(),
+        part_id=np.zeros(n, np.int32),
+    )
+
+
+def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The same Gaussians with room for (at least) a degree: missing coefficients are 0."""
+    missing = (degree + 1) ** 2 - gaussians.sh.shape[1]
+    if missing <= 0:
+        return gaussians
+    arrays = {f.name: getattr(gaussians, f.name) for f in fields(Gaussians)}
+    arrays["sh"] = np.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0)))
+    return Gaussians(**arrays)
+
+
+def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+    """All rows of several sets, one after the other; lower SH degrees are filled with 0. Needs at least one set."""
+    degree = round(max(p.sh.shape[1] for p in parts) ** 0.5) - 1
+    same = [with_sh_degree(p, degree) for p in parts]
+    return Gaussians(**{f.name: np.concatenate([getattr(p, f.name) for p in same]) for f in fields(Gaussians)})
+
+
+def select(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.integer]) -> Gaussians:
+    """Some rows, by mask or by index."""
+    return Gaussians(**{f.name: getattr(gaussians, f.name)[rows] for f in fields(Gaussians)})

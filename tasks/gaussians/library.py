@@ -1,0 +1,106 @@
+"""The native library: finds the build that suits this machine's processor and declares its C interface."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_INT32, _INT64, _DOUBLE, _FLOAT, _POINTER = (
+    ctypes.c_int32,
+    ctypes.c_int64,
+    ctypes.c_double,
+    ctypes.c_float,
+    ctypes.c_void_p,
+)
+
+
+class Scene(ctypes.Structure):
+    """`Scene` of native/scene.h."""
+
+    _fields_ = (
+        ("count", _INT64),
+        *((name, _POINTER) for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "labels")),
+        *((name, _INT32) for name in ("sh_coefficients", "sh_degree", "num_labels", "width", "height", "antialias")),
+        *((name, _DOUBLE) for name in ("fx", "fy", "cx", "cy")),
+        ("world_to_camera", _DOUBLE * 12),
+        ("near_plane", _DOUBLE),
+        ("background", _FLOAT * 3),
+    )
+
+
+class Images(ctypes.Structure):
+    """`Images` of native/scene.h."""
+
+    _fields_ = tuple((name, _POINTER) for name in ("rgb", "alpha", "depth", "masks", "top", "radii", "strongest"))
+
+
+class Gradients(ctypes.Structure):
+    """`Gradients` of native/scene.h."""
+
+    _fields_ = tuple(
+        (name, _POINTER)
+        for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "centers", "background")
+    )
+
+
+_NEEDS = {"avx512": {"avx512f", "avx512bw", "avx512dq", "avx512vl", "fma"}, "avx2": {"avx2", "fma"}, "baseline": set()}
+
+
+def _processor_flags() -> set[str]:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("flags"):
+                return set(line.split(":", 1)[1].split())
+    if platform.system() == "Darwin" and platform.machine() == "x86_64":
+        return {"avx2", "fma"}
+    return set()
+
+
+@functools.cache
+def instruction_set() -> str:
+    """The widest instruction set that this processor has and the library was built for."""
+    flags, folder = _processor_flags(), Path(__file__).parent
+    for name, needs in _NEEDS.items():
+        if needs <= flags and (folder / f"_rasterizer_{name}.so").exists():
+            return name
+    raise RuntimeError(
+        f"The CPU rasterizer is not built in {folder}: install the package again with a C++17 compiler at hand."
+    )
+
+
+@functools.cache
+def library(name: str | None = None) -> Any:
+    """The native library, opened; name: an instruction set, by default the processor's widest."""
+    lib = ctypes.CDLL(str(Path(__file__).parent / f"_rasterizer_{name or instruction_set()}.so"))
+    by_reference = ctypes.POINTER
+    lib.ss_rasterize.argtypes = [by_reference(Scene), by_reference(Images)]
+    lib.ss_rasterize.restype = _POINTER
+    lib.ss_rasterize_backward.argtypes = [
+        _POINTER,
+        by_reference(Scene),
+        by_reference(Images),
+        by_reference(Images),
+        by_reference(Gradients),
+    ]
+    lib.ss_rasterize_backward.restype = ctypes.c_int
+    lib.ss_rasterize_release.argtypes = [_POINTER]
+    lib.ss_rasterize_release.restype = None
+    lib.ss_photometric.argtypes = [_INT32, _INT32, _INT32, _POINTER, _POINTER, _POINTER, _FLOAT, _POINTER, _POINTER]
+    lib.ss_photometric.restype = ctypes.c_int
+    lib.ss_weighted_l1.argtypes = [_INT64, _POINTER, _POINTER, _POINTER, _POINTER]
+    lib.ss_weighted_l1.restype = _DOUBLE
+    lib.ss_adam.argtypes = [_INT64, _POINTER, _POINTER, _POINTER, _POINTER, _DOUBLE, _INT64, _DOUBLE]
+    lib.ss_adam.restype = None
+    return lib
+
+
+def address(array: NDArray[np.float32] | NDArray[np.int32] | None) -> int | None:
+    """Where a C-contiguous array lies, None for None."""
+    return None if array is None else array.ctypes.data

@@ -1,0 +1,47 @@
+// The plain C data that cross the border to Python.
+#pragma once
+
+#include <cstdint>
+
+extern "C" {
+
+struct Scene {
+    int64_t count;
+    const float* means;           // [N, 3] world
+    const float* quaternions;     // [N, 4] w x y z, any length
+    const float* log_scales;      // [N, 3]
+    const float* opacity_logits;  // [N]
+    const float* sh;              // [N, sh_coefficients, 3]
+    const int32_t* labels;        // [N] channel of the label masks, < 0 = none; null without masks
+    int32_t sh_coefficients;      // stored
+    int32_t sh_degree;            // used, 0..3
+    int32_t num_labels;
+    int32_t width, height;
+    int32_t antialias;
+    double fx, fy, cx, cy;
+    double world_to_camera[12];   // rows of [R | t]
+    double near_plane;
+    float background[3];
+};
+
+// Outputs of the forward pass, or gradients towards them (null = zero).
+struct Images {
+    float* rgb;        // [H, W, 3] over the background
+    float* alpha;      // [H, W]
+    float* depth;      // [H, W] sum of weight * z
+    float* masks;      // [L, H, W]
+    int32_t* top;      // [H, W] row of the largest weight, -1 = none; null when not wanted
+    float* radii;      // [N] pixels, 0 = not in view
+    float* strongest;  // [N] largest weight over the image; null when not wanted
+};
+
+struct Gradients {
+    float* means;
+    float* quaternions;
+    float* log_scales;
+    float* opacity_logits;
+    float* sh;
+    float* centers;     // [N, 2] towards the projected mean, pixels
+    float* background;  // [3]
+};
+}

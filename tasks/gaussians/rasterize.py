@@ -1,0 +1,177 @@
+"""The differentiable rasterizer: 3D Gaussians to images (Kerbl et al. 2023), on the CPU or on CUDA.
+
+Per pixel, front to back: alpha = min(0.99, opacity * exp(-q / 2)), nothing below 1/255 counts, and a pixel is done
+before its transmittance T would fall below 1e-4; weight = T * alpha. A Gaussian's screen covariance is widened by
+0.3 pixels^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Gaussians, Int32
+from ss_flow.tasks.gaussians.library import instruction_set
+from ss_flow.tasks.geometry.cameras import Camera
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+NEAR_PLANE = 0.01
+"""Nearest depth that is drawn, in world units."""
+
+NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+@dataclass
+class GaussianTensors:
+    """The parameters of 3D Gaussians as float32 tensors of one device, in the conventions of `Gaussians`."""
+
+    means: Tensor
+    """[N, 3] world."""
+    quaternions: Tensor
+    """[N, 4] w x y z, of any length but 0."""
+    log_scales: Tensor
+    """[N, 3]."""
+    opacity_logits: Tensor
+    """[N]."""
+    sh: Tensor
+    """[N, K, 3], K = 1, 4, 9 or 16."""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The five parameters in the order of `NAMES`."""
+        return self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, *, device: str = "cpu", requires_grad: bool = False) -> GaussianTensors:
+        """Copies of an artifact's arrays."""
+        import torch
+
+        return cls(
+            *(
+                torch.tensor(np.asarray(getattr(gaussians, name), np.float32), device=device).requires_grad_(
+                    requires_grad
+                )
+                for name in NAMES
+            )
+        )
+
+    def to_gaussians(self, *, instance_id: Int32, instance_conf: Any, part_id: Int32) -> Gaussians:
+        """The artifact, with quaternions of unit length and the given labels ([N] each)."""
+        means, quaternions, log_scales, opacity_logits, sh = (t.detach().cpu().numpy().copy() for t in self.tensors())
+        quaternions /= np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
+        return Gaussians(
+            means,
+            quaternions,
+            log_scales,
+            opacity_logits,
+            sh,
+            instance_id,
+            np.asarray(instance_conf, np.float32),
+            part_id,
+        )
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """One rendering; the first four are differentiable."""
+
+    rgb: Tensor
+    """[H, W, 3] composited over the background."""
+    alpha: Tensor
+    """[H, W] sum of the weights."""
+    depth: Tensor
+    """[H, W] sum of weight * z; divide by alpha for the expected depth."""
+    label_masks: Tensor
+    """[L, H, W] sum of the weights of the Gaussians of each label."""
+    top_contributor: Tensor
+    """[H, W] int32 row of the Gaussian with the largest weight, -1 = none; all -1 without `winners`."""
+    radii: Tensor
+    """[N] reach on the screen in pixels, 0 = not in view."""
+    max_contribution: Tensor
+    """[N] largest weight over the image; zeros without `winners`."""
+    center_gradient: Tensor
+    """[N, 2] after `backward`: gradient towards the projected means, per pixel; zeros before."""
+
+
+def backend_identity(device: str = "cpu") -> dict[str, str]:
+    """What a rendering depends on besides its inputs: the instruction set, or the CUDA rasterizer's version."""
+    if device == "cpu":
+        return {"rasterizer": instruction_set()}
+    from importlib.metadata import version
+
+    import torch
+
+    return {"rasterizer": f"gsplat {version('gsplat')} on {torch.cuda.get_device_name(device)}"}
+
+
+def rasterize(
+    gaussians: GaussianTensors,
+    camera: Camera,
+    *,
+    background: Tensor | tuple[float, float, float],
+    labels: Tensor | None = None,
+    num_labels: int = 0,
+    sh_degree: int | None = None,
+    near_plane: float = NEAR_PLANE,
+    antialias: bool = False,
+    winners: bool = False,
+) -> Rendered:
+    """Render 3D Gaussians.
+
+    background: [3] RGB, differentiable when a tensor. labels: [N] int32, the mask channel (0 <= label < num_labels) of
+    each Gaussian, negative = none. sh_degree: the degree in use, by default all that is stored. antialias: lower the
+    opacity by what the 0.3 pixels^2 add to the area (Mip-Splatting, Yu et al. 2024). winners: also find
+    `top_contributor` and `max_contribution`.
+
+    Raises ValueError when shapes or types do not fit, a parameter is not finite, or the image is empty.
+    """
+    import torch
+
+    stored = _check(gaussians, labels, num_labels, camera)
+    degree = stored if sh_degree is None else min(sh_degree, stored)
+    if not isinstance(background, torch.Tensor):
+        background = torch.tensor(background, dtype=torch.float32, device=gaussians.means.device)
+    if background.shape != (3,):
+        raise ValueError(f"background must be [3], not {list(background.shape)}")
+    if gaussians.means.is_cuda:
+        from ss_flow.tasks.gaussians.cuda import rasterize_cuda
+
+        return rasterize_cuda(gaussians, camera, background, labels, num_labels, degree, near_plane, antialias, winners)
+    from ss_flow.tasks.gaussians.autograd import rasterize_cpu
+
+    return rasterize_cpu(gaussians, camera, background, labels, num_labels, degree, near_plane, antialias, winners)
+
+
+def _check(gaussians: GaussianTensors, labels: Tensor | None, num_labels: int, camera: Camera) -> int:
+    import torch
+
+    n = len(gaussians.means)
+    for name, tensor, shape in zip(NAMES, gaussians.tensors(), ((3,), (4,), (3,), (), (None, 3)), strict=True):
+        fits = tensor.dim() == len(shape) + 1 and len(tensor) == n
+        if not fits or any(s is not None and s != t for s, t in zip(shape, tensor.shape[1:], strict=True)):
+            expected = ", ".join(["N", *("K" if s is None else str(s) for s in shape)])
+            raise ValueError(f"{name} must be [{expected}] with N = {n}, not {list(tensor.shape)}")
+        if tensor.dtype != torch.float32:
+            raise ValueError(f"{name} must be float32, not {tensor.dtype}")
+        # A sum is finite only where all terms are; one that overflows is looked at term by term.
+        if not bool(torch.isfinite(tensor.detach().sum())) and not bool(torch.isfinite(tensor.detach()).all()):
+            raise ValueError(f"{name} holds values that are not finite")
+    degrees = {1: 0, 4: 1, 9: 2, 16: 3}
+    if gaussians.sh.shape[1] not in degrees:
+        raise ValueError(f"sh must hold 1, 4, 9 or 16 coefficients, not {gaussians.sh.shape[1]}")
+    if (labels is None) != (num_labels == 0):
+        raise ValueError("labels and num_labels go together")
+    if labels is not None:
+        if labels.shape != (n,) or labels.dtype != torch.int32:
+            raise ValueError(f"labels must be [{n}] int32, not {list(labels.shape)} {labels.dtype}")
+        if n and int(labels.max()) >= num_labels:
+            raise ValueError(f"labels must be below num_labels = {num_labels}, but one is {int(labels.max())}")
+    if camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
+        raise ValueError(f"a camera needs pixels and positive focal lengths, not {camera}")
+    return degrees[gaussians.sh.shape[1]]

@@ -1,0 +1,72 @@
+"""Rendering without gradients, arrays in and arrays out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
+from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
+from ss_flow.tasks.gaussians.rasterize import NAMES, NEAR_PLANE
+from ss_flow.tasks.geometry.cameras import Camera
+
+OPAQUE_LOGIT = 20.0
+"""Opacity 1 in float32."""
+
+
+class Rendering(NamedTuple):
+    """One rendering."""
+
+    rgb: Float32
+    """[H, W, 3] composited over the background; may exceed 1."""
+    alpha: Float32
+    """[H, W]."""
+    depth: Float32
+    """[H, W] sum of weight * z; divide by alpha for the expected depth."""
+    label_masks: Float32
+    """[L, H, W] sum of the weights of each label's Gaussians."""
+    top_contributor: Int32
+    """[H, W] row of the Gaussian with the largest weight T * alpha, -1 = none."""
+    visible: Bool
+    """[N] reaches the image."""
+    max_contribution: Float32
+    """[N] largest weight over the image."""
+
+
+def channels_of(instance_id: Int32, label_ids: Sequence[int]) -> Int32:
+    """The mask channel of each Gaussian: the place of its id in `label_ids`, -1 where it is not there."""
+    channels = np.full(len(instance_id), -1, np.int32)
+    for channel, label in enumerate(label_ids):
+        channels[instance_id == label] = channel
+    return channels
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    opaque: bool = False,
+    label_ids: Sequence[int] = (),
+    antialias: bool = False,
+) -> Rendering:
+    """Render Gaussians on the CPU.
+
+    opaque: every opacity 1, with the falloff kept (spec P2). label_ids: instance ids, one mask channel each.
+    Raises ValueError when a parameter is not finite.
+    """
+    if opaque:
+        gaussians = replace(gaussians, opacity_logits=np.full(len(gaussians), OPAQUE_LOGIT, np.float32))
+    parameters = tuple(np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in NAMES)
+    for name, array in zip(NAMES, parameters, strict=True):
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} holds values that are not finite")
+    labels = channels_of(gaussians.instance_id, label_ids) if len(label_ids) else None
+    degree = round(gaussians.sh.shape[1] ** 0.5) - 1
+    red, green, blue = background
+    settings = Settings((red, green, blue), len(label_ids), degree, NEAR_PLANE, antialias, winners=True)
+    done = NativePass(parameters, labels, camera, settings)  # type: ignore[arg-type]
+    return Rendering(done.rgb, done.alpha, done.depth, done.masks, done.top, done.radii > 0, done.strongest)

@@ -1,0 +1,64 @@
+"""Density-based clustering of points in space."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
+
+
+def dbscan(points: Float32 | Float64, eps: float, min_samples: int) -> Int32:
+    """DBSCAN (Ester et al. 1996): [N] cluster of each point, -1 for noise.
+
+    points: [N, 3]; eps: neighbourhood radius, inclusive, in the points' unit; min_samples: how many points, itself
+    among them, make a core point. Clusters are numbered by their first core point; a border point within reach of
+    several clusters joins the lowest.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    count = len(points)
+    cluster = np.full(count, -1, np.int32)
+    if not count:
+        return cluster
+    pairs = cKDTree(points).query_pairs(eps, output_type="ndarray")
+    core = np.bincount(pairs.ravel(), minlength=count) + 1 >= min_samples
+    a, b = pairs[core[pairs].all(axis=1)].T
+    _, component = connected_components(
+        coo_array((np.ones(len(a), bool), (a, b)), shape=(count, count)), directed=False
+    )
+    _, first, inverse = np.unique(component[core], return_index=True, return_inverse=True)
+    cluster[core] = np.argsort(np.argsort(first))[inverse]
+
+    reach = np.concatenate([pairs, pairs[:, ::-1]])
+    reach = reach[~core[reach[:, 0]] & core[reach[:, 1]]]
+    joined = np.full(count, count, np.int32)
+    np.minimum.at(joined, reach[:, 0], cluster[reach[:, 1]])
+    border = joined < count
+    cluster[border] = joined[border]
+    return cluster
+
+
+def main_clusters(points: Float32 | Float64, eps: float, min_samples: int, keep_share: float) -> Bool:
+    """[N] which points lie in a cluster worth keeping: the largest, and all with at least `keep_share` of the points.
+
+    All points are kept where none is dense enough to form a cluster. Arguments as in `dbscan`.
+    """
+    cluster = dbscan(points, eps, min_samples)
+    if not len(points) or cluster.max() < 0:
+        return np.ones(len(points), bool)
+    size = np.bincount(cluster[cluster >= 0])
+    keep = size >= keep_share * len(points)
+    keep[size.argmax()] = True
+    return (cluster >= 0) & keep[cluster]
+
+
+def nearest_spacing(points: Float32 | Float64) -> float:
+    """Median distance of the points [N, 3] to their nearest neighbour; 0.0 for fewer than two points."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 2:
+        return 0.0
+    distance = np.asarray(cKDTree(points).query(points, k=2)[0])
+    return float(np.median(distance[:, 1]))

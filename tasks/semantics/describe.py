@@ -1,0 +1,114 @@
+"""One vector for each instance: what a text-image encoder sees of it (Split&Splat, Sec. 4.2; spec rows 38-40)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.events import progress
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, UInt8
+from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.ranges import Count, Fraction, Natural, Positive
+from ss_flow.tasks.semantics.encoders import encoder_of
+from ss_flow.tasks.split.erosion import ErosionParams, erode
+
+
+@dataclass(frozen=True)
+class DescribeParams:
+    """How the pictures of an instance are cut out."""
+
+    background: Literal["blur", "black", "white"] = "blur"
+    """What takes the place of the pixels around the instance; without effect for an encoder that sees masks."""
+    blur_radius: Positive = 10.0
+    """Standard deviation of the blur, pixels of the photo."""
+    margin_px: Natural = 10
+    """Pixels added on every side of the square box around the mask."""
+    box_scale: Positive = 1.05
+    """Factor on the side of that box."""
+    crop_side: Count = 224
+    """Side of the picture that the encoder gets, pixels."""
+    max_views: Count = 10
+    """How many views go in, those with the largest masks first."""
+    min_area: Fraction = 0.002
+    """Share of the image that a mask must cover for its view to go in."""
+    erosion: ErosionParams = ErosionParams()
+    """How much of the mask's border is left out."""
+
+
+@task(resources=Resources(cores=1, memory_mb=1200), uses=("opencv-contrib-python-headless", "onnxruntime"))
+def describe(
+    frames: tuple[Frame, ...],
+    instance: InstanceMasks,
+    *,
+    encoder: Model | None = None,
+    params: DescribeParams = DescribeParams(),
+) -> Descriptors:
+    """The mean of an instance's pictures, as unit vectors weighted by visible area, brought back to unit length.
+
+    frames: all views of the scene, in the order that `instance.view` counts. encoder: None for colour words.
+    Returns zeros and no views when no mask covers `min_area` of its image.
+    Raises InputError when a frame's size is not that of the masks.
+    """
+    model = encoder_of(encoder)
+    masks = instance.dense()
+    area = masks.sum(axis=(1, 2))
+    large = np.argsort(-area, kind="stable")[: params.max_views]
+    chosen = np.sort(large[area[large] >= max(1, params.min_area * instance.height * instance.width)])
+    vectors = []
+    for done, row in enumerate(chosen):
+        frame = frames[instance.view[row]]
+        if (frame.height, frame.width) != (instance.height, instance.width):
+            raise InputError(
+                f"Frame {frame.name} is {frame.width} x {frame.height} pixels and the masks of instance "
+                f"{instance.instance_id} are {instance.width} x {instance.height}; both must have one size."
+            )
+        mask = erode(masks[row], params.erosion)
+        image = decode_rgb(frame)
+        if model.sees_masks:
+            x0, y0, x1, y1 = _bounds(mask)
+            vectors.append(model.encode_images([image[y0:y1, x0:x1]], [mask[y0:y1, x0:x1]])[0])
+        else:
+            vectors.append(model.encode_images([crop(image, mask, params)])[0])
+        progress(done + 1, len(chosen), frame.name)
+    weights = area[chosen].astype(np.float32)
+    total = np.einsum("v,vd->d", weights, np.array(vectors, np.float32).reshape(len(chosen), model.dimension))
+    length = np.linalg.norm(total)
+    embedding = (total / length if length > 0 else total).astype(np.float32)
+    return Descriptors(instance.instance_id, embedding, instance.view[chosen].astype(np.int32), weights, model.name)
+
+
+def crop(image: UInt8, mask: Bool, params: DescribeParams) -> UInt8:
+    """The square around a mask with all else blurred or painted over: [crop_side, crop_side, 3].
+
+    image: [H, W, 3]; mask: [H, W], not empty. Where the square leaves the image, its border pixels repeat.
+    """
+    import cv2
+
+    x0, y0, x1, y1 = _bounds(mask)
+    side = max(x1 - x0, y1 - y0) + 2 * params.margin_px
+    side = round(side * params.box_scale)
+    left, top = (x0 + x1 - side) // 2, (y0 + y1 - side) // 2
+    rows = np.clip(np.arange(top, top + side), 0, image.shape[0] - 1)
+    columns = np.clip(np.arange(left, left + side), 0, image.shape[1] - 1)
+    inside = np.outer((rows == np.arange(top, top + side)), (columns == np.arange(left, left + side)))
+    square, keep = image[np.ix_(rows, columns)], mask[np.ix_(rows, columns)] & inside
+    if params.background == "blur":
+        around = cv2.GaussianBlur(square, (0, 0), params.blur_radius)
+    else:
+        around = np.full_like(square, 255 if params.background == "white" else 0)
+    composed = np.where(keep[..., None], square, around)
+    shrinks = side > params.crop_side
+    size = (params.crop_side, params.crop_side)
+    scaled = cv2.resize(composed, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    return np.asarray(scaled, np.uint8)
+
+
+def _bounds(mask: Bool) -> tuple[int, int, int, int]:
+    """Columns and rows that hold the mask: x0, y0, x1, y1, the last two exclusive."""
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

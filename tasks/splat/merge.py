@@ -1,0 +1,247 @@
+"""Instances joined into one scene (Split&Splat, Sec. 3.2.3; spec P4)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, Int32, LabelMap
+from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.gaussians.initialise import concatenate, select
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.trainer import TrainParams, TrainView, train
+from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
+from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, training_view
+
+
+@dataclass(frozen=True)
+class MergeParams:
+    """How merged Gaussians are refined together, without densification."""
+
+    iterations_per_view: int = 40
+    """Training steps of a pair for each view that sees it, within the two limits below."""
+    min_iterations: int = 300
+    """Fewest steps of a pair."""
+    max_iterations: int = 1000
+    """Most steps of a pair."""
+    global_iterations: int = 2000
+    """Steps of the last pass over the whole scene; 0 leaves it out."""
+    global_mask_weight: float = 0.25
+    """w_mask of the last pass."""
+    reset_opacity: bool = True
+    """Whether a pair starts from opacities of at most 0.01."""
+    prune_opacity: float = 0.005
+    """Fainter Gaussians are dropped in the end."""
+    prune_contribution: float = 1 / 255
+    """Gaussians that add no more than this to any pixel of any view are dropped in the end."""
+    sh_degree: int = 3
+    """Highest degree of the colour's spherical harmonics."""
+    background: str = "random"
+    """Colour behind the Gaussians: "random" in each step, or "black"."""
+    ignore_occluded: bool = True
+    """Whether pixels where something else is in front are left out; False calls them empty."""
+    guard_iou: float = 0.02
+    """A refinement that lowers the mean IoU of the masks by more than this is undone."""
+    guard_psnr: float = 1.0
+    """A refinement that lowers the PSNR by more than this, in dB, is undone."""
+    guard_views: int = 12
+    """Views that the two are measured on."""
+    crop: CropParams = CropParams()
+    """The part of each view that is rendered."""
+
+    def iterations(self, num_views: int) -> int:
+        """Training steps of a pair that so many views see (spec row 34)."""
+        return int(np.clip(self.iterations_per_view * num_views, self.min_iterations, self.max_iterations))
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How well Gaussians explain views."""
+
+    iou: float
+    """Mean over views and instances of the IoU of rendered mask and target; 1 where there is no target."""
+    psnr: float
+    """Over the pixels inside masks, dB."""
+
+
+@task(
+    name="splat.merge_pair",
+    resources=Resources(cores=1, memory_mb=2000),
+    uses=("torch", "opencv-contrib-python-headless", "scipy"),
+    environment=rasterizer,
+)
+def merge_pair(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    a: Gaussians,
+    b: Gaussians,
+    masks: tuple[LabelMap, ...],
+    *,
+    params: MergeParams,
+    w_mask: float,
+    tau_depth: float = 0.02,
+    tau_relative: float = 0.0,
+) -> Gaussians:
+    """Two groups as one, refined together in the views that see either (Split&Splat, Eqs. of l and l_mask).
+
+    Opacities start from min(alpha, 0.01), so that what only explained an occluder does not come back (spec A23). The
+    loss is l_RGB + w_mask * l_mask with the masks of all instances composited jointly (spec A25, A26). When refinement
+    makes masks or colours worse than `params` allows, the plain union comes back, with a warning (spec P4).
+
+    masks: exclusive label maps of all views, in the order of `cameras`. The order of a and b does not matter.
+    """
+    parts = sorted((part for part in (a, b) if len(part)), key=lambda part: int(part.instance_id.min()))
+    if len(parts) < 2:
+        return parts[0] if parts else NO_GAUSSIANS
+    union = concatenate(parts)
+    ids = np.unique(union.instance_id)
+    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
+    surface = select(union, union.opacity_logits >= np.log(0.1 / 0.9)).means
+    surface = surface if len(surface) > 1 else union.means
+    views = _views(scene, masks, ids, surface, params)
+    if not views:
+        return union
+    settings = TrainParams(
+        iterations=params.iterations(len(views)),
+        sh_degree=params.sh_degree,
+        background=params.background,
+        densify=False,
+        mask_weight=w_mask,
+        reset_opacity=params.reset_opacity,
+        prune_opacity=params.prune_opacity,
+        prune_contribution=params.prune_contribution,
+    )
+    refined = train(
+        union,
+        views,
+        params=settings,
+        extent=box_diagonal(surface),
+        seed=int(ids[0]),
+        label_ids=ids.tolist(),
+    ).gaussians
+    return _guarded(union, refined, views, ids, params)
+
+
+@task(name="splat.assemble")
+def assemble(groups: tuple[Gaussians, ...]) -> Gaussians:
+    """All groups as one scene, ordered by instance id; inside an instance the order stays."""
+    parts = [group for group in groups if len(group)]
+    if not parts:
+        return NO_GAUSSIANS
+    union = concatenate(sorted(parts, key=lambda part: int(part.instance_id.min())))
+    return select(union, np.argsort(union.instance_id, kind="stable"))
+
+
+@task(
+    name="splat.global_pass",
+    resources=Resources(cores=1, memory_mb=4000),
+    uses=("torch", "opencv-contrib-python-headless", "scipy"),
+    environment=rasterizer,
+)
+def global_pass(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    scene: Gaussians,
+    masks: tuple[LabelMap, ...],
+    *,
+    params: MergeParams,
+) -> Gaussians:
+    """A last, short training of the whole scene with its background, on whole photos (spec P4, A22).
+
+    scene: as `assemble` gives it. masks: exclusive label maps of all views. Opacities are kept and nothing is split or
+    cloned. The guard of `merge_pair` holds here too.
+    """
+    if not len(scene) or not params.global_iterations:
+        return scene
+    ids = np.unique(scene.instance_id)
+    views = _views(scene_views(frames, cameras, depths, 0.0, 0.0), masks, ids, scene.means, params, whole=True)
+    settings = TrainParams(
+        iterations=params.global_iterations,
+        sh_degree=params.sh_degree,
+        background=params.background,
+        densify=False,
+        mask_weight=params.global_mask_weight,
+        prune_opacity=params.prune_opacity,
+        prune_contribution=params.prune_contribution,
+    )
+    refined = train(
+        scene,
+        views,
+        params=settings,
+        extent=box_diagonal(scene.means),
+        seed=0,
+        label_ids=ids.tolist(),
+    ).gaussians
+    return _guarded(scene, refined, views, ids, params)
+
+
+def quality(gaussians: Gaussians, views: Sequence[TrainView], ids: Int32) -> Quality:
+    """Mean mask IoU and PSNR of Gaussians over views with mask targets; ids: [L] the instance of each channel."""
+    overlaps: list[float] = []
+    error, count = 0.0, 0
+    for view in views:
+        rendering = render(gaussians, view.camera, label_ids=ids.tolist())
+        error += float(((rendering.rgb - view.image)[view.inside].astype(np.float64) ** 2).sum())
+        count += 3 * int(view.inside.sum())
+        assert view.ids is not None
+        counts = view.ids != -1
+        for channel in np.unique(view.ids[view.inside]):
+            mask, target = (rendering.label_masks[channel] >= 0.5) & counts, view.ids == channel
+            overlaps.append(float((mask & target).sum() / (mask | target).sum()))
+    mse = max(error / max(1, count), 1e-10)
+    return Quality(float(np.mean(overlaps)) if overlaps else 1.0, -10 * float(np.log10(mse)))
+
+
+def _views(
+    scene: SceneViews,
+    masks: tuple[LabelMap, ...],
+    ids: Int32,
+    surface: np.ndarray,
+    params: MergeParams,
+    *,
+    whole: bool = False,
+) -> list[TrainView]:
+    """The views that see any of the instances; `whole`: with no pixel outside them, and the entire photo."""
+    # On whole photos, what has no Gaussians of its own can only be explained by the background.
+    rest = 0 if whole and ids[0] == 0 else NONE_OF_MINE
+    channel_of = np.full(np.iinfo(np.uint16).max + 1, rest, np.int32)
+    channel_of[ids] = np.arange(len(ids))
+    spacing = nearest_spacing(surface)
+    crop = replace(params.crop, margin_px=int(scene.cameras.sizes.max())) if whole else params.crop
+    views = []
+    for view, label_map in enumerate(masks):
+        channels = channel_of[label_map.ids]
+        if (channels >= 0).any():
+            built = training_view(
+                scene,
+                view,
+                channels,
+                surface,
+                spacing,
+                crop=crop,
+                ignore_occluded=params.ignore_occluded and not whole,
+                with_ids=True,
+            )
+            views.append(built)
+    return [view for view in views if view.inside.any()]
+
+
+def _guarded(
+    before: Gaussians, after: Gaussians, views: list[TrainView], ids: Int32, params: MergeParams
+) -> Gaussians:
+    step = max(1, -(-len(views) // params.guard_views))
+    old, new = quality(before, views[::step], ids), quality(after, views[::step], ids)
+    if new.iou >= old.iou - params.guard_iou and new.psnr >= old.psnr - params.guard_psnr:
+        return after
+    warnings.warn(
+        f"Refining instances {', '.join(map(str, ids))} together was undone: it took the IoU of their masks from "
+        f"{old.iou:.3f} to {new.iou:.3f} and the PSNR from {old.psnr:.1f} to {new.psnr:.1f} dB.",
+        stacklevel=2,
+    )
+    return before

@@ -1,0 +1,52 @@
+"""One round of merging: who merges with whom (Split&Splat, Sec. 3.2.3; spec P4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.splat.collisions import MergePlan, collision_matrix, group_box, match_pairs
+
+
+@dataclass(frozen=True)
+class PlanParams:
+    """When two groups of instances count as colliding."""
+
+    min_opacity: float = 0.1
+    """Fainter Gaussians do not widen the box of their group."""
+    bbox_quantile: float = 0.005
+    """Share of the centres trimmed off at both ends of each axis of the box; 0 in the paper."""
+    min_score: float = 0.0
+    """Pairs that overlap by no more than this are left apart."""
+    mask_weights: tuple[float, ...] = (0.05, 0.15, 0.25)
+    """w_mask of each round; the last one holds for all further rounds."""
+
+
+@task()
+def plan(groups: tuple[Gaussians, ...], *, params: PlanParams, round: int) -> MergePlan:
+    """The pairs of groups that are merged in a round, and the weight of the mask loss for them.
+
+    groups: the instances, or what earlier rounds made of them, in any order. round: from 0. The background (instance 0)
+    reaches everywhere; it stays by itself until the pass over the whole scene. Merging is over when the plan has no
+    pairs.
+    """
+    boxes = np.array([group_box(g, min_opacity=params.min_opacity, quantile=params.bbox_quantile) for g in groups])
+    collisions = collision_matrix([g.means for g in groups], boxes)
+    background = [i for i, g in enumerate(groups) if len(g) and not g.instance_id.any()]
+    collisions[background, :] = collisions[:, background] = 0
+    sizes = np.array([len(g) for g in groups], np.int32)
+    # An empty group collides with nothing; its number keeps the ids unique.
+    ids = np.array(
+        [int(g.instance_id.min()) if len(g) else np.iinfo(np.int32).max - i for i, g in enumerate(groups)], np.int32
+    )
+    pairs, scores = match_pairs(collisions, sizes, ids, min_score=params.min_score)
+    return MergePlan(
+        pairs=pairs,
+        scores=scores.astype(np.float32),
+        singles=np.setdiff1d(np.arange(len(groups)), pairs).astype(np.int32),
+        mask_weight=params.mask_weights[min(round, len(params.mask_weights) - 1)],
+        collisions=collisions.astype(np.float32),
+    )

@@ -1,0 +1,196 @@
+"""One instance's Gaussians from its masked views (Split&Splat, Sec. 3.2.1; spec P1)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks, Int32
+from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.gaussians.initialise import initialise
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
+from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
+from ss_flow.tasks.splat.resolve import REFINED
+from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask_of, training_view
+
+
+@dataclass(frozen=True)
+class ReconstructParams:
+    """How an instance is trained."""
+
+    iterations_per_view: int = 40
+    """Training steps for each view of the instance, within the two limits below."""
+    min_iterations: int = 600
+    """Fewest steps."""
+    max_iterations: int = 10_000
+    """Most steps."""
+    retrain_share: float = 1.0
+    """Steps of training after refinement, as a share of the first training's."""
+    warm_start: bool = True
+    """Whether training after refinement goes on from the Gaussians of the first, or starts over."""
+    sh_degree: int = 3
+    """Highest degree of the colour's spherical harmonics; they stay at 0 below 2000 steps."""
+    max_points: int = 10_000
+    """Most points that training starts from; more are thinned out."""
+    max_gaussians: int = 30_000
+    """Most Gaussians of an instance."""
+    background_scale: float = 3.0
+    """Factor on both limits for the background."""
+    background: str = "random"
+    """Colour behind the Gaussians: "random" in each step, or "black" as in the paper."""
+    ignore_occluded: bool = True
+    """Whether pixels where something else is in front are left out; False calls them empty, as in the paper."""
+    densify: bool = True
+    """Whether Gaussians are split and cloned where the picture is still wrong."""
+    depth_weight_start: float = 1.0
+    """Weight of the depth loss at the first step."""
+    depth_weight_final: float = 0.01
+    """Weight of the depth loss at the last step."""
+    crop: CropParams = CropParams()
+    """The part of each view that is rendered."""
+
+    def iterations(self, num_views: int) -> int:
+        """Training steps for an instance with that many views (spec row 22)."""
+        return int(np.clip(self.iterations_per_view * num_views, self.min_iterations, self.max_iterations))
+
+
+@task(
+    name="splat.reconstruct",
+    resources=Resources(cores=1, memory_mb=1500),
+    uses=("torch", "opencv-contrib-python-headless", "scipy"),
+    environment=rasterizer,
+)
+def reconstruct(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    instance: InstanceMasks,
+    *,
+    params: ReconstructParams,
+    tau_depth: float = 0.02,
+    tau_relative: float = 0.0,
+) -> Gaussians:
+    """Gaussians of one instance, or of the background (id 0), from its own pixels alone (spec P1, A28).
+
+    Training starts from the labelled points and sees, in the views that have a mask, the three kinds of pixels that
+    `training_view` tells apart. A weak instance, or one without masks, stays as its points. An instance without points
+    gives no Gaussians.
+
+    frames, depths: all views of the scene, in the order of `cameras`. tau_depth: in scene units; tau_relative: as a
+    fraction of the depth; the larger of the two says when one surface is in front of another.
+    Raises InputError when a frame's size is not that of the masks.
+    """
+    if not len(instance.points):
+        return NO_GAUSSIANS
+    initial = _from_points(instance, params)
+    if instance.weak or not len(instance.view):
+        return initial
+    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
+    return _trained(scene, instance, initial, params, params.iterations(len(instance.view)))
+
+
+@task(
+    name="splat.retrain",
+    resources=Resources(cores=1, memory_mb=1500),
+    uses=("torch", "opencv-contrib-python-headless", "scipy"),
+    environment=rasterizer,
+)
+def retrain(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    instance: InstanceMasks,
+    gaussians: Gaussians,
+    *,
+    params: ReconstructParams,
+    tau_depth: float = 0.02,
+    tau_relative: float = 0.0,
+) -> Gaussians:
+    """The Gaussians of an instance after its masks were refined (spec row 31).
+
+    instance: with the refined masks. gaussians: of the first training; they come back as they are where refinement
+    changed no mask. The rest as for `reconstruct`.
+    """
+    unchanged = not (instance.prompted == REFINED).any()
+    if unchanged or instance.weak or not len(instance.points) or not len(instance.view):
+        return gaussians
+    initial = gaussians if params.warm_start and len(gaussians) else _from_points(instance, params)
+    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
+    steps = max(1, round(params.retrain_share * params.iterations(len(instance.view))))
+    return _trained(scene, instance, initial, params, steps)
+
+
+def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussians:
+    scale = params.background_scale if instance.instance_id == 0 else 1
+    rows = thin(instance.points, round(params.max_points * scale))
+    return initialise(
+        instance.points[rows], instance.colors[rows], instance.instance_id, instance.point_confidence[rows]
+    )
+
+
+def thin(points: Float32, limit: int) -> Int32:
+    """Rows of at most `limit` points, evenly spread: the first point in each cell of a grid. points: [N, 3]."""
+    if len(points) <= limit:
+        return np.arange(len(points), dtype=np.int32)
+    low = points.min(axis=0)
+    # A surface as large as the box's diagonal squared would fill 64 times too many cells: the loop ends from above.
+    side = float(np.linalg.norm(points.max(axis=0) - low)) / (8 * np.sqrt(limit))
+    while True:
+        _, rows = np.unique(np.floor((points - low) / side).astype(np.int32), axis=0, return_index=True)
+        if len(rows) <= limit:
+            return np.sort(rows).astype(np.int32)
+        side *= 1.02 * np.sqrt(len(rows) / limit)
+
+
+def _trained(
+    scene: SceneViews, instance: InstanceMasks, initial: Gaussians, params: ReconstructParams, iterations: int
+) -> Gaussians:
+    fills_scene = instance.instance_id == 0
+    surface = instance.points
+    spacing = nearest_spacing(surface) if len(surface) > 1 else 0.0
+    views = [
+        training_view(
+            scene,
+            int(view),
+            np.where(mask_of(instance, row), 0, NONE_OF_MINE).astype(np.int32),
+            surface,
+            spacing,
+            crop=params.crop,
+            ignore_occluded=params.ignore_occluded,
+            fills_scene=fills_scene,
+        )
+        for row, view in enumerate(instance.view)
+    ]
+    views = [view for view in views if view.inside.any()]
+    if not views:
+        return initial
+    result = train(
+        initial,
+        views,
+        params=TrainParams(**_settings(params, iterations, fills_scene)),
+        extent=max(box_diagonal(surface), spacing),
+        seed=instance.instance_id,
+    )
+    if not len(result.gaussians):
+        warnings.warn(
+            f"Training left nothing of instance {instance.instance_id}; it stays as its points.", stacklevel=2
+        )
+        return initial
+    return result.gaussians
+
+
+def _settings(params: ReconstructParams, iterations: int, fills_scene: bool) -> Mapping[str, object]:
+    limit = params.max_gaussians * (params.background_scale if fills_scene else 1)
+    return {
+        "iterations": iterations,
+        "sh_degree": params.sh_degree,
+        "background": params.background,
+        "densify": params.densify,
+        "max_gaussians": round(limit),
+        "depth_weight_start": params.depth_weight_start,
+        "depth_weight_final": params.depth_weight_final,
+    }

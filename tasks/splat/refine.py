@@ -1,0 +1,225 @@
+"""An instance's masks compared with its own Gaussians (Split&Splat, Sec. 3.2.2; spec P2, P3)."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ss_flow.events import progress
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.geometry.sampling import greedy_farthest
+from ss_flow.tasks.gaussians.initialise import select
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.splat.groups import box_diagonal, rasterizer, scene_views
+from ss_flow.tasks.splat.resolve import REFINED
+from ss_flow.tasks.splat.views import CropParams, SceneViews, crop_camera, mask_of, sample_depth
+
+if TYPE_CHECKING:
+    from ss_flow.tasks.models.sam import Embedding, Sam
+
+
+@dataclass(frozen=True)
+class RefineParams:
+    """How masks are compared and replaced."""
+
+    prompts: int = 5
+    """Points that the segmenter is asked with."""
+    prompt_alpha: float = 0.3
+    """How much a prompt's distance to the mean counts against it; 0 in the paper."""
+    drop_hull: bool = True
+    """Whether points at the corners of the visible region are left out as prompts; False in the paper."""
+    min_visible: int = 10
+    """Fewest visible Gaussians of a view that is looked at."""
+    alpha_threshold: float = 0.5
+    """Accumulated alpha from which a pixel belongs to the rendered mask."""
+    min_opacity: float = 0.05
+    """Fainter Gaussians are not rendered."""
+    max_scale: float = 0.5
+    """Gaussians longer than this share of the instance's box diagonal are not rendered."""
+    tau_iou: float = 0.5
+    """IoU with the rendered mask from which a mask is added to a view that had none; 0.95 in the paper."""
+    min_support: float = 0.7
+    """Without a segmenter: share of the rendered mask that the view's depth must confirm for it to be added."""
+    min_views: int = 2
+    """An instance with masks in fewer views stays weak."""
+
+
+@dataclass(frozen=True)
+class RenderedMask:
+    """The mask that an instance's Gaussians cast on one view (Split&Splat, M^gs)."""
+
+    mask: Bool
+    """[H, W] without the pixels where something else is in front."""
+    support: float
+    """Share of the mask where the view's depth agrees with the Gaussians'."""
+
+
+@task(
+    name="splat.refine",
+    resources=Resources(cores=1, memory_mb=1800),
+    uses=("onnxruntime", "opencv-contrib-python-headless", "scipy"),
+    environment=rasterizer,
+)
+def refine(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    instance: InstanceMasks,
+    gaussians: Gaussians,
+    *,
+    params: RefineParams,
+    model: Model | None = None,
+    tau_depth: float = 0.02,
+    tau_relative: float = 0.0,
+) -> InstanceMasks:
+    """The refined masks of one instance (Split&Splat, M^_{k,l}); they may overlap those of other instances.
+
+    In each view that sees at least `min_visible` of the Gaussians' centres, M^gs is rendered from the instance alone
+    and the segmenter is prompted at visible centres (spec row 26). Where the view has a mask, it stays unless the
+    segmenter's agrees better with M^gs; where it has none, the segmenter's is added when its IoU with M^gs exceeds
+    `tau_iou`.
+
+    model: the segmenter. Without one (None) no mask is replaced; where a mask is missing, M^gs itself is added when
+    the view's depth confirms at least `min_support` of it. New masks are marked as refined (2) in `prompted`. The
+    background (id 0) and an instance without Gaussians come back as they are.
+    """
+    if instance.instance_id == 0 or not len(gaussians):
+        return instance
+    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
+    solid = _solid(gaussians, params)
+    held = {int(view): row for row, view in enumerate(instance.view)}
+    views, masks, prompted = [], [], []
+    for view, frame in enumerate(frames):
+        old = mask_of(instance, held[view]) if view in held else None
+        new = _replacement(scene, view, solid, old, params, model)
+        if new is not None:
+            views.append(view)
+            masks.append(np.packbits(new))
+            prompted.append(REFINED)
+        elif old is not None:
+            views.append(view)
+            masks.append(instance.packed[held[view]])
+            prompted.append(int(instance.prompted[held[view]]))
+        progress(view + 1, len(frames), frame.name)
+    if not views:
+        return instance
+    return replace(
+        instance,
+        view=np.array(views, np.int32),
+        packed=np.array(masks, np.uint8),
+        prompted=np.array(prompted, np.uint8),
+        weak=instance.weak and len(views) < params.min_views,
+    )
+
+
+def render_mask(
+    gaussians: Gaussians, scene: SceneViews, view: int, alpha_threshold: float = 0.5, margin_px: int = 16
+) -> RenderedMask:
+    """M^gs of one view: the Gaussians rendered alone with full opacity, cut where something is in front (spec P2).
+
+    Full opacity gives the outline; with it, however, the Gaussian whose centre is nearest hides the surface that it is
+    part of, so the depth is that of the ordinary rendering wherever that is solid. Depth is compared no more finely
+    than the Gaussians are thick.
+    """
+    full = camera_of(scene.cameras, view)
+    nothing = np.zeros((full.height, full.width), bool)
+    whole = CropParams(margin_px=margin_px, max_side=max(full.width, full.height))
+    camera = crop_camera(full, nothing, gaussians.means, whole)
+    outline, surface = render(gaussians, camera, opaque=True), render(gaussians, camera)
+    solid = outline.alpha >= alpha_threshold
+    total, weight = np.where(surface.alpha >= 0.5, (surface.depth, surface.alpha), (outline.depth, outline.alpha))
+    depth = np.where(solid, total / np.maximum(weight, 1e-6), 0)
+    measured = sample_depth(scene.depths[view], full, camera)
+    thickness = float(np.median(np.exp(gaussians.log_scales.max(axis=1))))
+    tolerance = np.maximum(scene.tau, scene.tau_relative * depth) + thickness
+    visible = solid & ((measured == 0) | (measured + tolerance >= depth))
+    agrees = visible & (measured > 0) & (np.abs(measured - depth) <= tolerance)
+    return RenderedMask(_pasted(visible, camera, full), float(agrees.sum() / max(1, visible.sum())))
+
+
+def iou(a: Bool, b: Bool) -> float:
+    """Intersection over union of two masks of one shape; 0 when both are empty."""
+    return float((a & b).sum() / max(1, (a | b).sum()))
+
+
+def _pasted(mask: Bool, camera: Camera, full: Camera) -> Bool:
+    x0, y0 = round(full.cx - camera.cx), round(full.cy - camera.cy)
+    image = np.zeros((full.height, full.width), bool)
+    image[y0 : y0 + camera.height, x0 : x0 + camera.width] = mask
+    return image
+
+
+def _solid(gaussians: Gaussians, params: RefineParams) -> Gaussians:
+    """Without the faint and the oversized Gaussians (spec row 28); all of them where none would remain."""
+    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    longest = np.exp(gaussians.log_scales.max(axis=1))
+    keep = (opacity >= params.min_opacity) & (longest <= params.max_scale * box_diagonal(gaussians.means))
+    return select(gaussians, keep) if keep.any() else gaussians
+
+
+def _replacement(
+    scene: SceneViews, view: int, gaussians: Gaussians, old: Bool | None, params: RefineParams, model: Model | None
+) -> Bool | None:
+    """The mask that takes the place of `old` in a view, None where nothing changes."""
+    if model is None and old is not None:
+        return None
+    rows, column, row = scene.surface_rows(view, gaussians.means)
+    if len(rows) < params.min_visible:
+        return None
+    rendered = render_mask(gaussians, scene, view, params.alpha_threshold)
+    if not rendered.mask.any():
+        return None
+    if model is None:
+        return rendered.mask if rendered.support >= params.min_support else None
+    places = np.stack([column, row], axis=-1) + 0.5
+    taken = greedy_farthest(places, params.prompts, alpha=params.prompt_alpha, drop_hull=params.drop_hull)
+    candidate = _prompted(scene.frames[view], places[taken], model)
+    agreement = iou(candidate, rendered.mask)
+    if old is None:
+        return candidate if agreement > params.tau_iou else None
+    return candidate if agreement > iou(old, rendered.mask) else None
+
+
+def _prompted(frame: Frame, points: Float32, model: Model) -> Bool:
+    segmenter = _segmenter(model)
+    mask, _ = segmenter.predict_prompt(_embedding(segmenter, frame, model), points)
+    return mask
+
+
+@functools.lru_cache(maxsize=1)
+def _segmenter(model: Model) -> Sam:
+    from ss_flow.tasks.models.sam import Sam
+
+    return Sam(model)
+
+
+class _Slot:
+    """Where the embedding of one photo is kept; it is made by whoever comes first, while others wait."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.embedding: Embedding | None = None
+
+
+@functools.lru_cache(maxsize=100)
+def _slot(model: Model, photo: str) -> _Slot:
+    return _Slot()
+
+
+def _embedding(segmenter: Sam, frame: Frame, model: Model) -> Embedding:
+    """The segmenter's embedding of a photo, remembered by content: all instances of a scene share it (4 MB each)."""
+    from blake3 import blake3
+
+    slot = _slot(model, blake3(frame.encoded.tobytes()).hexdigest())
+    with slot.lock:
+        if slot.embedding is None:
+            slot.embedding = segmenter.encode(decode_rgb(frame))
+        return slot.embedding

@@ -1,0 +1,198 @@
+"""What a view says about some of the instances: the pixels that train their Gaussians (spec P1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, InstanceMasks, Int32
+from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view
+from ss_flow.tasks.geometry.fusion import depth_at
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
+
+if TYPE_CHECKING:
+    from ss_flow.tasks.gaussians.trainer import TrainView
+
+NONE_OF_MINE, IGNORED = -2, -1
+"""Pixels without an instance of the group, and pixels that say nothing about it (see `TrainView.ids`)."""
+_MAX_REACH_PX = 8
+
+
+@dataclass(frozen=True)
+class SceneViews:
+    """The photos of a scene with their cameras and depths, all in one order."""
+
+    frames: tuple[Frame, ...]
+    cameras: Cameras
+    depths: tuple[DepthMap, ...]
+    tau: float
+    """How far two depths of one surface may differ, world units."""
+    tau_relative: float
+    """The same as a fraction of the depth; the larger of the two counts."""
+
+    def surface_rows(self, view: int, points: Float32) -> tuple[Int32, Int32, Int32]:
+        """The points that a view really sees (Split&Splat, Eq. 1-2): rows of `points` [N, 3], pixel columns and rows."""
+        camera = camera_of(self.cameras, view)
+        rows, column, row, z = pixels_in_view(points, camera)
+        measured = depth_at(self.depths[view], column, row, camera.width, camera.height)
+        seen = (measured > 0) & (np.abs(measured - z) < np.maximum(self.tau, self.tau_relative * z))
+        return rows[seen], column[seen], row[seen]
+
+
+@dataclass(frozen=True)
+class CropParams:
+    """Which part of a view is used, and how large."""
+
+    margin_px: int = 16
+    """Pixels of the photo added on every side of the box around the instance."""
+    max_side: int = 640
+    """Longest side of the crop, pixels; larger crops are scaled down."""
+
+
+def mask_of(instance: InstanceMasks, row: int) -> Bool:
+    """The mask of `instance.view[row]`: [H, W]."""
+    bits = np.unpackbits(instance.packed[row], count=instance.height * instance.width)
+    return bits.reshape(instance.height, instance.width).astype(bool)
+
+
+def sample_depth(depth: DepthMap, full: Camera, crop: Camera) -> Float32:
+    """A view's depth at the pixel centres of a crop of its camera, nearest neighbour: [h, w], 0 where unknown.
+
+    full: the view's camera; crop: `full`, cropped and scaled.
+    """
+    column, row = _pixels_of_crop(full, crop)
+    row, column = np.meshgrid(row, column, indexing="ij")
+    return depth_at(depth, column, row, full.width, full.height)
+
+
+def propagated_depth(points: Float32, camera: Camera, spacing: float) -> Float32:
+    """The depth of a surface that is known by points only: [h, w] z-depth, 0 where no point is near.
+
+    points: [N, 3] world; spacing: distance between neighbours, world units. Each pixel takes the mean depth of the points
+    in front within the projected spacing, so that the surface has no holes between its points.
+    """
+    import cv2
+
+    rows, column, row, z = pixels_in_view(points, camera)
+    if not len(rows):
+        return np.zeros((camera.height, camera.width), np.float32)
+    front = nearest_per_pixel(row * camera.width + column, z, camera.height * camera.width)
+    far = np.float32(np.finfo(np.float32).max)
+    own = np.where(front >= 0, z[front], far).astype(np.float32).reshape(camera.height, camera.width)
+    distance = float(np.median(z))
+    reach = int(np.clip(np.ceil(spacing * camera.fx / distance), 1, _MAX_REACH_PX))
+    window = (2 * reach + 1, 2 * reach + 1)
+    nearest = cv2.erode(own, np.ones(window, np.uint8), borderType=cv2.BORDER_REPLICATE)
+    # Farther points belong to a side of the surface that shows through between those in front.
+    in_front = (own < far) & (own - nearest <= 3 * max(spacing, reach * distance / camera.fx))
+    total = cv2.boxFilter(np.where(in_front, own, 0), cv2.CV_32F, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    count = cv2.boxFilter(in_front.astype(np.float32), cv2.CV_32F, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.where(count > 0.5, total / np.maximum(count, 1), 0).astype(np.float32)
+
+
+def crop_camera(full: Camera, inside: Bool, points: Float32 | Float64, params: CropParams) -> Camera:
+    """The camera of the box around a mask and the projections of points: cropped, and scaled to `max_side`.
+
+    inside: [H, W]; points: [N, 3] world. The outermost 0.5 % of the points do not widen the box. The whole image where
+    there is neither mask nor point.
+    """
+    _, column, row, _ = pixels_in_view(points, full)
+    columns, rows = np.flatnonzero(inside.any(axis=0)), np.flatnonzero(inside.any(axis=1))
+    if len(column):
+        columns = np.append(columns, np.quantile(column, (0.005, 0.995)))
+        rows = np.append(rows, np.quantile(row, (0.005, 0.995)))
+    if not len(columns):
+        return full
+    x0, y0 = (max(0, int(v.min()) - params.margin_px) for v in (columns, rows))
+    x1 = min(full.width, int(columns.max()) + 1 + params.margin_px)
+    y1 = min(full.height, int(rows.max()) + 1 + params.margin_px)
+    cropped = full.cropped(x0, y0, x1, y1)
+    scale = min(1.0, params.max_side / max(cropped.width, cropped.height))
+    return cropped.scaled(max(1, round(cropped.width * scale)), max(1, round(cropped.height * scale)))
+
+
+def training_view(
+    scene: SceneViews,
+    view: int,
+    channels: Int32,
+    points: Float32,
+    spacing: float,
+    *,
+    crop: CropParams,
+    ignore_occluded: bool = True,
+    fills_scene: bool = False,
+    with_ids: bool = False,
+) -> TrainView:
+    """One view of a group of instances (spec P1).
+
+    Pixels are *inside* a mask of the group (colour counts), *free* (nothing of the group may be seen), or ignored:
+    where something lies in front of the group's surface, where a depth needed to tell is unknown, or where the frame
+    is masked out.
+
+    channels: [H, W] index of the group's instance at each pixel, -2 where there is none. points: [N, 3] the group's
+    surface, `spacing` apart. ignore_occluded: False calls every pixel outside the masks free, as in the paper.
+    fills_scene: the group is the background, which goes on unseen behind all else: only pixels that look through its
+    surface are free.
+    Raises InputError when the frame's size is not that of the masks.
+    """
+    import cv2
+
+    from ss_flow.tasks.gaussians.trainer import TrainView
+
+    frame, full = scene.frames[view], camera_of(scene.cameras, view)
+    if channels.shape != (frame.height, frame.width):
+        raise InputError(
+            f"Frame {frame.name} is {frame.width} x {frame.height} pixels and its masks are "
+            f"{channels.shape[1]} x {channels.shape[0]}; both must have one size."
+        )
+    camera = crop_camera(full, channels >= 0, points, crop)
+    column, row = _pixels_of_crop(full, camera)
+    x0, y0, width, height = _box(full, camera)
+    photo = decode_rgb(frame)[y0 : y0 + height, x0 : x0 + width]
+    if photo.shape[:2] != (camera.height, camera.width):
+        photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    valid = decode_valid(frame)[np.ix_(row, column)]
+    ids = channels[np.ix_(row, column)]
+    depth = sample_depth(scene.depths[view], full, camera)
+
+    inside = (ids >= 0) & valid
+    free = ~inside & valid
+    if ignore_occluded:
+        surface = propagated_depth(points, camera, spacing)
+        tolerance = np.maximum(scene.tau, scene.tau_relative * surface)
+        known = (surface > 0) & (depth > 0)
+        if fills_scene:
+            free &= known & (depth > surface + tolerance)
+        else:
+            free &= (surface == 0) | (known & (depth + tolerance >= surface))
+    return TrainView(
+        camera=camera,
+        image=photo.astype(np.float32) / 255,
+        inside=inside,
+        free=free,
+        depth=np.where(inside, depth, 0).astype(np.float32),
+        ids=np.where(inside, ids, np.where(free, NONE_OF_MINE, IGNORED)).astype(np.int32) if with_ids else None,
+    )
+
+
+def _box(full: Camera, crop: Camera) -> tuple[int, int, int, int]:
+    """Where a crop lies in the full image: x0, y0, width, height in pixels."""
+    sx, sy = full.fx / crop.fx, full.fy / crop.fy
+    return (
+        round(full.cx - crop.cx * sx),
+        round(full.cy - crop.cy * sy),
+        round(crop.width * sx),
+        round(crop.height * sy),
+    )
+
+
+def _pixels_of_crop(full: Camera, crop: Camera) -> tuple[Int32, Int32]:
+    """The pixel columns and rows of the full image under the pixel centres of a crop."""
+    x0, y0, width, height = _box(full, crop)
+    column = x0 + ((np.arange(crop.width) + 0.5) * width / crop.width).astype(np.int32)
+    row = y0 + ((np.arange(crop.height) + 0.5) * height / crop.height).astype(np.int32)
+    return column, row

@@ -1,0 +1,109 @@
+"""Dense points of the scene from its depth maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.events import progress
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, PointCloud
+from ss_flow.tasks.geometry.cameras import backproject, camera_of
+from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, sum_by_voxel
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+
+
+@dataclass(frozen=True)
+class DenseParams:
+    """How densely the scene's surfaces are sampled."""
+
+    voxel: float = 0.02
+    """Upper limit of the side of a sampling cube, in scene units (metres where the scale is known)."""
+    voxel_pixels: float = 2.0
+    """The cube's side in median pixel footprints, where that is finer than `voxel`."""
+    max_points: int = 400_000
+    """Cubes grow until no more points than this remain."""
+    tau_depth: float = 0.02
+    """How far two views' depths may differ at one point, in scene units."""
+    tau_relative: float = 0.01
+    """The same as a fraction of the depth; the larger of the two counts."""
+    min_views: int = 2
+    """How many views must confirm a point, where as many see it."""
+
+
+@task(uses=("opencv-contrib-python-headless", "scipy"))
+def dense(
+    frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...], *, params: DenseParams
+) -> PointCloud:
+    """Dense points P_dense, by back-projection of all depth maps (spec S2, row 11).
+
+    Known depth pixels that their frame does not mask out become world points; the points of one voxel are averaged;
+    those that other views contradict are dropped (see `consistent_points`). The points are ordered by voxel.
+
+    Raises InputError when no depth is known in any view, or no two views agree.
+    """
+    unit = scene_unit(cameras, depths)
+    voxel = min(params.voxel * unit, params.voxel_pixels * _pixel_footprint(cameras, depths))
+    views = []
+    for view, (frame, depth) in enumerate(zip(frames, depths, strict=True)):
+        progress(view, len(frames), frame.name)
+        views.append(sum_by_voxel([_samples(frame, cameras, view, depth)], voxel))
+    cloud = sum_by_voxel(views, voxel)
+    while True:
+        means, colors = cloud.means()
+        kept = consistent_points(
+            means,
+            cameras,
+            depths,
+            tau=params.tau_depth * unit,
+            tau_relative=params.tau_relative,
+            min_views=params.min_views,
+        )
+        if kept.sum() <= params.max_points:
+            break
+        # On surfaces the count falls with the square of the side; a little more ends the loop soon.
+        voxel *= 1.05 * float(np.sqrt(kept.sum() / params.max_points))
+        cloud = sum_by_voxel([cloud.take(kept)], voxel)
+    if not kept.any():
+        raise InputError(
+            "The depth maps of this scene agree in no point; they should be z-depths in the unit of the camera poses."
+        )
+    points = means[kept].astype(np.float32)
+    colors = np.rint(colors[kept]).astype(np.uint8)
+    return PointCloud(points=points, colors=colors, unit=unit, spacing=nearest_spacing(points))
+
+
+def scene_unit(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
+    """The length, in world units, that plays the part of one metre: 1.0 when the scale is known (spec 3.0).
+
+    Otherwise half the median, over the views, of the median known depth. Raises InputError when no depth is known.
+    """
+    medians = [float(np.median(d.depth[d.depth > 0])) for d in depths if (d.depth > 0).any()]
+    if not medians:
+        raise InputError("None of the depth maps of this scene has a known depth; at least one view should.")
+    return 1.0 if cameras.metric else float(np.median(medians)) / 2
+
+
+def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
+    """Median side, in world units, of the surface patch that a depth pixel covers when it is looked at head-on."""
+    sides = []
+    for view, depth in enumerate(depths):
+        known = depth.depth[depth.depth > 0]
+        if known.size:
+            height, width = depth.depth.shape
+            sides.append(float(np.median(known)) / camera_of(cameras, view).scaled(width, height).fx)
+    return float(np.median(sides))
+
+
+def _samples(frame: Frame, cameras: Cameras, view: int, depth: DepthMap) -> VoxelSums:
+    """The known depth pixels of one view as points with the colours of its photo."""
+    height, width = depth.depth.shape
+    row = ((np.arange(height) + 0.5) * frame.height / height).astype(np.intp)
+    column = ((np.arange(width) + 0.5) * frame.width / width).astype(np.intp)
+    known = ((depth.depth > 0) & decode_valid(frame)[np.ix_(row, column)]).ravel()
+    points = backproject(depth.depth, camera_of(cameras, view).scaled(width, height))[known]
+    colors = decode_rgb(frame)[np.ix_(row, column)].reshape(-1, 3)[known].astype(np.float64)
+    return VoxelSums(points, colors, np.ones(len(points)))

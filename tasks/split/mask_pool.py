@@ -1,0 +1,122 @@
+"""The pool of masks of one view: canonical order, duplicates, the mask tree, and the exclusive map (spec S1)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float32, Int32, MaskSet
+
+
+def canonical_order(masks: Bool) -> Int32:
+    """The order in which masks are taken everywhere, so that the order they come in does not matter (spec S1).
+
+    masks: [N, H, W]. Returns [N] indices: area descending, then row, then column of the centroid, then the pixels
+    themselves; only equal masks keep the order they came in.
+    """
+    if not len(masks):
+        return np.zeros(0, np.int32)
+    count, height, width = masks.shape
+    areas = masks.sum(axis=(1, 2), dtype=np.int64)
+    row_sums = masks.sum(axis=2, dtype=np.int64) @ np.arange(height)
+    column_sums = masks.sum(axis=1, dtype=np.int64) @ np.arange(width)
+    packed = pack(masks)
+    keys = [(-int(areas[i]), int(row_sums[i]), int(column_sums[i]), packed[i].tobytes()) for i in range(count)]
+    return np.array(sorted(range(count), key=keys.__getitem__), np.int32)
+
+
+def exclusive(masks: MaskSet) -> Int32:
+    """One mask a pixel: large masks painted first, smaller ones on top (spec S1).
+
+    Returns [H, W] the index of the mask that owns each pixel, -1 where there is none.
+    """
+    dense = masks.dense()
+    owner = np.full((masks.height, masks.width), -1, np.int32)
+    for index in canonical_order(dense):
+        owner[dense[index]] = index
+    return owner
+
+
+def pack(masks: Bool) -> np.ndarray:
+    """[N, H, W] booleans as [N, ceil(H * W / 8)] bits, also where N is 0."""
+    count, height, width = masks.shape
+    return np.packbits(masks.reshape(count, height * width), axis=1)
+
+
+def intersections(masks: Bool, others: Bool | None = None) -> Float32:
+    """Pixels that masks share: [N, H, W] and [M, H, W] (the same masks when None) -> [N, M], exact below 2^24."""
+    left = masks.reshape(len(masks), masks.shape[1] * masks.shape[2]).astype(np.float32)
+    right = left if others is None else others.reshape(len(others), left.shape[1]).astype(np.float32)
+    return left @ right.T
+
+
+def drop_duplicates(masks: Bool, scores: Float32, max_iou: float) -> Int32:
+    """Non-maximum suppression over masks: of two with an IoU above `max_iou` the one with the better score stays.
+
+    masks: [N, H, W], none empty. scores: [N]. Returns the rows that stay, ascending.
+    """
+    shared = intersections(masks)
+    areas = np.diag(shared)
+    return suppress(shared / (areas[:, None] + areas[None] - shared), scores, max_iou)
+
+
+def suppress(overlap: Float32, scores: Float32, threshold: float) -> Int32:
+    """Greedy non-maximum suppression on a matrix of overlaps.
+
+    overlap: [N, N]. scores: [N]; of equal scores the first row is taken first. Returns the rows that stay, ascending.
+    """
+    alive = np.ones(len(scores), bool)
+    kept: list[int] = []
+    for index in np.argsort(-scores, kind="stable"):
+        if alive[index]:
+            kept.append(int(index))
+            alive &= overlap[index] <= threshold
+    return np.array(sorted(kept), np.int32)
+
+
+def mask_tree(masks: Bool, contained: float) -> Int32:
+    """The parent of each mask: the smallest larger one that holds at least the share `contained` of it.
+
+    masks: [N, H, W] in canonical order, none empty. Returns [N] rows, -1 at the top; a parent comes before its
+    children.
+    """
+    shared = intersections(masks)
+    areas = np.diag(shared)
+    parent = np.full(len(masks), -1, np.int32)
+    for index in range(1, len(masks)):
+        holders = np.flatnonzero(shared[index, :index] >= contained * areas[index])
+        if holders.size:
+            parent[index] = holders[-1]
+    return parent
+
+
+def merge_union(masks: Bool, grid: Int32, duplicate: float, overlap: float) -> tuple[Bool, Int32]:
+    """Promote larger masks: a mask of a finer grid is united with every coarser one that it overlaps (Split&Splat,
+    Sec. 3.1; spec S1 with rows 8 and 9 of its table).
+
+    masks: [N, H, W], none empty. grid: [N] grid of origin, 0 = coarsest. duplicate: share of the smaller mask above
+    which the later of two masks of one grid is dropped. overlap: share of the smaller mask above which masks of two
+    grids are united.
+    Returns masks [K, H, W] and, for each, the row it grew from.
+    """
+    height, width = masks.shape[1:]
+    pool = np.zeros((0, height, width), bool)
+    origin: list[int] = []
+    for level in np.unique(grid):
+        rows = np.flatnonzero(grid == level)
+        rows = rows[canonical_order(masks[rows])]
+        # Canonical order is area descending, so the smaller of two is the later one.
+        shared = intersections(masks[rows])
+        areas = np.diag(shared)
+        share = shared / np.minimum(areas[:, None], areas[None])
+        rows = rows[suppress(share, -np.arange(len(rows), dtype=np.float32), duplicate)]
+        for row in rows:
+            mask = masks[row]
+            common = intersections(pool, mask[None])[:, 0]
+            smaller = np.minimum(pool.sum(axis=(1, 2)), mask.sum())
+            hit = common > overlap * smaller
+            if hit.any() and level > grid.min():
+                pool[hit] |= mask
+            else:
+                pool = np.concatenate([pool, mask[None]])
+                origin.append(int(row))
+    return pool, np.array(origin, np.int32)

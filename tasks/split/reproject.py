@@ -1,0 +1,120 @@
+"""View-consistent instance masks from labelled points (Split&Splat, Sec. 3.1.3, last part)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.events import progress
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import (
+    InstanceMasks,
+    Int32,
+    MaskSet,
+    PointCloud,
+    PointLabels,
+    PromptedMasks,
+    Visibility,
+)
+from ss_flow.tasks.geometry.images import pack_masks
+from ss_flow.tasks.split.selection import (
+    SelectionParams,
+    agreement,
+    contradicted,
+    paint_labels,
+    select_masks,
+    stack_exclusive,
+)
+
+
+@dataclass(frozen=True)
+class ReprojectParams:
+    """How labelled points become masks again."""
+
+    selection: SelectionParams = field(default_factory=SelectionParams)
+    """Which masks of a view show a label."""
+    min_views: int = 2
+    """Views with a mask below which an instance is weak: kept as points, not reconstructed."""
+
+
+@task(uses=("opencv-contrib-python-headless",))
+def reproject(
+    points: PointCloud,
+    visibility: tuple[Visibility, ...],
+    masks: tuple[MaskSet, ...],
+    labels: PointLabels,
+    prompted: tuple[PromptedMasks, ...],
+    *,
+    params: ReprojectParams,
+) -> tuple[InstanceMasks, ...]:
+    """The instances that the labelled points make, with one mask at most in each view (M~_{k,l}; spec S5).
+
+    visibility, masks: one of each per view. prompted: masks from `split.reprompt`, for any of the views, by name; they
+    stand in where the view's own masks do not show a label. The masks of one view do not overlap: smaller ones are on
+    top. The first instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by
+    id. An instance's confidence is its points' mean share of votes, less the share of its painted pixels that other
+    labels contradict.
+
+    Raises InputError when the frames of two views differ in size.
+    """
+    for view in visibility:
+        if (view.height, view.width) != (visibility[0].height, visibility[0].width):
+            raise InputError(
+                f"Frame {view.name} is {view.width} x {view.height} pixels but {visibility[0].name} is "
+                f"{visibility[0].width} x {visibility[0].height}; all frames of a scene should have one size."
+            )
+    by_name = {extra.name: extra for extra in prompted}
+    num_labels = int(labels.label.max(initial=0))
+    held, against = np.zeros(num_labels + 1), np.zeros(num_labels + 1)
+    views: list[dict[int, tuple[np.ndarray, bool]]] = []
+    for k, (view, pool) in enumerate(zip(visibility, masks, strict=True)):
+        progress(k, len(masks), view.name)
+        painted = paint_labels(view, labels.label)
+        shown = select_masks(painted, pool, params.selection)
+        own = set(shown)
+        if view.name in by_name:
+            extra = by_name[view.name]
+            for label, mask in zip(extra.label, extra.dense(), strict=True):
+                if int(label) not in own and agreement(painted, mask, int(label)) >= params.selection.min_iou:
+                    shown[int(label)] = mask
+        ids = stack_exclusive(shown, view.height, view.width)
+        views.append({int(i): (pack_masks((ids == i)[None])[0], int(i) not in own) for i in np.unique(ids)})
+        for total, part in zip((held, against), contradicted(painted, ids, num_labels), strict=True):
+            total += part
+    agreed = 1 - against / np.maximum(held, 1)
+    return tuple(
+        _instance(int(label), points, labels, views, visibility[0], float(agreed[label]), params.min_views)
+        for label in np.union1d([0], labels.label)
+    )
+
+
+def _instance(
+    label: int,
+    points: PointCloud,
+    labels: PointLabels,
+    views: list[dict[int, tuple[np.ndarray, bool]]],
+    size: Visibility,
+    agreed: float,
+    min_views: int,
+) -> InstanceMasks:
+    """The points and masks of one label. agreed: share of its painted pixels that no other label contradicts."""
+    rows = labels.label == label
+    seen: Int32 = np.array([k for k, view in enumerate(views) if label in view], np.int32)
+    share = labels.confidence[rows]
+    return InstanceMasks(
+        instance_id=label,
+        points=points.points[rows],
+        colors=points.colors[rows],
+        point_confidence=share,
+        confidence=float(share.mean(dtype=np.float64)) * agreed if share.size else 0.0,
+        height=size.height,
+        width=size.width,
+        view=seen,
+        packed=np.array([views[k][label][0] for k in seen], np.uint8).reshape(
+            len(seen), (size.height * size.width + 7) // 8
+        ),
+        prompted=np.array([label > 0 and views[k][label][1] for k in seen], np.uint8),
+        weak=label > 0 and len(seen) < min_views,
+    )

@@ -1,0 +1,167 @@
+"""2D instance masks of one RGB-D view without any weights: the stated fallback for Segment Anything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Int32, MaskSet
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size
+from ss_flow.tasks.split.graph_segmentation import (
+    RegionGraph,
+    boundaries,
+    find_planes,
+    superpixels,
+    surface_of,
+)
+from ss_flow.tasks.split.mask_pool import canonical_order, drop_duplicates, mask_tree, pack
+
+
+@dataclass(frozen=True)
+class SegmentRgbdParams:
+    """How regions grow together."""
+
+    side: int = 320
+    """Longer side of the image that regions are grown on, in pixels; masks are scaled back to the frame."""
+    levels: tuple[float, ...] = (0.17, 0.28, 0.45)
+    """Boundary strengths up to which regions merge; each level gives masks, and the lowest gives the finest."""
+    depth_jump: float = 0.02
+    """Step in depth, as a share of the depth, at which a surface ends."""
+    crease: float = 45.0
+    """Angle of a concave crease at which an object ends, in degrees."""
+    color_weight: float = 0.2
+    """Strength that a difference of colour adds to a boundary whose depth is known."""
+    color_scale: float = 30.0
+    """Lab distance at which colours count as different."""
+    superpixel: int = 20
+    """Least size of the regions that everything starts from, in pixels of the working image."""
+    plane_share: float = 0.05
+    """Least share of the image of a plane that gets a mask of its own."""
+    plane_tolerance: float = 0.01
+    """Distance from a plane of its points, as a share of the depth."""
+    min_area: float = 0.0025
+    """Smallest mask, as a share of the image."""
+    min_pixels: int = 64
+    """Smallest mask, in pixels of the frame."""
+    duplicate_iou: float = 0.9
+    """IoU above which the worse of two masks is dropped."""
+    contained: float = 0.9
+    """Share of a mask that its parent holds."""
+
+
+@task(
+    name="split.segment_rgbd",
+    resources=Resources(cores=1, memory_mb=500),
+    uses=("opencv-contrib-python-headless",),
+)
+def segment_rgbd(frame: Frame, depth: DepthMap, cameras: Cameras, *, params: SegmentRgbdParams) -> MaskSet:
+    """The masks of one view from its colours and its depth alone (the place of Split&Splat's M_k; spec S1).
+
+    Gives the same tree as a segmenter: the finest level holds objects, coarser ones groups, and large planes (walls,
+    floor, table tops) have masks of their own. `predicted_iou` is how strong a mask's boundary is, `stability` the IoU
+    of the mask at a level a tenth lower and a tenth higher.
+    Raises InputError when the cameras do not have the frame.
+    """
+    if frame.name not in cameras.names:
+        raise InputError(f"frame {frame.name} has no camera; RGB-D segmentation needs one for each frame.")
+    rgb, valid = decode_rgb(frame), decode_valid(frame)
+    scale = min(1.0, params.side / max(frame.width, frame.height))
+    width, height = max(8, round(frame.width * scale)), max(8, round(frame.height * scale))
+    camera = camera_of(cameras, cameras.names.index(frame.name)).scaled(width, height)
+
+    import cv2
+
+    small = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
+    rows = ((np.arange(height) + 0.5) * frame.height / height).astype(np.intp)
+    columns = ((np.arange(width) + 0.5) * frame.width / width).astype(np.intp)
+    pick = np.ix_(rows, columns)
+    valid_small = valid[pick]
+    surface = surface_of(np.where(valid_small, depth_at_frame_size(depth, frame)[pick], 0).astype(np.float32), camera)
+    boundary = boundaries(surface, valid_small, params.depth_jump, params.crease)
+    regions = superpixels(small, surface, boundary, valid_small, params.superpixel)
+    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
+    graph = RegionGraph(regions, lab, boundary, params.color_weight, params.color_scale)
+
+    areas = np.bincount(regions[regions >= 0], minlength=graph.size)
+
+    masks: list[Bool] = []
+    quality: list[float] = []
+    stability: list[float] = []
+    grid: list[int] = []
+    for step, level in enumerate(sorted(params.levels)):
+        graph.merge(level * 0.9)
+        before = graph.owners()
+        graph.merge(level)
+        owners = graph.owners()
+        enclosure = graph.enclosures()
+        graph.merge(level * 1.1)
+        after = graph.owners()
+        # Row -1 is the last one: pixels of no region.
+        labels = np.append(owners, -1)[regions]
+        for region in np.unique(owners):
+            members = owners == region
+            inner = np.bincount(before[members], areas[members]).max()
+            outer = areas[after == after[region]].sum()
+            masks.append(labels == region)
+            quality.append(min(1.0, enclosure[int(region)]))
+            stability.append(float(inner / outer))
+            grid.append(len(params.levels) - 1 - step)
+    for plane in find_planes(surface, valid_small, params.plane_share, params.plane_tolerance):
+        opened = cv2.morphologyEx(plane.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        masks.append(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)).astype(bool) & valid_small)
+        quality.append(0.5)
+        stability.append(1.0)
+        grid.append(0)
+    found = _Masks(
+        np.array(masks).reshape(-1, height, width),
+        np.array(quality, np.float32),
+        np.array(stability, np.float32),
+        np.array(grid, np.int32),
+    )
+    return _finish(frame, valid, found, params)
+
+
+@dataclass(frozen=True)
+class _Masks:
+    masks: Bool
+    """[N, h, w] at the working size."""
+    quality: Float32
+    stability: Float32
+    grid: Int32
+
+    def __getitem__(self, rows: Int32) -> _Masks:
+        return _Masks(self.masks[rows], self.quality[rows], self.stability[rows], self.grid[rows])
+
+
+def _finish(frame: Frame, valid: Bool, found: _Masks, params: SegmentRgbdParams) -> MaskSet:
+    """Drop small masks and duplicates, scale the rest to the frame, and put them in canonical order."""
+    import cv2
+
+    share = params.min_area * found.masks.shape[1] * found.masks.shape[2]
+    found = found[np.flatnonzero(found.masks.sum(axis=(1, 2)) >= max(1, share)).astype(np.int32)]
+    found = found[drop_duplicates(found.masks, found.quality, params.duplicate_iou)]
+    size = (frame.width, frame.height)
+    full = np.zeros((len(found.masks), frame.height, frame.width), bool)
+    for index, mask in enumerate(found.masks):
+        full[index] = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) >= 0.5
+    full &= valid
+    rows = np.flatnonzero(
+        full.sum(axis=(1, 2)) >= max(params.min_pixels, params.min_area * frame.width * frame.height)
+    ).astype(np.int32)
+    rows = rows[canonical_order(full[rows])]
+    full, found = full[rows], found[rows]
+    return MaskSet(
+        frame.name,
+        frame.height,
+        frame.width,
+        pack(full),
+        found.quality,
+        found.stability,
+        found.grid,
+        mask_tree(full, params.contained),
+        "rgbd-graph",
+    )

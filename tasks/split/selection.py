@@ -1,0 +1,126 @@
+"""Which masks of a view show which label."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float64, Int32, MaskSet, Visibility
+from ss_flow.tasks.geometry.zbuffer import paint
+from ss_flow.tasks.split.erosion import ErosionParams, interiors
+from ss_flow.tasks.split.mask_pool import canonical_order
+
+
+@dataclass(frozen=True)
+class SelectionParams:
+    """How the labels of points pick the masks of a view."""
+
+    masks: Literal["best", "all"] = "best"
+    """The masks that together agree best with a label's points, or, as in the paper, all that overlap it most."""
+    min_iou: float = 0.3
+    """IoU with a label's painted points below which no mask shows the label (only with "best")."""
+    erosion: ErosionParams = field(default_factory=ErosionParams)
+    """How far a mask's border is taken off before its majority is counted (only with "all")."""
+
+
+@dataclass(frozen=True)
+class PaintedView:
+    """The labels of the points in front, by pixel."""
+
+    pixel: Int32
+    """[P] flat indices of the pixels where a point falls, ascending."""
+    label: Int32
+    """[P] label of the point in front, 0 = unlabelled."""
+
+
+def paint_labels(view: Visibility, label: Int32) -> PaintedView:
+    """Paint the labels [N] of all dense points into a view; nearest depth wins a pixel."""
+    image = paint(label[view.point_index] + 1, view.pixel, view.depth, view.height * view.width)
+    pixel = np.flatnonzero(image).astype(np.int32)
+    return PaintedView(pixel, image[pixel] - 1)
+
+
+def select_masks(painted: PaintedView, pool: MaskSet, params: SelectionParams) -> dict[int, Bool]:
+    """For each label that a view's masks show, its mask [H, W]; the masks of two labels may overlap (spec S5)."""
+    dense = pool.dense()
+    if not len(dense) or not (painted.label > 0).any():
+        return {}
+    if params.masks == "all":
+        return _by_majority(painted, pool, dense, params)
+    return _by_agreement(painted, dense, params)
+
+
+def _by_majority(painted: PaintedView, pool: MaskSet, dense: Bool, params: SelectionParams) -> dict[int, Bool]:
+    """Every mask goes to the label that most painted pixels of its interior carry; masks of one label are united."""
+    label = np.zeros(pool.height * pool.width, np.int32)
+    label[painted.pixel] = painted.label
+    shown: dict[int, Bool] = {}
+    for interior in interiors(pool, params.erosion, nested=True):
+        counts = np.bincount(label[interior.pixels])
+        counts[0] = 0
+        if counts.any():
+            best = int(counts.argmax())
+            shown[best] = shown[best] | dense[interior.mask] if best in shown else dense[interior.mask]
+    return shown
+
+
+def _by_agreement(painted: PaintedView, dense: Bool, params: SelectionParams) -> dict[int, Bool]:
+    """Each label takes the mask that agrees best with its points, then those that make the agreement better still.
+
+    A mask shows one label at most; the pairs that agree best choose first, ties by label, then by mask.
+    """
+    dense = dense[canonical_order(dense)]
+    names, index = np.unique(painted.label, return_inverse=True)
+    flat = dense.reshape(len(dense), -1)[:, painted.pixel]
+    count = np.stack([np.bincount(index[mask], minlength=len(names)) for mask in flat])
+    total = np.bincount(index, minlength=len(names))
+    iou = count / np.maximum(count.sum(axis=1, keepdims=True) + total - count, 1)
+    iou[:, names == 0] = 0
+
+    chosen: dict[int, Bool] = {}
+    shown: dict[int, Bool] = {}
+    order = sorted(zip(*np.nonzero((iou > 0) & (iou >= params.min_iou)), strict=True), key=lambda p: (-iou[p], p[::-1]))
+    free = np.ones(len(dense), bool)
+    for row, column in order:
+        if free[row] and column not in chosen:
+            free[row] = False
+            chosen[column], shown[int(names[column])] = flat[row], dense[row]
+
+    # An occluder may cut an object in two: what is left joins where it fits.
+    for column in sorted(chosen):
+        mine = index == column
+        for row in np.flatnonzero(free & (count.argmax(axis=1) == column)):
+            both = chosen[column] | flat[row]
+            if _iou(both, mine) > _iou(chosen[column], mine):
+                free[row] = False
+                chosen[column] = both
+                shown[int(names[column])] = shown[int(names[column])] | dense[row]
+    return shown
+
+
+def _iou(a: Bool, b: Bool) -> float:
+    union = int((a | b).sum())
+    return float((a & b).sum() / union) if union else 0.0
+
+
+def agreement(painted: PaintedView, mask: Bool, label: int) -> float:
+    """IoU of a mask [H, W] with the points of a label, on the pixels where points fall."""
+    return _iou(mask.ravel()[painted.pixel], painted.label == label)
+
+
+def stack_exclusive(shown: dict[int, Bool], height: int, width: int) -> Int32:
+    """One label a pixel, smaller masks on top, equal ones by the lower label: [H, W], 0 = none."""
+    ids = np.zeros((height, width), np.int32)
+    for label in sorted(shown, key=lambda label: (-int(shown[label].sum()), -label)):
+        ids[shown[label]] = label
+    return ids
+
+
+def contradicted(painted: PaintedView, ids: Int32, num_labels: int) -> tuple[Float64, Float64]:
+    """For each label the painted pixels that its mask holds, and those of them with another label: [L + 1] each."""
+    under = ids.ravel()[painted.pixel]
+    held = np.bincount(under, minlength=num_labels + 1).astype(np.float64)
+    other = (painted.label > 0) & (painted.label != under)
+    return held, np.bincount(under[other], minlength=num_labels + 1).astype(np.float64)

@@ -1,0 +1,168 @@
+"""Small captures on disk in every layout, for tests to open and to damage."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ss_flow.task import FileRef
+
+WIDTH, HEIGHT = 32, 24
+NAMES = ("2", "10", "11")
+
+
+def ref(path: Path | None) -> FileRef | None:
+    """A reference to a file; tests of tasks need no digest that is true."""
+    return None if path is None else FileRef(path, path.name)
+
+
+def refs(paths) -> tuple:
+    return tuple(ref(p) for p in paths)
+
+
+def photo(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
+
+
+def write(path: Path, image: np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), image)
+    return path
+
+
+def depth_image(millimetres: int = 2000, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    return np.full((height, width), millimetres, np.uint16)
+
+
+def pose(x: float) -> np.ndarray:
+    """Camera-to-world, turned by 90 degrees about y and moved."""
+    matrix = np.array([[0, 0, 1, x], [0, 1, 0, 0.5], [-1, 0, 0, -1], [0, 0, 0, 1]], float)
+    return matrix
+
+
+def photos(root: Path) -> Path:
+    for i, name in enumerate(NAMES):
+        write(root / f"{name}.jpg", photo(i))
+    return root
+
+
+def scannet(root: Path) -> Path:
+    for i, name in enumerate(NAMES):
+        write(root / "color" / f"{name}.jpg", photo(i))
+        write(root / "depth" / f"{name}.png", depth_image(1000 + i, WIDTH // 2, HEIGHT // 2))
+        write(root / "valid" / f"{name}.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+        write(root / "instance" / f"{name}.png", np.full((HEIGHT, WIDTH), 3, np.uint16))
+        (root / "pose").mkdir(exist_ok=True)
+        np.savetxt(root / "pose" / f"{name}.txt", pose(i))
+    (root / "intrinsic").mkdir()
+    color = np.diag([30.0, 30.0, 1.0, 1.0])
+    color[0, 2], color[1, 2] = 15.5, 11.5
+    depth = np.diag([15.0, 15.0, 1.0, 1.0])
+    depth[0, 2], depth[1, 2] = 7.5, 5.5
+    np.savetxt(root / "intrinsic" / "intrinsic_color.txt", color)
+    np.savetxt(root / "intrinsic" / "intrinsic_depth.txt", depth)
+    return root
+
+
+def nerfstudio(root: Path, **changes) -> Path:
+    frames = []
+    for i, name in enumerate(NAMES):
+        write(root / "images" / f"{name}.png", photo(i))
+        write(root / "depth" / f"{name}.png", depth_image())
+        opengl = pose(i) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append(
+            {
+                "file_path": f"images/{name}.png",
+                "depth_file_path": f"depth/{name}.png",
+                "transform_matrix": opengl.tolist(),
+            }
+        )
+    document = {"w": WIDTH, "h": HEIGHT, "fl_x": 30.0, "fl_y": 31.0, "cx": 16.0, "cy": 12.0, "frames": frames}
+    (root / "transforms.json").write_text(json.dumps({**document, **changes}))
+    return root
+
+
+def tum(root: Path) -> Path:
+    rgb, depth, track = ["# time file"], ["# time file"], ["# time tx ty tz qx qy qz qw"]
+    for i, name in enumerate(NAMES):
+        write(root / "rgb" / f"{name}.png", photo(i))
+        write(root / "depth" / f"{name}.png", depth_image(5000))
+        rgb.append(f"{100 + i}.00 rgb/{name}.png")
+        depth.append(f"{100 + i}.01 depth/{name}.png")
+        track.append(f"{100 + i}.005 {i} 0.5 -1 0 {np.sqrt(0.5)} 0 {np.sqrt(0.5)}")
+    (root / "rgb.txt").write_text("\n".join(rgb))
+    (root / "depth.txt").write_text("\n".join(depth))
+    (root / "groundtruth.txt").write_text("\n".join(track))
+    return root
+
+
+def colmap(root: Path, binary: bool = True, distortion: float = 0.0, registered: int = 3) -> Path:
+    """A workspace with two models: `sparse/0` with one image, `sparse/1` with all."""
+    for i, name in enumerate(NAMES):
+        write(root / "images" / f"{name}.png", photo(i))
+    _colmap_model(root / "sparse" / "0", 1, binary, distortion)
+    _colmap_model(root / "sparse" / "1", registered, binary, distortion)
+    return root
+
+
+def _colmap_model(folder: Path, count: int, binary: bool, distortion: float) -> None:
+    folder.mkdir(parents=True)
+    half = np.sqrt(0.5)
+    rows = []
+    for i, name in list(enumerate(NAMES))[:count]:
+        inverse = np.linalg.inv(pose(i))
+        rows.append((i + 1, (half, 0.0, -half, 0.0), inverse[:3, 3], f"{name}.png"))
+    points = [(1, (0.5, 1.5, 2.5)), (2, (3.0, 4.0, 5.0))]
+    if binary:
+        parameters = (30.0, 16.0, 12.0, distortion)
+        (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 7, 2, WIDTH, HEIGHT, *parameters))
+        images = struct.pack("<Q", len(rows))
+        for image, quaternion, translation, name in rows:
+            images += struct.pack("<I7dI", image, *quaternion, *translation, 7) + name.encode() + b"\0"
+            images += struct.pack("<Q", 2) + struct.pack("<ddQ", 1, 2, 1) * 2
+        (folder / "images.bin").write_bytes(images)
+        data = struct.pack("<Q", len(points))
+        for number, xyz in points:
+            data += struct.pack("<Q3d3BdQ", number, *xyz, 1, 2, 3, 0.5, 2) + struct.pack("<II", 1, 0) * 2
+        (folder / "points3D.bin").write_bytes(data)
+        return
+    (folder / "cameras.txt").write_text(f"# cameras\n7 SIMPLE_RADIAL {WIDTH} {HEIGHT} 30 16 12 {distortion}\n")
+    lines = ["# images"]
+    for image, quaternion, translation, name in rows:
+        numbers = " ".join(repr(float(x)) for x in (*quaternion, *translation))
+        lines += [f"{image} {numbers} 7 {name}", "" if image == 2 else "1 2 1 3 4 -1"]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "points3D.txt").write_text("# points\n1 0.5 1.5 2.5 1 2 3 0.5 1 0 3 0\n2 3 4 5 1 2 3 0.5\n")
+
+
+def sens(path: Path, count: int = 3) -> Path:
+    color, depth = np.eye(4), np.eye(4)
+    color[0, 0] = color[1, 1] = 30
+    color[0, 2], color[1, 2] = 15.5, 11.5
+    depth[0, 0] = depth[1, 1] = 15
+    depth[0, 2], depth[1, 2] = 7.5, 5.5
+    data = struct.pack("<IQ", 4, 4) + b"test"
+    for matrix in (color, np.eye(4), depth, np.eye(4)):
+        data += struct.pack("<16f", *matrix.ravel())
+    data += struct.pack("<iiIIIIfQ", 2, 1, WIDTH, HEIGHT, WIDTH // 2, HEIGHT // 2, 1000.0, count)
+    for i in range(count):
+        jpeg = cv2.imencode(".jpg", photo(i))[1].tobytes()
+        packed = zlib.compress(depth_image(1000 + i, WIDTH // 2, HEIGHT // 2).tobytes())
+        matrix = np.full((4, 4), -np.inf) if i == 1 else pose(i)
+        data += struct.pack("<16fQQQQ", *matrix.ravel(), i, i, len(jpeg), len(packed)) + jpeg + packed
+    path.write_bytes(data)
+    return path
+
+
+def video(path: Path, count: int = 40) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
+    for i in range(count):
+        image = cv2.resize(photo(i, 16, 12), (64, 48), interpolation=cv2.INTER_NEAREST)
+        writer.write(image if i % 4 == 1 else cv2.GaussianBlur(image, (0, 0), 4))
+    writer.release()
+    return path

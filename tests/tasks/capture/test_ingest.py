@@ -1,0 +1,207 @@
+import struct
+
+import capture_folders as made
+import cv2
+import numpy as np
+import pytest
+from capture_folders import ref, refs
+
+from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
+from ss_flow.tasks.capture.ingest import IngestParams, cameras, frames
+from ss_flow.tasks.capture.lens import Lens, depth_to_color_map
+from ss_flow.tasks.capture.photo_files import read_photo
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.capture.sensor_depth import depth
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+
+
+def ingested(scene, **changes):
+    return frames(
+        names=scene.names,
+        photos=refs(scene.photos),
+        valid=refs(scene.valid),
+        lenses=scene.lenses,
+        params=IngestParams(**changes),
+    )
+
+
+def with_orientation(jpeg: bytes, orientation: int) -> bytes:
+    tiff = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
+    segment = b"Exif\0\0" + tiff
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
+
+
+def test_a_photo_that_needs_no_change_keeps_its_bytes(tmp_path):
+    scene = open_scene(made.photos(tmp_path))
+    result = ingested(scene)
+    assert [f.name for f in result] == ["2", "10", "11"]
+    assert result[0].encoded.tobytes() == scene.photos[0].read_bytes()
+    assert (result[0].width, result[0].height, result[0].source_width) == (32, 24, 32)
+    assert result[0].valid.size == 0
+
+
+def test_a_large_photo_is_scaled_down_and_remembers_its_size(tmp_path):
+    frame = ingested(open_scene(made.photos(tmp_path)), max_side=16)[0]
+    assert (frame.width, frame.height, frame.source_width, frame.source_height) == (16, 12, 32, 24)
+    assert decode_rgb(frame).shape == (12, 16, 3)
+
+
+def test_png_is_lossless_where_it_is_asked_for(tmp_path):
+    made.write(tmp_path / "a.bmp", made.photo())
+    frame = ingested(open_scene(tmp_path), jpeg_quality=0)[0]
+    np.testing.assert_array_equal(decode_rgb(frame), made.photo()[..., ::-1])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_are_turned_upright_as_a_viewer_turns_them(tmp_path, orientation):
+    smooth = cv2.resize(made.photo(width=4, height=3), (64, 48), interpolation=cv2.INTER_CUBIC)
+    data = with_orientation(cv2.imencode(".jpg", smooth)[1].tobytes(), orientation)
+    (tmp_path / "a.jpg").write_bytes(data)
+    frame = ingested(open_scene(tmp_path), jpeg_quality=0)[0]
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_array_equal(decode_rgb(frame), expected)
+
+
+def test_a_photo_is_not_turned_when_its_intrinsics_are_those_of_the_stored_one(tmp_path):
+    path = tmp_path / "a.jpg"
+    path.write_bytes(with_orientation(cv2.imencode(".jpg", made.photo())[1].tobytes(), 6))
+    stored = frames(names=("a",), photos=(ref(path),), lenses=(Lens(32, 24, 30, 30, 16, 12),))[0]
+    turned = frames(names=("a",), photos=(ref(path),), lenses=(Lens(24, 32, 30, 30, 12, 16),))[0]
+    assert (stored.width, stored.height) == (32, 24) and stored.encoded.tobytes() == path.read_bytes()
+    assert (turned.width, turned.height) == (24, 32)
+
+
+def test_undistortion_makes_a_pinhole_of_the_same_intrinsics(tmp_path):
+    """A white dot at a distorted place lands where the pinhole sees it; by hand: r' = r (1 + k r^2)."""
+    k, focal = 0.5, 100.0
+    image = np.zeros((101, 101, 3), np.uint8)
+    distorted = 0.3 * (1 + k * 0.3**2) * focal
+    column = int(np.floor(50.5 + distorted))
+    image[49:52, column - 1 : column + 2] = 255
+    made.write(tmp_path / "a.png", image)
+    lens = Lens(101, 101, focal, focal, 50.5, 50.5, (k, 0.0, 0.0, 0.0))
+    frame = frames(
+        names=("a",), photos=(ref(tmp_path / "a.png"),), lenses=(lens,), params=IngestParams(jpeg_quality=0)
+    )[0]
+    bright = np.argwhere(decode_rgb(frame)[..., 0] > 128) + 0.5
+    assert bright.mean(axis=0) == pytest.approx([50.5, 50.5 + 0.3 * focal], abs=0.6)
+    valid = decode_valid(frame)
+    assert valid[50, 50] and not valid[0, 0]
+
+
+def test_a_scaled_pixel_counts_only_when_all_of_it_does(tmp_path):
+    made.scannet(tmp_path)
+    mask = np.full((24, 32), 255, np.uint8)
+    mask[0, 0] = 0
+    made.write(tmp_path / "valid" / "2.png", mask)
+    frame = ingested(open_scene(tmp_path), max_side=16)[0]
+    valid = decode_valid(frame)
+    assert not valid[0, 0] and valid.sum() == 12 * 16 - 1
+
+
+def test_cameras_are_scaled_to_the_frames_and_carry_sparse_points(tmp_path):
+    scene = open_scene(made.colmap(tmp_path))
+    small = ingested(scene, max_side=16)
+    result = cameras(
+        small[1:], names=scene.names, lenses=scene.lenses, poses=scene.poses, metric=False, sparse=ref(scene.sparse)
+    )
+    assert result.names == ("10", "11")
+    np.testing.assert_allclose(result.intrinsics, [[15, 15, 8, 6]] * 2)
+    np.testing.assert_allclose(result.world_to_camera[0], np.linalg.inv(made.pose(1)), atol=1e-9)
+    assert result.sparse_points.shape == (2, 3) and result.sizes.tolist() == [[16, 12]] * 2
+
+
+def read_depth(scene, views):
+    return depth(
+        views,
+        names=scene.names,
+        files=refs(scene.depths),
+        scale=scene.depth_scale,
+        metric=scene.metric,
+        lenses=scene.lenses,
+        depth_lens=scene.depth_lens,
+    )
+
+
+def test_depth_is_in_metres_and_unknown_where_the_photo_is_ignored(tmp_path):
+    made.scannet(tmp_path)
+    mask = np.full((24, 32), 255, np.uint8)
+    mask[:, :8] = 0
+    made.write(tmp_path / "valid" / "10.png", mask)
+    scene = open_scene(tmp_path)
+    maps = read_depth(scene, ingested(scene))
+    assert [m.name for m in maps] == ["2", "10", "11"] and maps[0].source == "sensor"
+    np.testing.assert_allclose(maps[0].depth, np.full((12, 16), 1.0))
+    np.testing.assert_allclose(maps[1].depth[:, 4:], 1.001)
+    assert not maps[1].depth[:, :4].any()
+
+
+def test_depth_of_another_camera_is_registered_to_the_photo():
+    """The depth camera sees twice the angle: its middle half fills the photo."""
+    depth_lens, color = Lens(16, 12, 8, 8, 8, 6), Lens(32, 24, 32, 32, 16, 12)
+    place = depth_to_color_map(depth_lens, color)
+    assert place.shape == (12, 16, 2)
+    np.testing.assert_allclose(place[0, 0], [8 - 7.5 / 2 - 0.5, 6 - 5.5 / 2 - 0.5])
+    np.testing.assert_allclose(place[11, 15], [8 + 7.5 / 2 - 0.5, 6 + 5.5 / 2 - 0.5])
+
+
+def test_registering_moves_pixels_only_where_the_cameras_differ(tmp_path):
+    made.scannet(tmp_path)
+    ramp = (1000 + np.arange(16, dtype=np.uint16))[None].repeat(12, axis=0)
+    made.write(tmp_path / "depth" / "2.png", ramp)
+    scene = open_scene(tmp_path)
+    views = ingested(scene)
+    np.testing.assert_allclose(read_depth(scene, views)[0].depth * 1000, ramp, rtol=1e-6)
+    matrix = np.loadtxt(tmp_path / "intrinsic" / "intrinsic_depth.txt")
+    matrix[0, 2] += 2
+    np.savetxt(tmp_path / "intrinsic" / "intrinsic_depth.txt", matrix)
+    scene = open_scene(tmp_path)
+    moved = read_depth(scene, views)[0].depth
+    np.testing.assert_allclose(moved[:, :14] * 1000, ramp[:, 2:], rtol=1e-6)
+    assert not moved[:, 14:].any()
+
+
+def test_float_depth_is_in_world_units_and_what_is_not_finite_is_unknown(tmp_path):
+    made.scannet(tmp_path)
+    values = np.full((12, 16), 2.5, np.float32)
+    values[0, 0], values[0, 1], values[0, 2] = np.nan, np.inf, -1
+    (tmp_path / "depth" / "2.png").unlink()
+    made.write(tmp_path / "depth" / "2.tiff", values)
+    scene = open_scene(tmp_path)
+    found = read_depth(scene, ingested(scene))[0].depth
+    assert not found[0, :3].any() and (found[1:] == 2.5).all()
+
+
+def test_ready_masks_become_one_mask_an_id_at_the_frames_size(tmp_path):
+    made.photos(tmp_path)
+    ids = np.zeros((24, 32), np.uint16)
+    ids[:12, :16], ids[12:, 16:] = 700, 2
+    for name in made.NAMES:
+        made.write(tmp_path / "instance_masks" / f"{name}.png", ids if name != "11" else ids * 0)
+    scene = open_scene(tmp_path)
+    views = ingested(scene, max_side=16)
+    first, _, empty = ready_masks(views, names=scene.names, files=refs(scene.ready_masks))
+    assert first.dense().shape == (2, 12, 16)
+    assert first.dense()[0, 6:, 8:].all() and first.dense()[0].sum() == 48
+    assert first.dense()[1, :6, :8].all() and first.dense()[1].sum() == 48
+    assert first.parent.tolist() == [-1, -1] and len(empty) == 0 and empty.dense().shape == (0, 12, 16)
+
+
+def test_ground_truth_covers_the_annotated_views_only(tmp_path):
+    scene = open_scene(made.scannet(tmp_path))
+    (tmp_path / "instance" / "10.png").unlink()
+    scene = open_scene(tmp_path)
+    maps = ground_truth(ingested(scene), names=scene.names, files=refs(scene.ground_truth))
+    assert [m.name for m in maps] == ["2", "11"]
+    assert maps[0].ids.dtype == np.uint16 and (maps[0].ids == 3).all()
+
+
+def test_a_jpeg_with_a_thumbnail_and_bytes_after_its_end_is_whole(tmp_path):
+    jpeg = cv2.imencode(".jpg", made.photo())[1].tobytes()
+    thumbnail = b"JFXX\0\x10" + jpeg
+    segment = b"\xff\xe0" + struct.pack(">H", len(thumbnail) + 2) + thumbnail
+    (tmp_path / "a.jpg").write_bytes(jpeg[:2] + segment + jpeg[2:] + b"maker notes")
+    assert read_photo(tmp_path / "a.jpg").width == 32
+    progressive = cv2.imencode(".jpg", made.photo(), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    (tmp_path / "b.jpg").write_bytes(progressive)
+    assert read_photo(tmp_path / "b.jpg").height == 24

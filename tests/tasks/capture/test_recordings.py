@@ -1,0 +1,42 @@
+import capture_folders as made
+import cv2
+import numpy as np
+from capture_folders import ref
+
+from ss_flow.tasks.capture.ingest import cameras
+from ss_flow.tasks.capture.recordings import VideoParams, sens_depth, sens_frames, video_frames
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.geometry.images import decode_rgb
+
+
+def test_the_sharpest_frame_of_each_stride_is_taken(tmp_path):
+    frames = video_frames(video=ref(made.video(tmp_path / "a.avi")), params=VideoParams(max_frames=10, candidates=4))
+    assert [f.name for f in frames] == [f"frame-{i:06d}" for i in range(1, 40, 4)]
+    assert decode_rgb(frames[0]).shape == (48, 64, 3)
+
+
+def test_blurred_frames_are_dropped_where_a_stride_has_no_sharp_one(tmp_path):
+    video = ref(made.video(tmp_path / "a.avi"))
+    everything = video_frames(video=video, params=VideoParams(stride=2, candidates=2, min_sharpness=0.0))
+    sharp = video_frames(video=video, params=VideoParams(stride=2, candidates=2))
+    assert len(everything) == 20
+    assert [f.name for f in sharp] == [f"frame-{i:06d}" for i in range(1, 40, 4)]
+
+
+def test_video_frames_are_few_and_small_when_asked(tmp_path):
+    frames = video_frames(video=ref(made.video(tmp_path / "a.avi")), params=VideoParams(max_frames=3, max_side=32))
+    assert len(frames) == 3
+    assert (frames[0].width, frames[0].height, frames[0].source_width) == (32, 24, 64)
+
+
+def test_a_sens_file_gives_its_photos_and_depth_by_entry(tmp_path):
+    scene = open_scene(made.sens(tmp_path / "a.sens"))
+    recording = ref(scene.recording)
+    frames = sens_frames(recording=recording, names=scene.names, entries=scene.entries)
+    depth = sens_depth(frames, recording=recording, names=scene.names, entries=scene.entries)
+    assert [f.name for f in frames] == ["frame-000000", "frame-000002"]
+    jpeg = cv2.imencode(".jpg", made.photo(2))[1]
+    np.testing.assert_array_equal(decode_rgb(frames[1]), cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1])
+    np.testing.assert_allclose(depth[0].depth, np.full((12, 16), 1.0), rtol=1e-6)
+    np.testing.assert_allclose(depth[1].depth, np.full((12, 16), 1.002), rtol=1e-6)
+    assert len(cameras(frames, names=scene.names, lenses=scene.lenses, poses=scene.poses, metric=True)) == 2

@@ -1,0 +1,178 @@
+import sys
+import time
+from pathlib import Path
+
+import capture_folders as made
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ss_flow.tasks.capture.layout_colmap import read_points
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.capture.scene_files import natural_key
+
+SHARED = Path(__file__).parents[3] / ".." / "shared" / "data"
+WORLD_TO_CAMERA = np.stack([np.linalg.inv(made.pose(i)) for i in range(3)])
+
+
+def assert_cameras(scene, fy=30.0):
+    np.testing.assert_allclose(scene.world_to_camera, WORLD_TO_CAMERA, atol=1e-6)
+    for lens in scene.lenses:
+        assert (lens.fx, lens.fy, lens.cx, lens.cy) == (30.0, fy, 16.0, 12.0)
+
+
+def test_a_folder_of_photos_is_sorted_as_people_count(tmp_path):
+    scene = open_scene(made.photos(tmp_path))
+    assert scene.kind == "photos"
+    assert scene.names == ("2", "10", "11")
+    assert scene.poses is None and scene.depths is None and not scene.metric
+    assert scene.valid == (None, None, None)
+
+
+def test_photos_may_lie_in_a_folder_images(tmp_path):
+    made.photos(tmp_path / "images")
+    assert open_scene(tmp_path).names == ("2", "10", "11")
+
+
+def test_scannet_has_metric_poses_and_half_a_pixel_is_added_to_its_centres(tmp_path):
+    scene = open_scene(made.scannet(tmp_path))
+    assert scene.kind == "scannet" and scene.metric and scene.depth_scale == 0.001
+    assert_cameras(scene)
+    assert (scene.depth_lens.fx, scene.depth_lens.cx, scene.depth_lens.cy) == (15.0, 8.0, 6.0)
+    assert [p.name for p in scene.depths] == ["2.png", "10.png", "11.png"]
+    assert [p.parent.name for p in scene.ground_truth] == ["instance"] * 3
+    assert [p.parent.name for p in scene.valid] == ["valid"] * 3
+
+
+def test_scannet_views_whose_tracking_was_lost_are_skipped(tmp_path):
+    made.scannet(tmp_path)
+    np.savetxt(tmp_path / "pose" / "10.txt", np.full((4, 4), -np.inf))
+    scene = open_scene(tmp_path)
+    assert scene.names == ("2", "11") and scene.skipped == ("10",)
+    assert len(scene.depths) == len(scene.ground_truth) == len(scene.valid) == 2
+
+
+def test_nerfstudio_cameras_look_the_other_way(tmp_path):
+    scene = open_scene(made.nerfstudio(tmp_path))
+    assert scene.kind == "nerfstudio" and scene.metric
+    assert_cameras(scene, fy=31.0)
+    assert scene.lenses[0].pinhole
+
+
+def test_nerfstudio_without_depth_is_not_metric_and_may_be_named_by_its_file(tmp_path):
+    made.nerfstudio(tmp_path)
+    text = (tmp_path / "transforms.json").read_text().replace("depth_file_path", "unused")
+    (tmp_path / "transforms.json").write_text(text)
+    scene = open_scene(tmp_path / "transforms.json")
+    assert scene.depths is None and not scene.metric
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_the_largest_colmap_model_is_taken(tmp_path, binary):
+    scene = open_scene(made.colmap(tmp_path, binary))
+    assert scene.kind == "colmap" and not scene.metric
+    assert scene.names == ("2", "10", "11")
+    assert_cameras(scene)
+    np.testing.assert_allclose(read_points(scene.sparse), [[0.5, 1.5, 2.5], [3, 4, 5]])
+
+
+def test_a_colmap_model_that_pycolmap_wrote_reads_the_same(tmp_path):
+    import zlib  # noqa: F401
+
+    import pycolmap
+
+    made.colmap(tmp_path, binary=False)
+    scene = open_scene(tmp_path)
+    points = read_points(scene.sparse)
+    model = pycolmap.Reconstruction()
+    model.read_text(tmp_path / "sparse" / "1")
+    for folder in ("0", "1"):
+        for file in (tmp_path / "sparse" / folder).iterdir():
+            file.unlink()
+    model.write_binary(tmp_path / "sparse" / "1")
+    again = open_scene(tmp_path)
+    assert again.lenses == scene.lenses and again.names == scene.names
+    np.testing.assert_allclose(again.world_to_camera, scene.world_to_camera, atol=1e-12)
+    np.testing.assert_allclose(read_points(again.sparse), points)
+
+
+def test_tum_takes_what_is_nearest_in_time(tmp_path):
+    made.tum(tmp_path)
+    (tmp_path / "intrinsics.txt").write_text("30 30 15.5 11.5")
+    scene = open_scene(tmp_path)
+    assert scene.kind == "tum" and scene.depth_scale == 1 / 5000
+    assert_cameras(scene)
+    text = (tmp_path / "depth.txt").read_text().replace("101.01", "101.03")
+    (tmp_path / "depth.txt").write_text(text)
+    assert open_scene(tmp_path).skipped == ("10",)
+
+
+def test_tum_without_intrinsics_has_those_of_the_benchmark(tmp_path):
+    lens = open_scene(made.tum(tmp_path)).lenses[0]
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (525, 525, 320, 240)
+
+
+def test_a_sens_file_lists_the_views_that_have_a_pose(tmp_path):
+    scene = open_scene(made.sens(tmp_path / "scene0000_00.sens"))
+    assert scene.kind == "sens" and scene.name == "scene0000_00" and scene.metric
+    assert scene.names == ("frame-000000", "frame-000002") and scene.skipped == ("frame-000001",)
+    assert scene.entries == (0, 2)
+    np.testing.assert_allclose(scene.world_to_camera, WORLD_TO_CAMERA[[0, 2]], atol=1e-6)
+    assert scene.depth_scale == pytest.approx(0.001)
+
+
+def test_a_video_is_known_by_its_name_alone(tmp_path):
+    (tmp_path / "walk.MP4").write_bytes(b"")
+    assert open_scene(tmp_path / "walk.MP4").kind == "video"
+    assert open_scene(tmp_path).recording == tmp_path / "walk.MP4"
+
+
+def test_ready_masks_are_found_beside_any_layout_or_where_they_are_said_to_be(tmp_path):
+    made.photos(tmp_path / "scene")
+    for name in made.NAMES:
+        made.write(tmp_path / "elsewhere" / f"{name}.png", np.zeros((made.HEIGHT, made.WIDTH), np.uint16))
+    assert open_scene(tmp_path / "scene").ready_masks is None
+    assert len(open_scene(tmp_path / "scene", masks=tmp_path / "elsewhere").ready_masks) == 3
+    (tmp_path / "elsewhere").rename(tmp_path / "scene" / "instance_masks")
+    assert open_scene(tmp_path / "scene").ready_masks[1].name == "10.png"
+
+
+def test_every_second_view_keeps_everything_aligned(tmp_path):
+    scene = open_scene(made.scannet(tmp_path)).every(2)
+    assert scene.names == ("2", "11")
+    assert [p.stem for p in (*scene.photos, *scene.depths, *scene.valid, *scene.ground_truth)] == ["2", "11"] * 4
+    np.testing.assert_allclose(scene.world_to_camera, WORLD_TO_CAMERA[[0, 2]], atol=1e-9)
+
+
+def test_opening_is_light_and_quick(tmp_path):
+    import subprocess
+
+    made.nerfstudio(tmp_path)
+    code = (
+        "import sys; from pathlib import Path; from ss_flow.tasks.capture.scene import open_scene;"
+        f"open_scene(Path({str(tmp_path)!r}));"
+        "print([m for m in ('cv2', 'torch', 'pycolmap', 'scipy', 'onnxruntime') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
+
+
+def test_a_hundred_photos_open_in_less_than_a_tenth_of_a_second(tmp_path):
+    for i in range(100):
+        (tmp_path / f"{i}.jpg").write_bytes(b"\xff\xd8")
+    before = time.process_time()
+    assert len(open_scene(tmp_path).names) == 100
+    assert time.process_time() - before < 0.1
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=1))
+def test_numbers_in_names_sort_by_value(numbers):
+    names = [f"frame_{n}.jpg" for n in numbers]
+    assert sorted(names, key=natural_key) == [f"frame_{n}.jpg" for n in sorted(numbers)]
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real captures are not beside the project")
+def test_the_real_captures_open():
+    shelf, office = open_scene(SHARED / "apc_shelf"), open_scene(SHARED / "hololens_office")
+    assert (len(shelf.names), shelf.kind, len(shelf.ground_truth)) == (15, "scannet", 15)
+    assert (len(office.names), office.kind, office.metric) == (75, "nerfstudio", True)

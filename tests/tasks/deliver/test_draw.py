@@ -1,0 +1,172 @@
+import numpy as np
+import pytest
+
+from ss_flow.tasks.artifacts import (
+    Cameras,
+    DepthMap,
+    Descriptors,
+    Frame,
+    Gaussians,
+    InstanceMasks,
+    LabelMap,
+    MaskSet,
+    Metrics,
+    PointCloud,
+    PointLabels,
+    Visibility,
+)
+from ss_flow.tasks.deliver.draw import draw
+from ss_flow.tasks.deliver.palette import instance_color
+from ss_flow.tasks.geometry.images import encode_png, pack_masks
+from ss_flow.tasks.models.colour_words import TERMS
+from ss_flow.tasks.semantics.query import query
+
+H, W = 48, 64
+NONE_I, NONE_F = np.zeros(0, np.int32), np.zeros(0, np.float32)
+PHOTO = np.random.default_rng(0).integers(0, 256, (H, W, 3), np.uint8)
+FRAME = Frame("left", W, H, encode_png(PHOTO), np.zeros(0, np.uint8), W, H)
+POINTS = np.random.default_rng(1).uniform(-1, 1, (500, 3)).astype(np.float32) + np.float32([0, 0, 4])
+CLOUD = PointCloud(POINTS, np.full((500, 3), (10, 200, 30), np.uint8), 1.0, 0.1)
+CAMERAS = Cameras(("left",), np.array([[W, H]], np.int32), np.array([[50.0, 50, 32, 24]]), np.eye(4)[None], True)
+HALF = np.zeros((H, W), bool)
+HALF[:, :32] = True
+
+EMPTY_3 = np.zeros((0, 3), np.float32)
+NO_GAUSSIANS = Gaussians(
+    EMPTY_3, np.zeros((0, 4), np.float32), EMPTY_3, NONE_F, np.zeros((0, 1, 3), np.float32), NONE_I, NONE_F, NONE_I
+)
+
+
+def labels_of(label: np.ndarray) -> PointLabels:
+    return PointLabels(label.astype(np.int32), np.ones(len(label), np.float32), 5, NONE_I, NONE_I, NONE_I, NONE_F)
+
+
+def instance_of(masks: np.ndarray, views: list[int]) -> InstanceMasks:
+    n = len(views)
+    return InstanceMasks(
+        2, POINTS, CLOUD.colors, np.ones(500, np.float32), 0.9, H, W, np.array(views, np.int32),
+        np.packbits(masks.reshape(n, H * W), axis=1),
+        np.zeros(n, np.uint8), False,
+    )  # fmt: skip
+
+
+def has_color(picture: np.ndarray, color) -> bool:
+    return bool((picture == np.array(color)).all(axis=2).any())
+
+
+def test_a_frame_is_its_photo():
+    np.testing.assert_array_equal(draw(FRAME), PHOTO)
+
+
+def test_masks_are_painted_and_small_ones_lie_on_top():
+    small = np.zeros((H, W), bool)
+    small[10:20, 5:15] = True
+    both = np.stack([small, HALF])
+    masks = MaskSet(
+        "left", H, W, pack_masks(both), *(np.ones(2, np.float32),) * 2, *(np.zeros(2, np.int32),) * 2, "own"
+    )
+    picture = draw(masks)
+    assert picture.shape == (H, W, 3)
+    assert tuple(picture[15, 10]) == instance_color(1) and tuple(picture[40, 10]) == instance_color(2)
+    tinted = draw(masks, frame=FRAME)
+    np.testing.assert_array_equal(tinted[5, 50], (PHOTO[5, 50] * 0.8).astype(np.uint8))
+
+
+def test_a_photo_of_another_size_is_left_out():
+    ids = LabelMap("left", np.ones((H * 2, W * 2), np.uint16))
+    np.testing.assert_array_equal(draw(ids, frame=FRAME), draw(ids))
+
+
+def test_depth_has_a_legend_below():
+    picture = draw(DepthMap("left", np.linspace(1, 2, H * W, dtype=np.float32).reshape(H, W), "sensor"))
+    assert picture.shape[1] == W and picture.shape[0] > H
+    assert (picture[H + 4, :, 0] != picture[H + 4, ::-1, 0]).any()
+
+
+def test_points_are_seen_from_a_view_or_from_outside():
+    outside, inside = draw(CLOUD), draw(CLOUD, cameras=CAMERAS)
+    assert outside.shape == (720, 960, 3) and inside.shape == (H, W, 3)
+    assert has_color(outside, (10, 200, 30)) and has_color(inside, (10, 200, 30))
+
+
+def test_labels_take_the_colors_of_their_instances():
+    label = np.where(POINTS[:, 0] > 0, 3, 0)
+    picture = draw(labels_of(label), points=CLOUD, cameras=CAMERAS)
+    assert has_color(picture[:, W // 2 :], instance_color(3)) and has_color(picture[:, : W // 2], (190, 190, 190))
+    assert not has_color(picture[:, : W // 3], instance_color(3))
+
+
+def test_labels_without_points_are_counted():
+    assert draw(labels_of(np.array([0, 1, 1]))).shape[1] == 800
+
+
+def test_an_instance_is_shown_in_its_views():
+    instance = instance_of(np.stack([HALF, ~HALF]), [0, 3])
+    picture = draw(instance, frames=(FRAME,))
+    assert picture.shape[1] == 1400 and has_color(picture, instance_color(2))
+
+
+def test_an_instance_without_masks_is_shown_by_its_points():
+    instance = instance_of(np.zeros((0, H, W), bool), [])
+    assert has_color(draw(instance), (10, 200, 30))
+
+
+def test_visible_points_are_colored_by_depth():
+    pixel = np.array([10 * W + 10, 30 * W + 50], np.int32)
+    seen = Visibility("left", np.arange(2, dtype=np.int32), pixel, np.array([1, 2], np.float32), H, W)
+    picture = draw(seen)
+    assert picture[10, 10, 0] > picture[10, 10, 2] and picture[5, 5].max() == 34
+    assert draw(seen, frame=FRAME)[:H].std() > picture[:H].std()
+
+
+def test_gaussians_are_rendered():
+    sh = np.tile(np.float32([[[1.7, -1.7, -1.7]]]), (500, 1, 1))
+    quaternions = np.tile(np.float32([1, 0, 0, 0]), (500, 1))
+    sizes, opacity = np.full((500, 3), -2.5, np.float32), np.full(500, 4.0, np.float32)
+    ids, sure = np.ones(500, np.int32), np.ones(500, np.float32)
+    scene = Gaussians(POINTS, quaternions, sizes, opacity, sh, ids, sure, np.zeros(500, np.int32))
+    picture = draw(scene, cameras=CAMERAS)
+    assert picture.shape == (H, W, 3) and picture.dtype == np.uint8
+    np.testing.assert_allclose(picture[24, 32], [250, 5, 5], atol=25)
+    assert draw(scene).shape == (720, 960, 3)
+
+
+def test_cameras_descriptors_metrics_and_answers_have_pictures():
+    embedding = np.zeros(len(TERMS), np.float32)
+    embedding[TERMS.index("red")] = 1
+    described = Descriptors(1, embedding, np.zeros(1, np.int32), np.ones(1, np.float32), "colour words")
+    other = Descriptors(1, np.ones(4, np.float32) / 2, np.zeros(1, np.int32), np.ones(1, np.float32), "clip")
+    assert has_color(draw(described), (255, 0, 0))
+    for value in (CAMERAS, other, Metrics({"miou": 0.5}), query((described,), text="red")):
+        picture = draw(value, points=CLOUD)
+        assert picture.dtype == np.uint8 and picture.ndim == 3 and picture.std() > 5
+
+
+def test_a_list_becomes_a_sheet_over_the_photos_of_its_views():
+    maps = tuple(LabelMap(f"v{i}", np.zeros((H, W), np.uint16)) for i in range(2))
+    bare, over = draw(maps), draw(maps, frames=(FRAME, FRAME))
+    assert bare.shape == over.shape and over[:200].std() > bare[:200].std()
+
+
+def test_a_long_list_is_cut_and_an_empty_one_says_so():
+    frames = (FRAME,) * 30
+    assert draw(frames).shape == draw(frames[:24]).shape
+    assert draw(()).shape[1] == 800
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        CLOUD.__class__(POINTS[:0], CLOUD.colors[:0], 1.0, 0.0),
+        NO_GAUSSIANS,
+        Cameras((), np.zeros((0, 2), np.int32), np.zeros((0, 4)), np.zeros((0, 4, 4)), False),
+        MaskSet("e", H, W, np.zeros((0, H * W // 8), np.uint8), NONE_F, NONE_F, NONE_I, NONE_I, "own"),
+        Visibility("e", NONE_I, NONE_I, NONE_F, H, W),
+        Metrics({}),
+        3.5,
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_empty_or_unknown_has_a_picture_too(value):
+    picture = draw(value)
+    assert picture.ndim == 3 and picture.dtype == np.uint8 and picture.size > 0

@@ -1,0 +1,93 @@
+import json
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.deliver.instances_json import instance_file, instances_document
+from ss_flow.tasks.deliver.palette import instance_color
+from ss_flow.tasks.semantics.name import InstanceNames
+
+NOTHING = np.zeros(0, np.uint8)
+FRAMES = tuple(Frame(name, 4, 2, NOTHING, NOTHING, 4, 2) for name in "abc")
+
+
+def instance(instance_id: int, points, views=(0, 2), weak: bool = False) -> InstanceMasks:
+    points = np.asarray(points, np.float32).reshape(-1, 3)
+    n, v = len(points), len(views)
+    return InstanceMasks(
+        instance_id, points, np.zeros((n, 3), np.uint8), np.ones(n, np.float32), 0.87654321, 2, 4,
+        np.array(views, np.int32), np.zeros((v, 1), np.uint8), np.zeros(v, np.uint8), weak,
+    )  # fmt: skip
+
+
+def gaussians(means, ids) -> Gaussians:
+    n = len(ids)
+    return Gaussians(
+        np.asarray(means, np.float32), np.zeros((n, 4), np.float32), np.zeros((n, 3), np.float32),
+        np.zeros(n, np.float32), np.zeros((n, 1, 3), np.float32), np.asarray(ids, np.int32),
+        np.zeros(n, np.float32), np.zeros(n, np.int32),
+    )  # fmt: skip
+
+
+def test_an_instance_is_described_by_its_points():
+    document = instances_document([instance(7, [[0, 0, 0], [2, 4, 6]])], None, None, FRAMES)
+    assert json.loads(json.dumps(document)) == {
+        "version": 1,
+        "background_id": 0,
+        "instances": [
+            {
+                "id": 7,
+                "name": "object 7",
+                "named_by": None,
+                "color": list(instance_color(7)),
+                "parent": None,
+                "bbox": {"min": [0, 0, 0], "max": [2, 4, 6]},
+                "centroid": [1, 2, 3],
+                "views": ["a", "c"],
+                "confidence": 0.8765,
+                "num_points": 2,
+                "num_gaussians": 0,
+                "weak": False,
+                "file": None,
+            }
+        ],
+    }
+
+
+def test_where_there_are_gaussians_they_say_where_it_is():
+    scene = gaussians([[9, 9, 9], [1, 0, 0], [5, 5, 5], [3, 0, 0]], [0, 7, 8, 7])
+    entry = instances_document([instance(7, [[0, 0, 0]])], scene, None, FRAMES)["instances"][0]
+    assert entry["bbox"] == {"min": [1, 0, 0], "max": [3, 0, 0]} and entry["centroid"] == [2, 0, 0]
+    assert entry["num_gaussians"] == 2 and entry["file"] == instance_file(7) == "instances/0007.ply"
+
+
+def test_a_weak_instance_has_points_but_no_file():
+    scene = gaussians([[1, 0, 0]], [8])
+    entry = instances_document([instance(7, [[1, 1, 1]], weak=True)], scene, None, FRAMES)["instances"][0]
+    assert entry["weak"] and entry["file"] is None and entry["centroid"] == [1, 1, 1]
+
+
+def test_names_are_unique_and_the_unknown_go_by_their_id():
+    names = InstanceNames(
+        np.array([3, 1, 2, 4], np.int32), ("mug", "mug", "object", "sofa"), np.ones(4, np.float32), "clip"
+    )
+    document = instances_document([instance(i, [[0, 0, 0]]) for i in (5, 4, 3, 2, 1)], None, names, FRAMES)
+    found = [(e["id"], e["name"], e["named_by"]) for e in document["instances"]]
+    assert found == [
+        (1, "mug", "clip"),
+        (2, "object 2", "clip"),
+        (3, "mug 2", "clip"),
+        (4, "sofa", "clip"),
+        (5, "object 5", None),
+    ]
+
+
+def test_the_background_is_no_instance_and_parts_know_their_whole():
+    three = [instance(i, [[0, 0, 0]]) for i in (0, 1, 2)]
+    entries = instances_document(three, None, None, FRAMES, parents={2: 1})["instances"]
+    assert [(e["id"], e["parent"]) for e in entries] == [(1, None), (2, 1)]
+
+
+def test_an_instance_without_points_has_no_place():
+    entry = instances_document([instance(1, [])], None, None, FRAMES)["instances"][0]
+    assert entry["bbox"] is None and entry["centroid"] is None

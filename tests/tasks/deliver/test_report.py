@@ -1,0 +1,142 @@
+import base64
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap
+from ss_flow.tasks.deliver.report import data_uri, report_html, report_pictures
+from ss_flow.tasks.geometry.images import encode_png
+
+PHOTO = np.random.default_rng(0).integers(0, 256, (60, 80, 3), np.uint8)
+RUN = {
+    "status": "degraded",
+    "scene": "my <room> & more",
+    "params": {"split": {"tau_depth": 0.02, "grids": (1, 4)}, "seed": None},
+    "models": {"masks": "rgb-d graph"},
+    "metrics": {"split": {"miou": 0.8123}, "novel_view": {"psnr": 27.314, "ssim": 0.9}, "extra": 3},
+    "nodes": [
+        {"step": "split.segment", "item": "a", "hit": True, "seconds": 50.0, "peak_rss_mb": 10},
+        {"step": "split.segment", "item": "b", "hit": False, "seconds": 4.0, "peak_rss_mb": 812.3},
+        {"step": "splat.merge", "hit": False, "seconds": 76.0},
+    ],
+    "failures": [{"step": "splat.reconstruct", "item": "3", "error": "loss is <NaN>"}],
+}
+INSTANCE = {
+    **{"id": 3, "name": "red <b>mug</b>", "color": [1, 2, 3], "views": ["a", "b"], "num_points": 12345},
+    **{"num_gaussians": 0, "confidence": 0.9, "weak": True, "file": None},
+}
+
+
+class Page(HTMLParser):
+    """Open tags, text, and the addresses that the page would load."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open, self.words, self.addresses = [], [], []
+        self.feed(html)
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+        self.addresses += [value for key, value in attrs if key in ("src", "href", "srcset")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.words.append(data)
+
+
+def test_the_page_is_well_formed_and_loads_nothing():
+    html = report_html(RUN, pictures={"a/photo": PHOTO, "Cameras": PHOTO}, instances={"instances": [INSTANCE]})
+    page = Page(html)
+    assert page.open == []
+    assert len(page.addresses) == 2 and all(a.startswith("data:image/") for a in page.addresses)
+    assert not re.search(r"https?:|url\(|@import|<script|<link", html)
+
+
+def test_what_the_run_says_is_on_the_page():
+    page = Page(report_html(RUN, pictures={}, instances={"instances": [INSTANCE]}))
+    for text in (
+        "my <room> & more", "degraded", "mIoU 0.812", "PSNR 27.31 dB", "SSIM 0.900", "After Split", "Novel views",
+        "rgb-d graph", "split.tau_depth 0.02", "split.grids (1, 4)", "seed –", "splat.reconstruct 3: loss is <NaN>",
+        "red <b>mug</b> (weak: points only)", "12,345", "812 MB", "Nodes computed 2", "From the cache 1",
+    ):  # fmt: skip
+        assert text in page.text, text
+
+
+def test_of_a_scenes_place_only_its_name_is_shown():
+    html = report_html({**RUN, "scene": "/home/someone/captures/kitchen"}, pictures={})
+    assert "<h1>kitchen</h1>" in html and "someone" not in html
+
+
+def test_failures_by_label_are_told():
+    page = Page(report_html({"failures": [{"label": "reconstruct[3]", "error": "out of memory"}]}, pictures={}))
+    assert "reconstruct[3]: out of memory" in page.text
+
+
+def test_three_views_spread_over_the_capture_are_drawn():
+    n, h, w = 9, 60, 80
+    frames = [Frame(f"v{i}", w, h, encode_png(PHOTO), np.zeros(0, np.uint8), w, h) for i in range(n)]
+    maps = [LabelMap(f"v{i}", np.ones((h, w), np.uint16)) for i in range(n)]
+    depths = [DepthMap(f"v{i}", np.ones((h, w), np.float32), "sensor") for i in range(n)]
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    cameras = Cameras(tuple(f.name for f in frames), np.full((n, 2), (w, h), np.int32), np.ones((n, 4)), poses, True)
+    f, i = np.zeros(0, np.float32), np.zeros(0, np.int32)
+    nothing = Gaussians(f.reshape(0, 3), f.reshape(0, 4), f.reshape(0, 3), f, f.reshape(0, 1, 3), i, f, i)
+    pictures = report_pictures(frames, cameras, depths, maps, maps, nothing)
+    kinds = ("photo", "masks_split", "masks", "depth")
+    assert list(pictures) == [*(f"{v}/{kind}" for v in ("v1", "v4", "v7") for kind in kinds), "Cameras"]
+    few = report_pictures(frames[:2], cameras, depths[:2], maps[:2], maps[:2], nothing)
+    assert [name for name in few if name.endswith("photo")] == ["v0/photo", "v1/photo"]
+
+
+def test_the_time_of_a_hit_is_not_counted():
+    page = Page(report_html(RUN, pictures={}))
+    assert "Computing time 1 min 20 s" in page.text
+    assert "split.segment 2 1 4.00 s" in page.text and "splat.merge 1 0 1 min 16 s" in page.text
+
+
+def test_the_longest_step_has_the_full_bar():
+    html = report_html(RUN, pictures={})
+    assert re.findall(r'<i style="width: ([\d.]+)%"', html) == ["5.3", "100.0"]
+
+
+def test_pictures_of_a_view_stand_together_in_a_fixed_order():
+    pictures = {"a/depth": PHOTO, "b/photo": PHOTO, "a/photo": PHOTO, "Cameras": PHOTO}
+    html = report_html(RUN, pictures=pictures)
+    assert re.findall(r"<figcaption>(.*?)</figcaption>", html) == ["Photo", "Depth", "Photo", "Cameras"]
+    assert re.findall(r"<h3>View (.*?)</h3>", html) == ["a", "b"]
+
+
+def test_an_empty_run_has_a_report_too():
+    page = Page(report_html({}, pictures={}))
+    assert "unknown" in page.text and "How it was made" in page.text and "Instances" in page.text
+
+
+def decoded(uri: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), 1)[..., ::-1]
+
+
+def test_pictures_are_inside_in_the_smaller_form():
+    flat = np.zeros((60, 80, 3), np.uint8)
+    assert data_uri(flat).startswith("data:image/png;") and data_uri(PHOTO).startswith("data:image/jpeg;")
+    np.testing.assert_array_equal(decoded(data_uri(flat)), flat)
+    smooth = cv2.resize(PHOTO, (320, 240), interpolation=cv2.INTER_CUBIC)
+    assert np.abs(decoded(data_uri(smooth)).astype(int) - smooth).mean() < 12
+
+
+def test_bytes_stay_as_they_are():
+    png = encode_png(PHOTO).tobytes()
+    uri = data_uri(png)
+    assert uri.startswith("data:image/png;") and base64.b64decode(uri.split(",")[1]) == png
+
+
+@pytest.mark.parametrize("width, expected", [(2000, 960), (500, 500)])
+def test_large_pictures_are_scaled_down(width, expected):
+    assert decoded(data_uri(np.zeros((90, width, 3), np.uint8))).shape[1] == expected

@@ -1,0 +1,194 @@
+"""Training on a generated ball, and the rules around it."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.trainer import TrainingDiverged, TrainParams, TrainView, auto_iterations, train
+from ss_flow.tasks.geometry.cameras import Camera
+
+SIZE = 48
+
+
+def camera_round(angle: float) -> Camera:
+    """Looks at the origin from 3 units away, in the plane y = 0."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    pose[2, 3] = 3
+    return Camera(SIZE, SIZE, 60.0, 60.0, SIZE / 2, SIZE / 2, pose)
+
+
+def color_at(points: np.ndarray) -> np.ndarray:
+    return (0.5 + 0.4 * np.sin(3 * points + (0, 1, 2))).astype(np.float32)
+
+
+def ball_view(angle: float) -> TrainView:
+    """The ball of radius 0.8 about the origin, cast ray by ray."""
+    camera = camera_round(angle)
+    v, u = np.mgrid[:SIZE, :SIZE] + 0.5
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    rays = rays @ camera.world_to_camera[:3, :3]
+    a, b, c = (rays**2).sum(-1), rays @ camera.center, camera.center @ camera.center - 0.64
+    root = b * b - a * c
+    inside = root > 0
+    z = np.where(inside, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
+    image = color_at(camera.center + rays * z[..., None])
+    image[~inside] = 1
+    return TrainView(camera, image, inside, ~inside, z.astype(np.float32))
+
+
+VIEWS = [ball_view(a) for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
+
+
+def ball_points(n: int = 300):
+    points = np.random.default_rng(0).normal(size=(n, 3))
+    points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
+    return initialise(points.astype(np.float32), (255 * color_at(points)).astype(np.uint8), 4, 0.5)
+
+
+def test_training_finds_colours_shape_and_depth_of_a_ball():
+    result = train(ball_points(), VIEWS, params=TrainParams(iterations=400), extent=1.6, seed=1)
+    assert result.psnr > 29
+    assert result.loss[-50:].mean() < 0.3 * result.loss[:20].mean()
+    unseen = ball_view(0.3)
+    out = render(result.gaussians, unseen.camera)
+    inside = unseen.inside
+    assert np.square(out.rgb - unseen.image)[inside].mean() < 10**-2.7
+    assert out.alpha[inside].mean() > 0.95 and out.alpha[~inside].mean() < 0.2
+    assert np.abs(out.depth / np.maximum(out.alpha, 1e-6) - unseen.depth)[inside].mean() < 0.15
+    assert (result.gaussians.instance_id == 4).all() and (result.gaussians.instance_conf == 0.5).all()
+    assert np.allclose(np.linalg.norm(result.gaussians.quaternions, axis=1), 1, atol=1e-5)
+
+
+def test_threads_beside_it_do_not_change_a_byte():
+    params = TrainParams(iterations=60)
+    alone = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1)
+    found = {}
+
+    def work(seed: int) -> None:
+        found[seed] = train(ball_points(), VIEWS, params=params, extent=1.6, seed=seed)
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in (1, 2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found[1].gaussians.means.tobytes() == alone.gaussians.means.tobytes()
+    assert found[2].gaussians.means.tobytes() != alone.gaussians.means.tobytes()
+
+
+def test_the_mask_loss_gives_pixels_back_to_their_instance():
+    half = ball_points()
+    labels = np.where(half.means[:, 1] < 0, 4, 9).astype(np.int32)
+    wrong = labels.copy()
+    wrong[::7] = np.where(labels[::7] == 4, 9, 4)
+    views = []
+    for view in VIEWS:
+        world_y = (view.depth * ((np.mgrid[:SIZE, :SIZE][0] + 0.5 - SIZE / 2) / 60.0)).astype(np.float32)
+        ids = np.where(view.inside, np.where(world_y < 0, 0, 1), -2).astype(np.int32)
+        views.append(replace(view, ids=ids))
+    params = TrainParams(iterations=150, densify=False, mask_weight=0.25, reset_opacity=True, prune_opacity=0.0)
+    params = replace(params, prune_contribution=0.0)
+    mixed = replace(half, instance_id=wrong)
+
+    def error(gaussians) -> float:
+        out = render(gaussians, views[0].camera, label_ids=(4, 9)).label_masks
+        return float(np.abs(out - np.stack([views[0].ids == 0, views[0].ids == 1])).mean())
+
+    with_masks = train(mixed, views, params=params, extent=1.6, seed=0, label_ids=(4, 9)).gaussians
+    without = train(mixed, views, params=replace(params, mask_weight=0.0), extent=1.6, seed=0).gaussians
+    assert error(with_masks) < 0.8 * error(without)
+    assert np.array_equal(with_masks.instance_id, wrong)
+
+
+def test_ignored_pixels_do_not_count():
+    noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
+    views = [replace(v, free=np.zeros_like(v.free)) for v in VIEWS]
+    disturbed = [replace(v, image=np.where(v.inside[..., None], v.image, noise)) for v in views]
+    a, b = (train(ball_points(), x, params=TrainParams(iterations=20), extent=1.6, seed=0) for x in (views, disturbed))
+    assert a.gaussians.means.tobytes() == b.gaussians.means.tobytes()
+
+
+def test_bad_input_is_refused():
+    params = TrainParams(iterations=5)
+    with pytest.raises(ValueError, match="views"):
+        train(ball_points(), [], params=params, extent=1, seed=0)
+    with pytest.raises(ValueError, match="inside"):
+        train(ball_points(), [replace(VIEWS[0], inside=np.ones((3, 3), bool))], params=params, extent=1, seed=0)
+    with pytest.raises(ValueError, match="extent"):
+        train(ball_points(), VIEWS, params=params, extent=0, seed=0)
+
+
+def test_a_training_that_blows_up_says_so():
+    with pytest.raises(TrainingDiverged, match="diverged"):
+        train(ball_points(), VIEWS, params=TrainParams(iterations=60, scale_lr=1e38), extent=1.6, seed=0)
+
+
+def test_iterations_follow_the_number_of_views():
+    assert [auto_iterations(k) for k in (1, 20, 1000)] == [600, 800, 10_000]
+
+
+def test_large_gaussians_are_split_and_small_ones_cloned():
+    points = initialise(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8), 1, 1.0)
+    parameters = {"means": points.means, "quaternions": points.quaternions, "log_scales": points.log_scales.copy()}
+    parameters["log_scales"][0] = np.log(0.001)
+    values, source, fresh = densify(
+        parameters, np.array([1.0, 1.0, 0.0]), threshold=0.5, extent=1.0, most=10, generator=np.random.default_rng(0)
+    )
+    assert source.tolist() == [0, 2, 0, 1, 1] and fresh.tolist() == [False, False, True, True, True]
+    assert np.array_equal(values["means"][2], points.means[0])
+    assert np.allclose(np.exp(values["log_scales"][3:]), np.exp(points.log_scales[1]) / 1.6)
+    assert not np.array_equal(values["means"][3], values["means"][4])
+
+
+def test_densification_ends_at_the_limit_with_the_largest_gradients_first():
+    points = initialise(np.random.default_rng(0).random((6, 3)).astype(np.float32), np.zeros((6, 3), np.uint8), 1, 1.0)
+    parameters = {"means": points.means, "quaternions": points.quaternions, "log_scales": points.log_scales - 9}
+    gradient = np.array([1, 6, 2, 5, 3, 4.0])
+    _, source, _ = densify(
+        parameters, gradient, threshold=0.5, extent=1, most=8, generator=np.random.default_rng(0)
+    )  # fmt: skip
+    assert source.tolist() == [0, 1, 2, 3, 4, 5, 1, 3]
+
+
+def test_the_gradient_record_averages_over_the_views_that_saw():
+    record = GradientRecord(2)
+    record.add(np.array([[3, 4], [0, 0]], np.float32), np.array([1, 0], np.float32), 2 * REFERENCE_ROWS)
+    record.add(np.array([[0, 1], [0, 2]], np.float32), np.array([1, 1], np.float32), 2 * REFERENCE_ROWS)
+    assert record.mean().tolist() == [3, 2]
+
+
+def test_a_long_training_densifies_as_3dgs_does():
+    assert Schedule.of(30_000) == Schedule(500, 15_000, 100, 3_000)
+
+
+def test_initial_scales_are_the_root_mean_square_of_three_neighbours():
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], np.float32)
+    made = initialise(points, np.full((4, 3), 255, np.uint8), 7, 0.25)
+    assert np.exp(made.log_scales[0]) == pytest.approx([np.sqrt(14 / 3)] * 3)
+    assert 1 / (1 + np.exp(-made.opacity_logits[0])) == pytest.approx(0.1)
+    assert made.sh[0, 0] * 0.28209479 + 0.5 == pytest.approx([1, 1, 1])
+    lone = initialise(points[:1], np.zeros((1, 3), np.uint8), 7, 0.25)
+    assert np.exp(lone.log_scales[0]) == pytest.approx([0.01] * 3)
+
+
+def test_joining_fills_colours_of_lower_degree_and_picking_undoes_it():
+    low, high = ball_points(5), initialise(np.ones((3, 3), np.float32), np.zeros((3, 3), np.uint8), 2, 1.0, sh_degree=2)
+    both = concatenate([low, high])
+    assert both.sh.shape == (8, 9, 3) and both.instance_id.tolist() == [4] * 5 + [2] * 3
+    assert np.array_equal(select(both, both.instance_id == 4).means, low.means)
+
+
+def test_opaque_rendering_ignores_the_opacities():
+    faint = replace(ball_points(), opacity_logits=np.full(300, -4, np.float32))
+    camera = camera_round(0)
+    centre = SIZE // 2
+    assert render(faint, camera).alpha[centre, centre] < 0.5
+    assert render(faint, camera, opaque=True).alpha[centre, centre] > 0.95

@@ -1,0 +1,70 @@
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ss_flow.tasks.artifacts import Cameras, DepthMap
+from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_at, sum_by_voxel
+
+
+def samples(points, color=0.0):
+    points = np.asarray(points, float)
+    return VoxelSums(points, np.full((len(points), 3), color), np.ones(len(points)))
+
+
+def test_points_of_one_voxel_are_averaged_by_weight():
+    once = sum_by_voxel([samples([[-0.4, 0.1, 0.1], [-0.2, 0.1, 0.1], [1.0, 0, 0]], 30)], 1.0)
+    twice = sum_by_voxel([once, samples([[0.3, 0.1, 0.1]], 90)], 1.0)
+    position, color = twice.means()
+    np.testing.assert_allclose(position, [[-0.1, 0.1, 0.1], [1.0, 0, 0]])
+    np.testing.assert_allclose(color, [[50] * 3, [30] * 3])
+    assert twice.weight.tolist() == [3, 1]
+
+
+@settings(deadline=None)
+@given(st.integers(0, 1000), st.floats(0.05, 3.0))
+def test_summing_agrees_with_a_dictionary_of_voxels(seed, voxel):
+    points = np.random.default_rng(seed).normal(0, 2, (60, 3))
+    cells = {}
+    for p in points:
+        cells.setdefault(tuple(np.floor(p / voxel + 0.5).astype(int)), []).append(p)
+    expected = sorted(tuple(np.mean(c, axis=0)) for c in cells.values())
+    found = sorted(map(tuple, sum_by_voxel([samples(points)], voxel).means()[0]))
+    np.testing.assert_allclose(found, expected)
+
+
+def test_depth_of_a_smaller_map_is_read_at_the_pixel_centre():
+    depth = DepthMap("0", np.array([[1.0, 2.0], [3.0, 4.0]], np.float32), "sensor")
+    column, row = np.array([0, 1, 2, 3, 1]), np.array([0, 0, 0, 3, 2])
+    assert depth_at(depth, column, row, 4, 4).tolist() == [1, 1, 2, 4, 3]
+
+
+def four_equal_views(distances):
+    """Cameras at the same place that measure a wall at different distances."""
+    k = len(distances)
+    cameras = Cameras(
+        tuple("abcd"[:k]),
+        np.full((k, 2), 10, np.int32),
+        np.tile([10.0, 10.0, 5.0, 5.0], (k, 1)),
+        np.tile(np.eye(4), (k, 1, 1)),
+        True,
+    )
+    return cameras, tuple(DepthMap("x", np.full((10, 10), d, np.float32), "sensor") for d in distances)
+
+
+def test_a_point_that_the_other_views_look_through_is_dropped():
+    cameras, depths = four_equal_views([1.0, 3.0, 3.0])
+    points = np.array([[0.0, 0, 1.0], [0, 0, 3.0]])
+    kept = consistent_points(points, cameras, depths, tau=0.02, tau_relative=0, min_views=2)
+    assert kept.tolist() == [False, True]
+
+
+def test_a_point_that_only_one_view_sees_needs_no_second():
+    cameras, depths = four_equal_views([3.0, 1.0, 0.0])
+    kept = consistent_points(np.array([[0.0, 0, 3.0]]), cameras, depths, tau=0.02, tau_relative=0, min_views=2)
+    assert kept.tolist() == [True]
+
+
+def test_a_point_that_no_view_confirms_is_dropped():
+    cameras, depths = four_equal_views([0.0])
+    kept = consistent_points(np.array([[0.0, 0, 3.0]]), cameras, depths, tau=0.02, tau_relative=0, min_views=2)
+    assert kept.tolist() == [False]

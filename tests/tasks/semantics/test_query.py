@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import Descriptors
+from ss_flow.tasks.models.colour_words import TERMS
+from ss_flow.tasks.semantics import query as module
+from ss_flow.tasks.semantics.query import query
+
+
+def descriptor(instance_id: int, embedding, encoder: str = "colour words") -> Descriptors:
+    vector = np.asarray(embedding, np.float32)
+    return Descriptors(instance_id, vector, np.zeros(1, np.int32), np.ones(1, np.float32), encoder)
+
+
+def coloured(instance_id: int, **share: float) -> Descriptors:
+    p = np.zeros(len(TERMS))
+    for term, value in share.items():
+        p[TERMS.index(term)] = value
+    return descriptor(instance_id, np.sqrt(p))
+
+
+ROOM = (
+    coloured(1, grey=0.8, white=0.2),
+    coloured(2, red=0.6, brown=0.4),
+    coloured(3, blue=1.0),
+    coloured(4, red=0.95, orange=0.05),
+    coloured(5, brown=0.6, red=0.4),
+)
+
+
+class Directions:
+    """A stand-in for CLIP in three dimensions: a word is a direction."""
+
+    name, dimension, sees_masks, absolute = "directions", 3, False, False
+    words = {"east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1), "an image of a east": (0, 1, 0)}  # noqa: RUF012
+
+    def encode_texts(self, texts):
+        return np.array([self.words[text] for text in texts], np.float32)
+
+    def negatives(self, text):
+        return ("up",)
+
+
+@pytest.fixture
+def directions(monkeypatch):
+    monkeypatch.setattr(module, "encoder_of", lambda files: Directions())
+
+
+def at_degrees(instance_id: int, angle: float, height: float = 0.0) -> Descriptors:
+    a = np.radians(angle)
+    vector = np.array([np.cos(a), np.sin(a), height])
+    return descriptor(instance_id, vector / np.linalg.norm(vector), "directions")
+
+
+def test_red_finds_the_red_objects_and_no_others():
+    found = query(ROOM, text="the crimson thing")
+    assert found.matches() == [4, 2] and found.accepted
+
+
+def test_a_colour_that_nothing_has_matches_nothing():
+    found = query(ROOM, text="purple")
+    assert found.matches() == [] and not found.accepted
+
+
+def test_two_colours_find_what_has_both():
+    room = (*ROOM, coloured(6, red=0.5, white=0.5))
+    assert query(room, text="red and white").instance_id[0] == 6
+
+
+def test_a_text_without_a_colour_is_refused():
+    with pytest.raises(InputError, match="names no colour"):
+        query(ROOM, text="the mug")
+
+
+def test_scores_margins_and_deltas_are_as_worked_out_by_hand(directions):
+    found = query((at_degrees(8, 60), at_degrees(5, 0), at_degrees(2, 90)), text="east")
+    assert found.instance_id.tolist() == [5, 8, 2]
+    np.testing.assert_allclose(found.score, [1, 0.5, 0], atol=1e-6)
+    np.testing.assert_allclose(found.margin, [0.5, 0.5, 0], atol=1e-6)
+    np.testing.assert_allclose(found.delta, [0, 0.5, 1], atol=1e-6)
+    np.testing.assert_allclose(found.relevancy, [1 / (1 + np.exp(-10)), 1 / (1 + np.exp(-5)), 0.5], atol=1e-6)
+
+
+def test_an_instance_matches_when_its_distance_is_near_the_best(directions):
+    room = (at_degrees(1, 10), at_degrees(2, 14), at_degrees(3, 30))
+    assert query(room, text="east", tau_corr=0.02).matches() == [1, 2]
+    assert query(room, text="east", tau_corr=0.005).matches() == [1]
+    assert query(room, text="east", tau_corr=0.2).matches() == [1, 2, 3]
+
+
+def test_delta_must_be_below_tau_corr_and_not_equal(directions):
+    room = (at_degrees(1, 0), at_degrees(2, 90))
+    assert query(room, text="east", tau_corr=1.0).matches() == [1]
+
+
+def test_what_fits_a_negative_better_does_not_match(directions):
+    found = query((at_degrees(1, 0, height=1.2), at_degrees(2, 0, height=1.3)), text="east", tau_corr=0.5)
+    assert found.matches() == [] and not found.accepted and (found.relevancy < 0.5).all()
+
+
+def test_the_prompt_wraps_the_text(monkeypatch):
+    class Prompted(Directions):
+        def negatives(self, text):
+            return ()
+
+    monkeypatch.setattr(module, "encoder_of", lambda files: Prompted())
+    room = (at_degrees(1, 0), at_degrees(2, 90))
+    assert query(room, text="east", prompt="an image of a {text}").matches() == [2]
+
+
+def test_an_instance_without_a_descriptor_comes_last_and_never_matches():
+    found = query((descriptor(9, np.zeros(11)), *ROOM), text="red")
+    assert found.instance_id[-1] == 9 and found.score[-1] == -1 and found.relevancy[-1] == 0
+    assert 9 not in found.matches()
+
+
+def test_equal_scores_are_ranked_by_id():
+    room = tuple(coloured(i, red=1.0) for i in (5, 3, 4))
+    assert query(room, text="red").instance_id.tolist() == [3, 4, 5]
+
+
+@given(st.permutations(range(len(ROOM))))
+def test_the_order_of_the_descriptors_changes_nothing(order):
+    shuffled, straight = query(tuple(ROOM[i] for i in order), text="red"), query(ROOM, text="red")
+    for field in ("instance_id", "score", "margin", "delta", "relevancy", "matched"):
+        np.testing.assert_array_equal(getattr(shuffled, field), getattr(straight, field))
+
+
+def test_a_scene_without_instances_matches_nothing():
+    found = query((), text="red")
+    assert found.matches() == [] and not found.accepted and len(found.score) == 0
+
+
+@pytest.mark.parametrize("text", ["", "  "])
+def test_an_empty_text_is_refused(text):
+    with pytest.raises(InputError, match="query is empty"):
+        query(ROOM, text=text)
+
+
+def test_a_tau_that_matches_nothing_is_refused():
+    with pytest.raises(InputError, match="tau_corr is 0"):
+        query(ROOM, text="red", tau_corr=0)
+
+
+def test_descriptors_of_another_encoder_are_refused():
+    with pytest.raises(InputError, match="made by clip-b16"):
+        query((descriptor(1, np.ones(11), "clip-b16"),), text="red")

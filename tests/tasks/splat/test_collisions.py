@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.splat.collisions import collision_matrix, group_box, match_pairs
+from ss_flow.tasks.splat.plan import PlanParams, plan
+
+EXACT = PlanParams(bbox_quantile=0.0)
+
+
+def group(points, instance_id: int, opacity: float = 0.9) -> Gaussians:
+    points = np.asarray(points, np.float32).reshape(-1, 3)
+    n = len(points)
+    return Gaussians(
+        means=points,
+        quaternions=np.tile(np.array([[1, 0, 0, 0]], np.float32), (n, 1)),
+        log_scales=np.full((n, 3), -3, np.float32),
+        opacity_logits=np.full(n, np.log(opacity / (1 - opacity)), np.float32),
+        sh=np.zeros((n, 1, 3), np.float32),
+        instance_id=np.full(n, instance_id, np.int32),
+        instance_conf=np.ones(n, np.float32),
+        part_id=np.zeros(n, np.int32),
+    )
+
+
+def union(a: Gaussians, b: Gaussians) -> Gaussians:
+    return Gaussians(**{name: np.concatenate([getattr(a, name), getattr(b, name)]) for name in vars(a)})
+
+
+def spread(count: int, low, high) -> np.ndarray:
+    """`count` points that span a box exactly: its two corners, and the rest along its diagonal."""
+    share = np.linspace(0, 1, count)[:, None]
+    return np.asarray(low) + share * (np.asarray(high, float) - low)
+
+
+def table_cup_book_floor_lamp() -> dict[str, Gaussians]:
+    """Places that give the collision shares of golden example E2."""
+    cup = [1.1, -0.1, -0.1], [1.4, 0.1, 0.1]
+    book = [-0.1, 1.1, -0.1], [0.1, 1.4, 0.1]
+    floor = [-0.5, -0.5, -2.0], [0.5, 0.5, -0.8]
+    table = np.concatenate(
+        [
+            [[-1.2, -1.2, -1.0], [1.2, 1.2, 1.0]],
+            spread(2, [1.1, 0, 0], [1.15, 0, 0]),
+            spread(5, [0, 1.1, 0], [0, 1.15, 0]),
+            spread(30, [0, 0, -0.95], [0, 0, -0.85]),
+            spread(61, [-0.9, -0.9, 0.5], [0.9, 0.9, 0.9]),
+        ]
+    )
+    return {
+        "A": group(table, 1),
+        "B": group([cup[0], *spread(17, [1.11, 0, 0], [1.19, 0, 0]), [1.3, 0, 0], cup[1]], 2),
+        "C": group([book[0], *spread(17, [0, 1.11, 0], [0, 1.19, 0]), *spread(11, [0, 1.3, 0], [0, 1.39, 0]), book[1]], 3),
+        "D": group([floor[0], *spread(19, [0, 0, -0.99], [0, 0, -0.9]), *spread(179, [0, 0, -1.9], [0, 0, -1.1]), floor[1]], 4),
+        "E": group(spread(10, [9, 9, 9], [10, 10, 10]), 5),
+    }  # fmt: skip
+
+
+def test_the_golden_scene_has_the_collision_shares_of_the_specification():
+    groups = list(table_cup_book_floor_lamp().values())
+    boxes = np.array([group_box(g, min_opacity=0.1, quantile=0.0) for g in groups])
+    matrix = collision_matrix([g.means for g in groups], boxes)
+    expected = np.zeros((5, 5))
+    expected[1, 0], expected[0, 1] = 0.9, 0.02
+    expected[2, 0], expected[0, 2] = 0.6, 0.05
+    expected[0, 3], expected[3, 0] = 0.3, 0.1
+    np.testing.assert_allclose(matrix, expected)
+
+
+def test_table_cup_book_and_floor_merge_in_the_golden_order_and_the_lamp_never():
+    a, b, c, d, e = table_cup_book_floor_lamp().values()
+
+    first = plan((a, b, c, d, e), params=EXACT, round=0)
+    assert first.pairs.tolist() == [[0, 1]] and first.singles.tolist() == [2, 3, 4]
+    np.testing.assert_allclose(first.scores, [0.9])
+    assert first.mask_weight == 0.05
+
+    ab = union(a, b)
+    second = plan((ab, c, d, e), params=EXACT, round=1)
+    assert second.pairs.tolist() == [[0, 1]] and second.singles.tolist() == [2, 3]
+    np.testing.assert_allclose(second.scores, [0.6])
+    np.testing.assert_allclose(second.collisions[0, 2], 30 / 120)
+    assert second.mask_weight == 0.15
+
+    abc = union(ab, c)
+    third = plan((abc, d, e), params=EXACT, round=2)
+    assert third.pairs.tolist() == [[0, 1]]
+    np.testing.assert_allclose(third.scores, [0.2])
+    assert third.mask_weight == 0.25
+
+    last = plan((union(abc, d), e), params=EXACT, round=3)
+    assert last.pairs.shape == (0, 2) and last.singles.tolist() == [0, 1]
+    assert last.mask_weight == 0.25
+
+
+def test_a_group_is_in_one_pair_only_and_the_rest_pair_up_among_themselves():
+    collisions = np.zeros((4, 4))
+    collisions[0, 1], collisions[1, 2], collisions[2, 3] = 0.8, 0.9, 0.1
+    pairs, scores = match_pairs(collisions, np.full(4, 10), np.arange(4))
+    assert pairs.tolist() == [[1, 2]] and scores.tolist() == [0.9]
+    collisions[3, 0] = 0.05
+    assert match_pairs(collisions, np.full(4, 10), np.arange(4))[0].tolist() == [[1, 2], [0, 3]]
+
+
+def test_equal_overlap_prefers_fewer_gaussians_then_lower_ids():
+    collisions = np.full((4, 4), 0.5)
+    np.fill_diagonal(collisions, 0)
+    assert match_pairs(collisions, np.array([90, 10, 20, 90]), np.arange(4))[0].tolist() == [[1, 2], [0, 3]]
+    assert match_pairs(collisions, np.full(4, 5), np.array([7, 3, 5, 4]))[0].tolist() == [[1, 3], [2, 0]]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7))
+def test_the_order_of_the_groups_does_not_change_who_merges(seed, count):
+    rng = np.random.default_rng(seed)
+    collisions = np.round(rng.random((count, count)) * 4) / 4
+    np.fill_diagonal(collisions, 0)
+    sizes, ids = rng.integers(1, 4, count), rng.permutation(count)
+    order = rng.permutation(count)
+    pairs, _ = match_pairs(collisions, sizes, ids)
+    shuffled, _ = match_pairs(collisions[np.ix_(order, order)], sizes[order], ids[order])
+    assert ids[pairs].tolist() == ids[order][shuffled].tolist()
+    assert len(np.unique(pairs)) == pairs.size
+    free = np.setdiff1d(np.arange(count), pairs)
+    assert not np.maximum(collisions, collisions.T)[np.ix_(free, free)].any()
+
+
+def test_the_box_ignores_faint_and_outlying_centres():
+    points = np.concatenate([spread(1000, [0, 0, 0], [1, 1, 1]), [[50, 50, 50]]])
+    solid, faint = group(points, 1), group([[-9, -9, -9]], 1, opacity=0.05)
+    box = group_box(union(solid, faint), min_opacity=0.1, quantile=0.005)
+    assert (box[0] >= 0).all() and (box[1] <= 1).all() and (box[1] - box[0] > 0.98).all()
+
+
+def test_a_group_without_gaussians_collides_with_nothing():
+    empty = group(np.zeros((0, 3)), 1)
+    result = plan((empty, empty, group(spread(9, [0, 0, 0], [1, 1, 1]), 2)), params=EXACT, round=0)
+    assert not len(result.pairs) and result.singles.tolist() == [0, 1, 2]
+
+
+def test_pairs_below_the_least_score_stay_apart():
+    a, b, *_ = table_cup_book_floor_lamp().values()
+    assert not len(plan((a, b), params=PlanParams(bbox_quantile=0, min_score=0.95), round=0).pairs)

@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_and_box import HEIGHT, WIDTH, SmallScene
+from ss_flow.errors import InputError
+from ss_flow.tasks.geometry.cameras import camera_of, project
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.splat.views import (
+    IGNORED,
+    NONE_OF_MINE,
+    CropParams,
+    SceneViews,
+    crop_camera,
+    propagated_depth,
+    sample_depth,
+    training_view,
+)
+
+pytest.importorskip("ss_flow.tasks.gaussians.trainer")
+
+
+@pytest.fixture(scope="module")
+def small() -> SmallScene:
+    return SmallScene()
+
+
+def views_of(small: SmallScene, **changes) -> SceneViews:
+    return replace(SceneViews(small.frames, small.cameras, small.depths, 0.02, 0.0), **changes)
+
+
+def built(small: SmallScene, view: int, instance_id: int, scene: SceneViews | None = None, **options):
+    channels = np.where(small.ids[view] == instance_id, 0, NONE_OF_MINE).astype(np.int32)
+    points = small.points[small.labels == instance_id][::3]
+    crop = options.pop("crop", CropParams())
+    return training_view(scene or views_of(small), view, channels, points, 0.02, crop=crop, with_ids=True, **options)
+
+
+def hidden_by_box(small: SmallScene, view: int) -> np.ndarray:
+    """Pixels of the box behind which a part of the ball lies, by the ball's equation."""
+    from ball_and_box import BALL, RADIUS
+    from ss_flow.tasks.geometry.cameras import backproject
+
+    camera = camera_of(small.cameras, view)
+    rays = backproject(np.ones((HEIGHT, WIDTH), np.float32), camera) - camera.center
+    to_ball = BALL - camera.center
+    nearest = to_ball - rays * ((rays @ to_ball) / (rays**2).sum(axis=1))[:, None]
+    return ((nearest**2).sum(axis=1) < RADIUS**2).reshape(HEIGHT, WIDTH) & (small.ids[view] == 1)
+
+
+def whole(small: SmallScene, view: int, mask: np.ndarray, camera) -> np.ndarray:
+    full = camera_of(small.cameras, view)
+    x0, y0 = round(full.cx - camera.cx), round(full.cy - camera.cy)
+    image = np.zeros((HEIGHT, WIDTH), bool)
+    image[y0 : y0 + camera.height, x0 : x0 + camera.width] = mask
+    return image
+
+
+def test_the_three_kinds_of_pixels_do_not_overlap_and_follow_the_ids(small):
+    for view in range(len(small.frames)):
+        made = built(small, view, 2)
+        assert not (made.inside & made.free).any()
+        np.testing.assert_array_equal(made.ids == 0, made.inside)
+        np.testing.assert_array_equal(made.ids == NONE_OF_MINE, made.free)
+        np.testing.assert_array_equal(made.ids == IGNORED, ~made.inside & ~made.free)
+        np.testing.assert_array_equal(whole(small, view, made.inside, made.camera), small.ids[view] == 2)
+
+
+def test_where_the_box_hides_the_ball_the_ball_is_ignored_and_elsewhere_free(small):
+    hidden_somewhere = 0
+    for view in range(len(small.frames)):
+        made = built(small, view, 2)
+        ignored = whole(small, view, ~made.inside & ~made.free, made.camera)
+        box = whole(small, view, np.ones_like(made.inside), made.camera)
+        hidden = hidden_by_box(small, view) & box
+        hidden_somewhere += hidden.sum()
+        # What no view shows has no points; what they show must be found, up to a pixel of border.
+        if hidden.sum() > 40:
+            assert (ignored & hidden).sum() > 0.6 * hidden.sum()
+        assert (ignored & ~hidden).sum() <= 0.12 * (small.ids[view] == 2).sum() + 12
+    assert hidden_somewhere > 200
+
+
+def test_the_paper_calls_hidden_pixels_empty(small):
+    for view in range(len(small.frames)):
+        made = built(small, view, 2, ignore_occluded=False)
+        np.testing.assert_array_equal(made.free, ~made.inside)
+
+
+def test_the_background_is_unknown_behind_the_objects(small):
+    made = built(small, 0, 0, fills_scene=True)
+    assert not made.free.any()
+    np.testing.assert_array_equal(whole(small, 0, made.inside, made.camera), small.ids[0] == 0)
+
+
+def test_masked_out_pixels_are_neither_inside_nor_free(small):
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[:, : WIDTH // 2] = 0
+    frames = (replace(small.frames[0], valid=encode_png(valid)), *small.frames[1:])
+    made = built(small, 0, 1, views_of(small, frames=frames))
+    left = whole(small, 0, made.inside | made.free, made.camera)[:, : WIDTH // 2]
+    assert not left.any()
+    assert made.inside.any()
+
+
+def test_without_known_depth_nothing_outside_the_mask_is_called_free_near_the_surface(small):
+    depths = tuple(replace(d, depth=np.zeros_like(d.depth)) for d in small.depths)
+    made = built(small, 0, 1, views_of(small, depths=depths))
+    surface = propagated_depth(small.points[small.labels == 1][::3], made.camera, 0.02) > 0
+    assert not (made.free & surface).any()
+
+
+def test_a_crop_sees_the_same_points_at_its_own_pixels(small):
+    full = camera_of(small.cameras, 3)
+    points = small.points[small.labels == 2]
+    crop = crop_camera(full, small.ids[3] == 2, points, CropParams(margin_px=4, max_side=15))
+    assert max(crop.width, crop.height) == 15
+    inside, _ = project(points, crop)
+    assert (inside > -0.5).all() and (inside[:, 0] < crop.width + 0.5).all() and (inside[:, 1] < crop.height + 0.5).all()
+
+
+def test_the_depth_of_a_crop_is_the_depth_at_the_pixels_it_shows(small):
+    full = camera_of(small.cameras, 1)
+    crop = full.cropped(20, 10, 60, 50)
+    np.testing.assert_array_equal(sample_depth(small.depths[1], full, crop), small.depths[1].depth[10:50, 20:60])
+    half = crop.scaled(20, 20)
+    np.testing.assert_array_equal(sample_depth(small.depths[1], full, half), small.depths[1].depth[11:50:2, 21:60:2])
+
+
+def test_propagated_depth_is_close_to_the_true_depth_of_a_surface_seen_by_points(small):
+    camera = camera_of(small.cameras, 0)
+    own = small.ids[0] == 1
+    found = propagated_depth(small.points[small.labels == 1][::3], camera, 0.02)
+    both = own & (found > 0)
+    assert both.sum() > 0.99 * own.sum()
+    assert np.median(np.abs(found - small.depths[0].depth)[both]) < 0.03
+
+
+def test_masks_of_another_size_than_the_frame_are_refused(small):
+    with pytest.raises(InputError, match=r"Frame v0 is 96 x 72 pixels and its masks are 5 x 4"):
+        training_view(views_of(small), 0, np.zeros((4, 5), np.int32), small.points[:9], 0.02, crop=CropParams())

@@ -1,0 +1,95 @@
+from dataclasses import replace
+
+import box_scene
+import numpy as np
+import pytest
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import DepthMap
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.split.dense import DenseParams, dense, scene_unit
+
+
+def fuse(**changes):
+    return dense(box_scene.frames(), box_scene.cameras(), box_scene.depths(), params=DenseParams(**changes))
+
+
+def distance_to_scene(points):
+    """Distance of each point to the nearest surface of the boxes and the floor."""
+    outside = np.maximum(box_scene.BOXES[:, 0] - points[:, None], points[:, None] - box_scene.BOXES[:, 1])
+    boxes = np.abs(np.where(outside.max(axis=-1) <= 0, outside.max(axis=-1), np.linalg.norm(outside.clip(0), axis=-1)))
+    return np.minimum(np.abs(points[:, 2]), boxes.min(axis=1))
+
+
+def test_dense_points_lie_on_the_surfaces_with_their_colours():
+    cloud = fuse()
+    assert len(cloud.points) > 2000
+    # Two samples of one voxel average to a point inside a convex edge, at most half a voxel deep.
+    assert distance_to_scene(cloud.points).max() < 0.02
+    top = np.abs(cloud.points[:, 2] - 0.7) < 0.004
+    assert top.sum() > 50
+    np.testing.assert_array_equal(np.median(cloud.colors[top], axis=0), box_scene.COLORS[2])
+
+
+def test_points_are_spaced_by_the_voxel():
+    assert fuse(voxel=0.1, voxel_pixels=100).spacing == pytest.approx(0.1, rel=0.3)
+
+
+def test_no_more_points_remain_than_asked_for():
+    assert 500 < len(fuse(max_points=1000).points) <= 1000
+
+
+def test_the_same_input_gives_the_same_bits():
+    a, b = fuse(), fuse()
+    assert a.points.tobytes() == b.points.tobytes()
+    assert a.colors.tobytes() == b.colors.tobytes()
+
+
+def test_flying_pixels_of_one_view_are_dropped():
+    depths = list(box_scene.depths())
+    wrong = depths[0].depth.copy()
+    wrong[30:40, 40:50] *= 0.6
+    depths[0] = DepthMap("0", wrong, "sensor")
+    cloud = dense(box_scene.frames(), box_scene.cameras(), tuple(depths), params=DenseParams())
+    assert (distance_to_scene(cloud.points) > 0.1).mean() < 0.002
+
+
+def test_pixels_that_a_frame_masks_out_give_no_points():
+    nothing = encode_png(np.zeros((box_scene.HEIGHT, box_scene.WIDTH), np.uint8))
+    frames = tuple(replace(frame, valid=nothing) for frame in box_scene.frames())
+    one_left = (*frames[:-1], replace(frames[-1], valid=np.zeros(0, np.uint8)))
+    cloud = dense(one_left, box_scene.cameras(), box_scene.depths(), params=DenseParams())
+    assert len(cloud.points) <= box_scene.WIDTH * box_scene.HEIGHT
+
+
+def test_the_unit_is_a_metre_or_half_the_median_depth():
+    cameras = box_scene.cameras()
+    assert scene_unit(cameras, box_scene.depths()) == 1.0
+    maps = tuple(DepthMap("x", np.array([[0, d]], np.float32), "mvs") for d in (2.0, 6.0, 8.0))
+    assert scene_unit(replace(cameras, metric=False), maps) == 3.0
+
+
+def test_depth_that_is_unknown_everywhere_is_bad_input():
+    blind = tuple(DepthMap(d.name, np.zeros_like(d.depth), "sensor") for d in box_scene.depths())
+    with pytest.raises(InputError, match="known depth"):
+        dense(box_scene.frames(), box_scene.cameras(), blind, params=DenseParams())
+
+
+def test_depth_that_never_agrees_is_bad_input():
+    # Two cameras face each other, 10 m apart, and each looks through what the other measures.
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])
+    away[2, 3] = 10
+    cameras = box_scene.cameras()
+    cameras = replace(
+        cameras,
+        names=("a", "b"),
+        sizes=cameras.sizes[:2],
+        intrinsics=cameras.intrinsics[:2],
+        world_to_camera=np.stack([np.eye(4), away]),
+    )
+    near, far = np.zeros((2, box_scene.HEIGHT, box_scene.WIDTH), np.float32)
+    near[28:44, 40:56] = 1.0
+    far[35:37, 47:49] = 9.2
+    depths = (DepthMap("a", near, "sensor"), DepthMap("b", far, "sensor"))
+    with pytest.raises(InputError, match="agree in no point"):
+        dense(box_scene.frames()[:2], cameras, depths, params=DenseParams())

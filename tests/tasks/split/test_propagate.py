@@ -1,0 +1,223 @@
+from dataclasses import replace
+
+import box_scene
+import numpy as np
+import pytest
+from box_scene import mask_set, permuted, row_of_points, true_masks
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import PointCloud
+from ss_flow.tasks.split.dense import DenseParams, dense
+from ss_flow.tasks.split.observation import ClusterParams
+from ss_flow.tasks.split.propagate import PropagateParams, propagate
+from ss_flow.tasks.split.visibility import visibility
+
+BARE = PropagateParams(
+    start="empty", min_overlap=1, min_overlap_share=0, min_new_points=1, min_label_points=1, global_merge=False
+)
+PRESETS = {
+    "paper": replace(BARE, nested=True, contested_vote=1.0),
+    "reference": replace(BARE, nested=True, contested_vote=0.75),
+    "default": BARE,
+}
+
+
+def points(count):
+    places = np.stack([np.arange(count), np.zeros(count), np.ones(count)], axis=-1).astype(np.float32)
+    return PointCloud(places, np.zeros((count, 3), np.uint8), 1.0, 1.0)
+
+
+def views_of(*views):
+    """Views of one row of points; each view is a list of masks, each mask a list of points."""
+    seen, sets = [], []
+    for masks in views:
+        seen.append(row_of_points(sorted({p for mask in masks for p in mask}))[0])
+        sets.append(mask_set(np.stack([row_of_points(mask)[1] for mask in masks])))
+    return tuple(seen), tuple(sets)
+
+
+EXAMPLE = ([[1, 2, 3], [4, 5]], [[2, 3, 4], [5, 6]], [[4, 5, 6]])
+"""The worked example E1 of the specification; pixel and point 0 and 7 are seen by no view."""
+
+
+@pytest.mark.parametrize(
+    ("preset", "label_of_4", "share_of_4"),
+    [("paper", 0, 2.25 / 3.25), ("reference", 2, 2.25 / 3.0), ("default", 2, 2.25 / (2.25 + 2 / 3))],
+)
+def test_the_worked_example_of_the_specification(preset, label_of_4, share_of_4):
+    visible, masks = views_of(*EXAMPLE)
+    result = propagate(points(8), visible, masks, params=PRESETS[preset])
+    assert result.label.tolist() == [0, 1, 1, 1, label_of_4, 2, 2, 0]
+    np.testing.assert_allclose(result.confidence, [0, 1, 1, 1, share_of_4, 1, 1, 0], rtol=1e-6)
+    assert result.num_labels == 2
+    assert result.match_view.tolist() == [0, 0, 1, 1, 2]
+    assert result.match_mask.tolist() == [0, 1, 0, 1, 0]
+    assert result.match_label.tolist() == [1, 2, 1, 2, 2]
+    np.testing.assert_allclose(result.match_purity, [1, 1, 2 / 3, 1, 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("nested", [False, True])
+def test_swapping_the_masks_of_the_worked_example_changes_nothing(preset, nested):
+    params = replace(PRESETS[preset], nested=nested)
+    visible, masks = views_of(*EXAMPLE)
+    swapped = tuple(permuted(m, np.arange(len(m))[::-1]) for m in masks)
+    a, b = (propagate(points(8), visible, m, params=params) for m in (masks, swapped))
+    assert a.label.tolist() == b.label.tolist()
+    assert a.confidence.tolist() == b.confidence.tolist()
+
+
+def test_a_mask_without_enough_points_founds_no_object():
+    visible, masks = views_of([[1, 2, 3], [4, 5]])
+    result = propagate(points(8), visible, masks, params=replace(BARE, min_new_points=3))
+    assert result.label.tolist() == [0, 1, 1, 1, 0, 0, 0, 0]
+    assert result.match_mask.tolist() == [0]
+
+
+def test_labels_of_few_points_are_dropped_in_the_end():
+    visible, masks = views_of([[1, 2, 3], [4, 5]])
+    result = propagate(points(8), visible, masks, params=replace(BARE, min_label_points=3))
+    assert set(result.label) == {0, 1}
+    assert result.num_labels == 2
+
+
+def test_a_mask_that_hardly_touches_a_label_is_a_new_object():
+    visible, masks = views_of([[0, 1]], [[1, 2, 3, 4, 5, 6]])
+    joined = propagate(points(8), visible, masks, params=BARE)
+    apart = propagate(points(8), visible, masks, params=replace(BARE, min_overlap_share=0.5))
+    assert joined.label[6] == joined.label[0] == 1
+    assert apart.label[6] == 2
+
+
+def test_a_second_pass_matches_early_views_against_late_labels():
+    # View 1 sees two halves of an object, view 2 all of it: only then is it known that the halves are one.
+    visible, masks = views_of([[1, 2, 3], [4, 5, 6, 7]], [[1, 2, 3, 4, 5, 6, 7]], [[1, 2, 3, 4, 5, 6, 7]])
+    params = replace(BARE, tau_label=0.6, contested_vote=1.0)
+    once = propagate(points(8), visible, masks, params=params)
+    twice = propagate(points(8), visible, masks, params=replace(params, passes=2))
+    assert once.label[1:].tolist() == [1] * 7
+    assert once.confidence[1] == pytest.approx(2 / 3.25)
+    assert twice.confidence[1:].tolist() == [1.0] * 7
+
+
+def test_the_consensus_of_the_views_outvotes_one_mask_that_holds_two_objects():
+    good = [[0, 1, 2, 3], [4, 5, 6, 7]]
+    visible, masks = views_of([[0, 1, 2, 3, 4, 5, 6, 7]], good, good, good, good)
+    result = propagate(points(8), visible, masks, params=replace(BARE, start="consensus", min_overlap_share=0.1))
+    left, right = result.label[:4], result.label[4:]
+    assert len(set(left)) == len(set(right)) == 1
+    assert left[0] != right[0]
+    sequential = propagate(points(8), visible, masks, params=BARE)
+    assert len(set(sequential.label)) == 1
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    cameras, depths = box_scene.cameras(), box_scene.depths()
+    cloud = dense(box_scene.frames(), cameras, depths, params=DenseParams())
+    seen = tuple(visibility(cloud, cameras, d, view=k, tau_depth=0.02) for k, d in enumerate(depths))
+    return cloud, seen
+
+
+def degraded(seed):
+    """True masks of the boxes with ragged borders, halves in some views, and one that covers two boxes."""
+    random = np.random.default_rng(seed)
+    sets = []
+    for pool in true_masks():
+        masks = list(pool.dense())
+        if random.random() < 0.5:
+            i = int(random.integers(len(masks)))
+            _, u = np.nonzero(masks[i])
+            left = masks[i].copy()
+            left[:, int(np.median(u)) :] = False
+            masks.append(left)
+        noise = random.random((len(masks), *masks[0].shape)) < 0.02
+        sets.append(mask_set(np.stack(masks) ^ (noise & np.stack(masks)), pool.name))
+    first = sets[0].dense()
+    sets[0] = mask_set(np.concatenate([first, (first[0] | first[1])[None]]), "0")
+    return tuple(sets)
+
+
+DEFAULTS = (PropagateParams(), PropagateParams(start="empty", passes=2), PropagateParams(start="empty", nested=True))
+
+
+@pytest.mark.parametrize("params", DEFAULTS)
+def test_true_masks_give_each_box_one_label_in_all_views(boxes, params):
+    cloud, seen = boxes
+    result = propagate(cloud, seen, true_masks(), params=params)
+    for number, (low, high) in enumerate(box_scene.BOXES, start=1):
+        inner = ((cloud.points > low + 0.03 * (low > 0)) & (cloud.points < high + 0.01)).all(axis=1)
+        inner &= (cloud.points[:, 2] > 0.05) & (cloud.points[:, 0] > low[0] - 0.01)
+        labels, counts = np.unique(result.label[inner], return_counts=True)
+        assert counts.max() / counts.sum() > 0.9, number
+        assert labels[counts.argmax()] > 0
+    assert len(np.unique(result.label)) == 4
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=st.integers(0, 1000))
+@pytest.mark.parametrize("params", DEFAULTS)
+def test_permuting_the_masks_of_every_view_changes_no_label(boxes, params, seed):
+    cloud, seen = boxes
+    masks = degraded(seed)
+    random = np.random.default_rng(seed)
+    shuffled = tuple(permuted(m, random.permutation(len(m))) for m in masks)
+    a, b = (propagate(cloud, seen, m, params=params) for m in (masks, shuffled))
+    assert a.label.tobytes() == b.label.tobytes()
+    assert a.confidence.tobytes() == b.confidence.tobytes()
+
+
+@settings(deadline=None, max_examples=8)
+@given(scale=st.floats(0.01, 100), seed=st.integers(0, 1000))
+def test_scaling_the_world_changes_no_label(boxes, scale, seed):
+    cloud, seen = boxes
+    clusters = ClusterParams(eps=5.0)
+    params = PropagateParams(mask_clusters=clusters, label_clusters=replace(clusters, eps=2.5, keep_share=0.05))
+    scaled = replace(cloud, points=cloud.points * np.float32(scale), unit=scale, spacing=cloud.spacing * scale)
+    far = tuple(replace(v, depth=v.depth * np.float32(scale)) for v in seen)
+    masks = degraded(seed)
+    a, b = propagate(cloud, seen, masks, params=params), propagate(scaled, far, masks, params=params)
+    assert (a.label == b.label).mean() > 0.999
+
+
+@pytest.mark.parametrize("scale", [1 / 64, 64.0])
+def test_scaling_the_world_changes_no_label_from_depth_to_labels(scale):
+    labels = []
+    for size in (0.5, scale):
+        cameras, depths = box_scene.cameras(size), box_scene.depths(size)
+        cloud = dense(box_scene.frames(), cameras, depths, params=DenseParams())
+        seen = tuple(visibility(cloud, cameras, d, view=k, tau_depth=0.02) for k, d in enumerate(depths))
+        labels.append(propagate(cloud, seen, degraded(3), params=PropagateParams()).label)
+    assert labels[0].tobytes() == labels[1].tobytes()
+
+
+def test_clustering_keeps_stray_points_of_a_mask_from_voting(boxes):
+    cloud, seen = boxes
+    masks = list(true_masks())
+    first = masks[0].dense().copy()
+    first[0, :6, :6] = True  # a patch of the far floor
+    masks[0] = mask_set(first, "0")
+    only = (seen[0],), (masks[0],)
+    params = replace(BARE, mask_clusters=ClusterParams(eps=5.0, keep_share=1.0))
+    stray = (seen[0].pixel % box_scene.WIDTH < 3) & (seen[0].pixel // box_scene.WIDTH < 3)
+    assert stray.any()
+    rows = seen[0].point_index[stray]
+    assert (propagate(cloud, *only, params=BARE).label[rows] > 0).all()
+    assert (propagate(cloud, *only, params=params).label[rows] == 0).all()
+
+
+def test_views_without_masks_label_nothing(boxes):
+    cloud, seen = boxes
+    nothing = tuple(mask_set(np.zeros((0, box_scene.HEIGHT, box_scene.WIDTH), bool), v.name) for v in seen)
+    result = propagate(cloud, seen, nothing, params=PropagateParams())
+    assert not result.label.any()
+    assert result.num_labels == 0
+    assert len(result.match_mask) == 0
+
+
+@pytest.mark.parametrize("wrong", [{"passes": 0}, {"lambda_init": 1.0}])
+def test_parameters_out_of_range_are_bad_input(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        PropagateParams(**wrong)

