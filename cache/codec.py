@@ -1,14 +1,16 @@
 """Dataclasses of arrays as Zarr v3 groups, and back.
 
-Arrays become Zarr arrays (blosc-lz4 with shuffle, chunks of about 4 MiB along the first axis); every other field goes,
-with the type's name, into the group's attributes as JSON. Nothing is ever unpickled: reading an object can build only
-dataclasses of this package's own modules.
+Arrays become Zarr arrays (blosc-lz4 with shuffle, chunks of about 4 MiB along the first axis; small ones are one plain
+chunk); every other field goes, with the type's name, into the group's attributes as JSON. Nothing is ever unpickled:
+reading an object can build only dataclasses of this package's own modules.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import json
+import math
 import typing
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,8 @@ from typing import Any
 import numpy as np
 
 CHUNK_BYTES = 4 << 20
+PLAIN_BYTES = 64 << 10
+"""Smaller arrays are not compressed, so that plans and figures can be read back without loading Zarr."""
 TRUSTED_PREFIXES = ("ss_flow.", "ss_flow_")
 FORMAT = 1
 
@@ -44,7 +48,12 @@ def write(value: Any, folder: Path) -> None:
     compressor = BloscCodec(cname="lz4", clevel=5, shuffle="shuffle")
     for name, array in arrays.items():
         stored = group.create_array(
-            name, shape=array.shape, dtype=array.dtype, chunks=_chunks(array), compressors=compressor, fill_value=0
+            name,
+            shape=array.shape,
+            dtype=array.dtype,
+            chunks=_chunks(array),
+            compressors=None if array.nbytes <= PLAIN_BYTES and array.dtype.kind in "biuf" else compressor,
+            fill_value=0,
         )
         if array.size:
             stored[...] = array
@@ -55,20 +64,46 @@ def read(folder: Path) -> Any:
 
     Raises ValueError when the type is not one of this package's dataclasses, or was written by another format.
     """
-    import zarr
-
-    group = zarr.open_group(store=folder, mode="r", zarr_format=3)
-    header: dict[str, Any] = dict(group.attrs)
+    try:
+        header: dict[str, Any] = json.loads((folder / "zarr.json").read_bytes())["attributes"]
+    except (OSError, ValueError, KeyError) as error:
+        raise ValueError(f"{folder}: not a stored object ({error})") from None
     if header.get("format") != FORMAT:
         raise ValueError(f"{folder}: object format {header.get('format')}, this version reads format {FORMAT}")
     kind = type_named(header["type"])
     hints = typing.get_type_hints(kind)
     values = {name: _restored(content, hints[name]) for name, content in header["values"].items()}
-    for name, array in group.arrays():
-        content = np.asarray(array[...])
+    for array in sorted(path.parent for path in folder.glob("*/zarr.json")):
+        content = _read_plain(array)
+        content = _read_zarr(array) if content is None else content
         content.flags.writeable = False
-        values[name] = content
+        values[array.name] = content
     return kind(**values)
+
+
+def _read_zarr(folder: Path) -> np.ndarray:
+    import zarr
+
+    stored = zarr.open_array(store=folder, mode="r", zarr_format=3)
+    return np.asarray(stored[...])
+
+
+def _read_plain(folder: Path) -> np.ndarray | None:
+    """An array whose one chunk is not compressed; None for any other. Zarr leaves out a chunk that is all zeros."""
+    header = json.loads((folder / "zarr.json").read_bytes())
+    shape = tuple(header["shape"])
+    chunk = tuple(header["chunk_grid"]["configuration"]["chunk_shape"])
+    codecs = [(codec["name"], codec.get("configuration", {}).get("endian", "little")) for codec in header["codecs"]]
+    if codecs != [("bytes", "little")] or (chunk != shape and 0 not in shape):
+        return None
+    dtype = np.dtype(header["data_type"]).newbyteorder("<")
+    path = folder.joinpath("c", *("0" for _ in shape))
+    if 0 in shape or not path.exists():
+        return np.zeros(shape, dtype)
+    content = np.frombuffer(path.read_bytes(), dtype)
+    if content.size != math.prod(shape):
+        raise ValueError(f"{folder}: damaged; {content.size} values where there should be {math.prod(shape)}")
+    return content.reshape(shape)
 
 
 def type_named(name: str) -> type:

@@ -20,6 +20,7 @@ from ss_flow.tasks.splat.reconstruct import reconstruct, retrain
 from ss_flow.tasks.splat.refine import refine
 from ss_flow.tasks.splat.resolve import exclusive, resolve
 from ss_flow.tasks.split.dense import dense
+from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.propagate import propagate
 from ss_flow.tasks.split.reproject import reproject
 from ss_flow.tasks.split.reprompt import reprompt
@@ -47,6 +48,8 @@ class Split:
     labels: Any
     instances: Any
     """tuple[InstanceMasks, ...], the background first."""
+    embeddings: Any
+    """tuple[Embedding, ...], one a view; () without a segmenter."""
 
 
 def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Node]:
@@ -88,13 +91,17 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     """Photos and depth -> view-consistent instances (Split&Splat, Sec. 3.1)."""
     points = dense(capture.frames, capture.cameras, capture.depths, params=params.dense)
     segmenter = networks.segmenter
+    embeddings: Any = ()
+    if segmenter is not None:
+        embeddings = each(capture.frames, names=capture.names, build=lambda frame: embed(frame, model=segmenter))
     if capture.masks is not None:
         masks = capture.masks
     elif segmenter is not None:
         masks = each(
             capture.frames,
+            embeddings,
             names=capture.names,
-            build=lambda frame: segment(frame, params=params.segment, model=segmenter),
+            build=lambda frame, embedding: segment(frame, embedding, params=params.segment, model=segmenter),
         )
     else:
         masks = each(
@@ -119,11 +126,13 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     if segmenter is not None and capture.masks is None:
         prompted = each(
             capture.frames,
+            embeddings,
             seen,
             masks,
             names=capture.names,
-            build=lambda frame, visible, pool: reprompt(
+            build=lambda frame, embedding, visible, pool: reprompt(
                 frame,
+                embedding,
                 visible,
                 pool,
                 labels,
@@ -133,7 +142,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
             ),
         )
     instances = reproject(points, seen, masks, labels, prompted, params=params.reproject)
-    return Split(points, seen, masks, labels, instances)
+    return Split(points, seen, masks, labels, instances, embeddings)
 
 
 def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -> dict[str, Any]:
@@ -145,7 +154,13 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
     def build(instance: Any) -> tuple[Any, Any]:
         gaussians = reconstruct(*views, instance, params=settings.reconstruct, **tau)
         better = refine(
-            *views, instance, gaussians, model=networks.segmenter, params=settings.refine, **tau
+            *views,
+            instance,
+            gaussians,
+            halved.embeddings,
+            model=networks.segmenter,
+            params=settings.refine,
+            **tau,
         )
         return gaussians, better
 

@@ -9,7 +9,6 @@ change what it returns.
 from __future__ import annotations
 
 import ast
-import copy
 import functools
 import importlib.util
 from collections.abc import Callable, Iterator
@@ -57,13 +56,31 @@ def _closure(module_name: str, function_name: str) -> tuple[tuple[str, str], ...
         if name not in module.definitions:
             pending.extend(_follow(module, name, followed))
             continue
-        statements = module.definitions[name]
-        found[f"{module_name}.{name}"] = blake3("\n".join(map(_canonical, statements)).encode()).hexdigest()
-        for source in _native_sources(module):
-            found[f"{module_name}:{source}"] = blake3((module.path.parent / source).read_bytes()).hexdigest()
-        for statement in statements:
-            pending.extend(_dependencies(module, statement, followed))
+        found |= _digests(module_name, name)
+        pending.extend(_needed(module_name, name, followed))
     return tuple(sorted(found.items()))
+
+
+@functools.cache
+def _digests(module_name: str, name: str) -> dict[str, str]:
+    """The digest of one definition, and of the native sources of its module."""
+    module = _module(module_name)
+    assert module is not None
+    text = "\n".join(map(_canonical, module.definitions[name]))
+    native = {
+        f"{module_name}:{source}": blake3((module.path.parent / source).read_bytes()).hexdigest()
+        for source in _native_sources(module)
+    }
+    return {f"{module_name}.{name}": blake3(text.encode()).hexdigest()} | native
+
+
+@functools.cache
+def _needed(module_name: str, name: str, followed: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+    """What one definition names in the packages that are followed."""
+    module = _module(module_name)
+    assert module is not None
+    statements = module.definitions[name]
+    return tuple(dict.fromkeys(d for statement in statements for d in _dependencies(module, statement, followed)))
 
 
 def _follow(module: _Module, name: str, followed: tuple[str, ...]) -> Iterator[tuple[str, str]]:
@@ -74,8 +91,9 @@ def _follow(module: _Module, name: str, followed: tuple[str, ...]) -> Iterator[t
 
 
 def _dependencies(module: _Module, statement: ast.stmt, followed: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    local = module.imports | _imports(module, ast.walk(statement))
-    for node in ast.walk(statement):
+    nodes = list(ast.walk(statement))
+    local = module.imports | _imports(module, nodes)
+    for node in nodes:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             origin, attribute = local.get(node.value.id, ("", ""))
             if attribute is not None and origin.startswith(followed) and _module(f"{origin}.{attribute}"):
@@ -156,22 +174,23 @@ def _native_sources(module: _Module) -> tuple[str, ...]:
     return ()
 
 
-def _canonical(statement: ast.stmt) -> str:
-    """A definition as text in which only what is executed counts."""
-    return ast.dump(_Executed().visit(copy.deepcopy(statement)))
+def _canonical(node: Any) -> str:
+    """A definition as text in which only what is executed counts.
 
-
-class _Executed(ast.NodeTransformer):
-    """Takes out docstrings (under fields too), and the `@task(...)` decorator: how a task runs (cores, memory) is not what it returns."""
-
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
-        node.decorator_list = [d for d in node.decorator_list if "task" not in _called_names(d)]
-        node.body = [s for s in node.body if not _is_docstring(s)] or [ast.Pass()]
-        return self.generic_visit(node)
-
-    def visit_ClassDef(self, node: ast.ClassDef) -> ast.AST:
-        node.body = [s for s in node.body if not _is_docstring(s)] or [ast.Pass()]
-        return self.generic_visit(node)
+    Left out are docstrings (under fields too), and the `@task(...)` decorator: how a task runs (cores, memory) is not
+    what it returns.
+    """
+    if isinstance(node, list):
+        return f"[{','.join(map(_canonical, node))}]"
+    if not isinstance(node, ast.AST):
+        return repr(node)
+    parts = {name: getattr(node, name, None) for name in node._fields}
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        parts["body"] = [statement for statement in node.body if not _is_docstring(statement)]
+        if not isinstance(node, ast.ClassDef):
+            parts["decorator_list"] = [d for d in node.decorator_list if "task" not in _called_names(d)]
+    fields = ",".join(f"{name}={_canonical(part)}" for name, part in parts.items() if part is not None)
+    return f"{type(node).__name__}({fields})"
 
 
 def _is_docstring(statement: ast.stmt) -> bool:

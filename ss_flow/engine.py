@@ -57,11 +57,13 @@ def run_flow(
     executor: str = "threads",
     reporter: Reporter | None = None,
     dry: bool = False,
+    recorded: bool = True,
 ) -> Report:
     """Run what `build` describes.
 
     build: called in a flow; returns its outputs by name. until: run only what this output needs. jobs: how many cores
-    to use, 0 = all. scene: what the run is about; runs of the same scene are compared by `why`.
+    to use, 0 = all. scene: what the run is about; runs of the same scene are compared by `why`. recorded: whether the
+    run is kept among the store's runs; a question about a result need not be.
     Raises KeyError when `until` names no output, KeyboardInterrupt when interrupted: running tasks are then told to stop.
     """
     jobs = jobs or usable_cores()
@@ -74,7 +76,7 @@ def run_flow(
     recorder = _Recorder()
     listeners: list[Reporter] = [recorder, *([reporter] if reporter else [])]
     folder = ""
-    if not dry:
+    if recorded and not dry:
         run = start_run(runs, {"scene": scene, **header})
         listeners.append(JsonLines(run.folder / "events.jsonl"))
         folder = str(run.folder)

@@ -194,7 +194,7 @@ class InstanceMasks:
     packed: UInt8
     """[V, ceil(H * W / 8)] one bit a pixel (`np.packbits`), exclusive between instances."""
     prompted: UInt8
-    """[V] 1 where the mask came from re-prompting the segmenter, 0 where it came from Split."""
+    """[V] where the mask came from: 0 Split, 1 Split by re-prompting the segmenter, 2 refinement in Splat."""
     weak: bool
     """Seen in too few views to be reconstructed: kept as points only."""
 

@@ -43,8 +43,8 @@ class Query:
         if not all(value in store for value in descriptors):
             raise InputError(f"the store {store.root} no longer holds the descriptors of {self.result}; run it again.")
         tau_corr = document["params"]["semantics.query.tau_corr"] if self.tau_corr is None else self.tau_corr
-        if not 0 <= tau_corr <= 2:
-            raise InputError(f"--tau-corr {tau_corr} is out of range; it must be between 0 and 2.")
+        if not 0 < tau_corr <= 2:
+            raise InputError(f"--tau-corr {tau_corr} is out of range; it must be above 0 and at most 2.")
         digests = file_digests(store)
         encoder = choose_model("text-image", _encoder_name(store, descriptors), digests)
         digests.save()
@@ -53,8 +53,9 @@ class Query:
                 "query": query(stored("describe", descriptors), text=self.text, tau_corr=tau_corr, encoder=encoder)
             },
             store,
-            scene=f"{document['scene']}?{self.text}",
+            scene=document["scene"],
             header={},
+            recorded=False,
         )
         value = report.values["query"]
         if isinstance(value, Failure):

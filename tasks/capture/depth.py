@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from ss_flow.tasks.geometry.plane_sweep import (
     smooth_cost,
     typical_depth,
 )
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive, Range
 
 _USES = ("opencv-contrib-python-headless",)
 _COARSE_SIDE = 120
@@ -34,21 +36,21 @@ _CLEAR_MARGIN = 0.03
 class SweepParams:
     """How the depth of a view is swept."""
 
-    max_side: int = 320
+    max_side: Count = 320
     """Longer side of the depth map, in pixels."""
-    planes: int = 96
+    planes: Annotated[int, Range(3, float("inf"))] = 96
     """Depths that are tried, evenly spaced in inverse depth."""
-    sources: int = 6
+    sources: Count = 6
     """Other views that each view is compared with."""
-    best: int = 3
+    best: Count = 3
     """Out of those, so many that match a pixel best decide."""
-    window: int = 9
+    window: Count = 9
     """Side of the window that is compared, in pixels, odd."""
-    small_step: float = 0.04
+    small_step: NonNegative = 0.04
     """Price of a step by one plane between neighbouring pixels (costs lie in 0..1)."""
-    large_step: float = 0.3
+    large_step: NonNegative = 0.3
     """Price of a larger jump."""
-    max_cost: float = 0.45
+    max_cost: Fraction = 0.45
     """Pixels whose best match is dearer are unknown; 0.45 is a correlation of 0.1. Loose, since `agree` sorts out what
     is wrong far better than a view can alone, and needs what is right."""
 
@@ -57,13 +59,13 @@ class SweepParams:
 class AgreementParams:
     """Which swept depth is believed."""
 
-    neighbors: int = 8
+    neighbors: Count = 8
     """Other views that are asked."""
-    min_views: int = 2
+    min_views: Count = 2
     """So many of them must agree."""
-    max_pixels: float = 1.5
+    max_pixels: Positive = 1.5
     """How far a pixel may come back from where it started, in pixels of the depth map."""
-    max_relative: float = 0.02
+    max_relative: Positive = 0.02
     """How far the depths may be apart, as a share of the depth."""
 
 

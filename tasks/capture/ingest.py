@@ -19,6 +19,7 @@ from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map
 from ss_flow.tasks.capture.photo_files import Photo, decode, read_gray, read_photo
 from ss_flow.tasks.capture.scene_files import Pose
 from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.ranges import Count, JpegQuality
 
 _USES = ("opencv-contrib-python-headless",)
 _UPRIGHT = {2: "flip", 3: "180", 4: "flip 180", 5: "flip 270", 6: "90", 7: "flip 90", 8: "270"}
@@ -28,9 +29,9 @@ _UPRIGHT = {2: "flip", 3: "180", 4: "flip 180", 5: "flip 270", 6: "90", 7: "flip
 class IngestParams:
     """How photos are read."""
 
-    max_side: int = 1600
+    max_side: Count = 1600
     """Photos whose longer side is above this are scaled down to it, in pixels (1600 is what 3DGS trains at)."""
-    jpeg_quality: int = 95
+    jpeg_quality: JpegQuality = 95
     """Quality at which photos are encoded again when they must be; 0 keeps them lossless as PNG."""
 
 

@@ -120,15 +120,15 @@ def _lens(model: str, width: int, height: int, p: tuple[float, ...], where: str)
         case "SIMPLE_PINHOLE":
             lens = Lens(width, height, p[0], p[0], p[1], p[2])
         case "PINHOLE":
-            lens = Lens(width, height, *p)
+            lens = Lens(width, height, p[0], p[1], p[2], p[3])
         case "SIMPLE_RADIAL":
             lens = Lens(width, height, p[0], p[0], p[1], p[2], (p[3], 0.0, 0.0, 0.0))
         case "RADIAL":
             lens = Lens(width, height, p[0], p[0], p[1], p[2], (p[3], p[4], 0.0, 0.0))
         case "OPENCV" | "FULL_OPENCV":
-            lens = Lens(width, height, *p[:4], p[4:])
+            lens = Lens(width, height, p[0], p[1], p[2], p[3], p[4:])
         case "OPENCV_FISHEYE":
-            lens = Lens(width, height, *p[:4], p[4:], fisheye=True)
+            lens = Lens(width, height, p[0], p[1], p[2], p[3], p[4:], fisheye=True)
         case "SIMPLE_RADIAL_FISHEYE":
             lens = Lens(width, height, p[0], p[0], p[1], p[2], (p[3], 0.0, 0.0, 0.0), fisheye=True)
         case "RADIAL_FISHEYE":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.geometry.alignment import fit_scale_shift
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.ranges import Count, Fraction, Positive
 
 _MEAN = np.array((0.485, 0.456, 0.406), np.float32)
 _DEVIATION = np.array((0.229, 0.224, 0.225), np.float32)
@@ -22,21 +23,21 @@ _DEVIATION = np.array((0.229, 0.224, 0.225), np.float32)
 class MonoParams:
     """How the network is asked, and its answer brought to scale."""
 
-    input_side: int = 518
+    input_side: Count = 518
     """Longer side of the network's input, in pixels, unless the model fixes it."""
-    multiple: int = 14
+    multiple: Count = 14
     """Both sides of the input are multiples of this (a patch of the network)."""
-    predicts: str = "inverse"
+    predicts: Literal["inverse", "depth"] = "inverse"
     """What the network's output grows with: "inverse" depth, or "depth"."""
-    max_relative: float = 0.05
+    max_relative: Positive = 0.05
     """A known depth counts as met when it is off by no more than this share."""
-    min_points: int = 20
+    min_points: Count = 20
     """The fewest known depths that the scale is fitted to."""
-    min_met: float = 0.2
+    min_met: Fraction = 0.2
     """The share of known depths that the fit must meet."""
-    max_known_points: int = 4000
+    max_known_points: Count = 4000
     """The most known depths that are used, evenly spaced."""
-    max_extrapolation: float = 2.0
+    max_extrapolation: Positive = 2.0
     """Depths beyond so many times the farthest known depth are unknown."""
 
 
@@ -58,7 +59,7 @@ def mono(
     """
     predicted = _predict(frame, model, params)
     if params.predicts == "depth":
-        predicted = 1 / np.maximum(predicted, 1e-6)
+        predicted = np.float32(1) / np.maximum(predicted, np.float32(1e-6))
     relative, depth = _known_depths(frame, cameras, known, predicted, params)
     fit = fit_scale_shift(relative, 1 / depth, params.max_relative) if len(depth) >= params.min_points else None
     if fit is None or fit[2] < params.min_met:

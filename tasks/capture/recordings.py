@@ -15,6 +15,7 @@ from ss_flow.tasks.capture.ingest import IngestParams, frame_of
 from ss_flow.tasks.capture.layout_scannet import read_sens_index
 from ss_flow.tasks.capture.photo_files import inspect
 from ss_flow.tasks.capture.sensor_depth import registered_depth
+from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
 _USES = ("opencv-contrib-python-headless",)
 
@@ -23,17 +24,17 @@ _USES = ("opencv-contrib-python-headless",)
 class VideoParams:
     """Which frames of a video are used."""
 
-    max_frames: int = 120
+    max_frames: Count = 120
     """The most frames that are taken, spread evenly over the video."""
-    stride: int = 0
+    stride: Natural = 0
     """Take one frame out of so many; 0 = as many as `max_frames` asks for."""
-    candidates: int = 5
+    candidates: Count = 5
     """Out of each stride, so many frames are compared and the sharpest is taken."""
-    min_sharpness: float = 0.3
+    min_sharpness: NonNegative = 0.3
     """A frame is dropped when its sharpness is below this share of the median over the frames taken."""
-    max_side: int = 1600
+    max_side: Count = 1600
     """Frames whose longer side is above this are scaled down to it, in pixels."""
-    jpeg_quality: int = 95
+    jpeg_quality: JpegQuality = 95
     """Quality at which frames are encoded."""
 
 

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +73,7 @@ class SceneFiles:
     def pick(self, views: range | list[int]) -> SceneFiles:
         """Only these views, in this order."""
         per_view = ("names", "photos", "entries", "valid", "depths", "lenses", "poses", "ready_masks", "ground_truth")
-        kept = {}
+        kept: dict[str, Any] = {}
         for field in per_view:
             values = getattr(self, field)
             kept[field] = tuple(values[i] for i in views) if values else values

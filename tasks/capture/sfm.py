@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, Frame
 from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
+from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, Positive
 
 _MATCHING_THREADS = 2
 
@@ -26,32 +27,32 @@ _MATCHING_THREADS = 2
 class SfmParams:
     """How poses are found from photos alone."""
 
-    matching: str = "auto"
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Which photos are compared: "exhaustive" (all pairs), "sequential" (neighbours in order, for video), or "auto":
     all pairs up to `exhaustive_limit` photos."""
-    exhaustive_limit: int = 200
+    exhaustive_limit: Natural = 200
     """The most photos that "auto" compares in all pairs."""
-    overlap: int = 12
+    overlap: Count = 12
     """How many neighbours on either side sequential matching compares."""
-    max_features: int = 8192
+    max_features: Count = 8192
     """The most SIFT features a photo."""
-    peak_threshold: float = 0.003
+    peak_threshold: Positive = 0.003
     """Contrast that a SIFT feature needs; COLMAP's own default, 0.0067, finds too few in dim or blurred rooms."""
     guided_matching: bool = True
     """Whether photos are matched a second time along the epipolar lines that the first match gave."""
-    min_pose_matches: int = 15
+    min_pose_matches: Count = 15
     """So many points must confirm a photo's pose (COLMAP's own default is 30)."""
-    min_start_angle: float = 8.0
+    min_start_angle: Angle = 8.0
     """Parallax of the two photos that the model starts from, in degrees (COLMAP's own default is 16)."""
-    max_image_side: int = 1600
+    max_image_side: Count = 1600
     """Features are found in photos scaled down to this longer side, in pixels."""
-    camera_model: str = "SIMPLE_RADIAL"
+    camera_model: Literal["SIMPLE_RADIAL", "SIMPLE_PINHOLE"] = "SIMPLE_RADIAL"
     """"SIMPLE_RADIAL" (one focal length, one radial coefficient) or "SIMPLE_PINHOLE", shared by photos of one size."""
-    min_registered: float = 0.5
+    min_registered: Fraction = 0.5
     """The share of photos that must find their pose; below it the step fails."""
-    max_point_error: float = 2.0
+    max_point_error: Positive = 2.0
     """Sparse points with a larger mean reprojection error are dropped, in pixels."""
-    min_track: int = 3
+    min_track: Count = 3
     """Sparse points seen in fewer photos are dropped."""
 
 
@@ -68,10 +69,6 @@ def sfm(frames: tuple[Frame, ...], *, params: SfmParams = SfmParams(), seed: int
         raise InputError(
             f"poses cannot be found from {len(frames)} photo(s); at least 3 overlapping photos are needed."
         )
-    if params.matching not in ("auto", "exhaustive", "sequential"):
-        raise InputError(f"sfm.matching is {params.matching!r}; auto, exhaustive or sequential is possible.")
-    if params.camera_model not in ("SIMPLE_RADIAL", "SIMPLE_PINHOLE"):
-        raise InputError(f"sfm.camera_model is {params.camera_model!r}; SIMPLE_RADIAL or SIMPLE_PINHOLE is possible.")
     pycolmap = _load_pycolmap()
     with tempfile.TemporaryDirectory(prefix="ss-flow-sfm-") as folder, _quiet(pycolmap):
         root = Path(folder)

@@ -104,7 +104,7 @@ def table_picture(title: str, rows: Sequence[tuple[str, ...]], width: int = 800)
     return as_picture(figure)
 
 
-def _band(figure: Figure, bottom: float, height: float):  # type: ignore[no-untyped-def]
+def _band(figure: Figure, bottom: float, height: float) -> Rectangle:
     from matplotlib.patches import Rectangle
 
     return Rectangle((0, bottom), 1, height, transform=figure.transFigure, color="#efefec", zorder=-1)

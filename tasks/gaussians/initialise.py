@@ -37,7 +37,7 @@ def initialise(
     spread = np.full(n, 0.01)
     if n > 1:
         near, _ = cKDTree(points).query(points, k=min(4, n), workers=1)
-        spread = np.sqrt(np.square(near[:, 1:]).mean(axis=1))
+        spread = np.sqrt(np.square(np.asarray(near)[:, 1:]).mean(axis=1))
         # Coincident points would give a scale of 0, a logarithm without end.
         spread = np.maximum(spread, 1e-3 * max(float(np.median(spread)), 1e-6))
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)

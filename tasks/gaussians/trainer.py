@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import NEAR_PLANE
 from ss_flow.tasks.gaussians.render import channels_of
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, NonNegative, Positive
 
 
 class TrainingDiverged(RuntimeError):
@@ -44,45 +46,45 @@ class TrainView:
 class TrainParams:
     """How to train."""
 
-    iterations: int = 1000
+    iterations: Count = 1000
     """Steps, one view each."""
-    sh_degree: int = 3
+    sh_degree: HarmonicsDegree = 3
     """Highest degree of the colours; 0 is used below 2,000 iterations, otherwise one more every 1,000 steps."""
-    position_lr: float = 1.6e-4
+    position_lr: Positive = 1.6e-4
     """Learning rate of the means at the start, times the extent."""
-    position_lr_final: float = 1.6e-6
+    position_lr_final: Positive = 1.6e-6
     """Learning rate of the means at the last step, times the extent; the decay is exponential."""
-    color_lr: float = 1e-2
-    """Learning rate of the colours (four times that of 3DGS, which trains longer); a twentieth of it for degrees above 0."""
-    opacity_lr: float = 0.05
+    color_lr: NonNegative = 1e-2
+    """Learning rate of the colours (four times that of 3DGS, which trains longer); a twentieth above degree 0."""
+    opacity_lr: NonNegative = 0.05
     """Learning rate of the opacity logits."""
-    scale_lr: float = 5e-3
+    scale_lr: NonNegative = 5e-3
     """Learning rate of the logarithmic scales."""
-    rotation_lr: float = 1e-3
+    rotation_lr: NonNegative = 1e-3
     """Learning rate of the quaternions."""
-    ssim_weight: float = 0.2
+    ssim_weight: Fraction = 0.2
     """Share of 1 - SSIM in the colour loss; the rest is L1."""
-    alpha_weight: float = 0.5
+    alpha_weight: NonNegative = 0.5
     """Weight of the mean absolute error of alpha."""
-    depth_weight_start: float = 1.0
+    depth_weight_start: Positive = 1.0
     """Weight of the relative depth error at the first step."""
-    depth_weight_final: float = 0.01
+    depth_weight_final: Positive = 0.01
     """Weight of the relative depth error at the last step; the decay is exponential."""
-    mask_weight: float = 0.0
+    mask_weight: NonNegative = 0.0
     """Weight of the mask loss of merging (spec A25)."""
-    background: str = "random"
+    background: Literal["random", "black", "white"] = "random"
     """What lies behind: "random" (a colour for each step), "black" or "white"."""
     densify: bool = True
     """Whether to clone and split."""
-    densify_grad: float = 2e-4
+    densify_grad: Positive = 2e-4
     """Mean screen gradient from which a Gaussian is cloned or split, in 3DGS's units for images 512 pixels high."""
-    max_gaussians: int = 30_000
+    max_gaussians: Count = 30_000
     """Densification ends at this number."""
     reset_opacity: bool = False
     """Whether to start with no opacity above 0.01 (spec A23)."""
-    prune_opacity: float = 0.005
+    prune_opacity: Fraction = 0.005
     """Fainter Gaussians are dropped at every densification and at the end."""
-    prune_contribution: float = 1 / 255
+    prune_contribution: Fraction = 1 / 255
     """Gaussians with no larger weight in any view are dropped at the end; 0 keeps them."""
     antialias: bool = False
     """Whether to lower the opacity of Gaussians smaller than a pixel."""

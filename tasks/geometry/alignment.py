@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from ss_flow.tasks.artifacts import Float32, Float64
 
 

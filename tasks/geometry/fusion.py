@@ -46,7 +46,7 @@ def sum_by_voxel(parts: list[VoxelSums], voxel: float) -> VoxelSums:
     _, inverse = np.unique(code, return_inverse=True)
 
     def added(values: Float64) -> Float64:
-        return np.bincount(inverse, values)
+        return np.bincount(inverse, values).astype(np.float64, copy=False)
 
     return VoxelSums(
         np.stack([added(position[:, i]) for i in range(3)], axis=-1),

@@ -11,7 +11,7 @@ def decode_rgb(frame: Frame) -> UInt8:
     """The photo of a frame: [H, W, 3] uint8 RGB."""
     import cv2
 
-    bgr = cv2.imdecode(frame.encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    bgr: UInt8 = cv2.imdecode(frame.encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(bgr[..., ::-1])
 
 
@@ -21,7 +21,8 @@ def decode_valid(frame: Frame) -> Bool:
         return np.ones((frame.height, frame.width), bool)
     import cv2
 
-    return cv2.imdecode(frame.valid, cv2.IMREAD_GRAYSCALE) > 0
+    gray: UInt8 = cv2.imdecode(frame.valid, cv2.IMREAD_GRAYSCALE)
+    return gray > 0
 
 
 def encode_png(image: np.ndarray) -> UInt8:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
 from ss_flow.tasks.artifacts import Bool, Float32, Float64
 from ss_flow.tasks.geometry.cameras import Camera, backproject, project
 

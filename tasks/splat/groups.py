@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame, Gaussians
-from ss_flow.tasks.split.dense import scene_unit
 from ss_flow.tasks.splat.views import SceneViews
+from ss_flow.tasks.split.dense import scene_unit
 
 NO_GAUSSIANS = Gaussians(
     means=np.zeros((0, 3), np.float32),

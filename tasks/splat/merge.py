@@ -10,10 +10,10 @@ import numpy as np
 
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, Int32, LabelMap
-from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.gaussians.initialise import concatenate, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainParams, TrainView, train
+from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
 from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, training_view
 
@@ -22,13 +22,13 @@ from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, trai
 class MergeParams:
     """How merged Gaussians are refined together, without densification."""
 
-    iterations_per_view: int = 40
+    iterations_per_view: int = 10
     """Training steps of a pair for each view that sees it, within the two limits below."""
-    min_iterations: int = 300
+    min_iterations: int = 100
     """Fewest steps of a pair."""
-    max_iterations: int = 1000
+    max_iterations: int = 300
     """Most steps of a pair."""
-    global_iterations: int = 2000
+    global_iterations: int = 1000
     """Steps of the last pass over the whole scene; 0 leaves it out."""
     global_mask_weight: float = 0.25
     """w_mask of the last pass."""
@@ -232,9 +232,7 @@ def _views(
     return [view for view in views if view.inside.any()]
 
 
-def _guarded(
-    before: Gaussians, after: Gaussians, views: list[TrainView], ids: Int32, params: MergeParams
-) -> Gaussians:
+def _guarded(before: Gaussians, after: Gaussians, views: list[TrainView], ids: Int32, params: MergeParams) -> Gaussians:
     step = max(1, -(-len(views) // params.guard_views))
     old, new = quality(before, views[::step], ids), quality(after, views[::step], ids)
     if new.iou >= old.iou - params.guard_iou and new.psnr >= old.psnr - params.guard_psnr:

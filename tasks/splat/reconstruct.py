@@ -10,9 +10,9 @@ import numpy as np
 
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks, Int32
-from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
+from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
 from ss_flow.tasks.splat.resolve import REFINED
 from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask_of, training_view
@@ -22,13 +22,13 @@ from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask
 class ReconstructParams:
     """How an instance is trained."""
 
-    iterations_per_view: int = 40
+    iterations_per_view: int = 20
     """Training steps for each view of the instance, within the two limits below."""
-    min_iterations: int = 600
+    min_iterations: int = 300
     """Fewest steps."""
-    max_iterations: int = 10_000
+    max_iterations: int = 1000
     """Most steps."""
-    retrain_share: float = 1.0
+    retrain_share: float = 0.5
     """Steps of training after refinement, as a share of the first training's."""
     warm_start: bool = True
     """Whether training after refinement goes on from the Gaussians of the first, or starts over."""
@@ -38,7 +38,7 @@ class ReconstructParams:
     """Most points that training starts from; more are thinned out."""
     max_gaussians: int = 30_000
     """Most Gaussians of an instance."""
-    background_scale: float = 3.0
+    background_scale: float = 2.0
     """Factor on both limits for the background."""
     background: str = "random"
     """Colour behind the Gaussians: "random" in each step, or "black" as in the paper."""

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import functools
-import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ss_flow.events import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
-from ss_flow.tasks.geometry.cameras import Camera, camera_of
-from ss_flow.tasks.geometry.images import decode_rgb
-from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.splat.groups import box_diagonal, rasterizer, scene_views
 from ss_flow.tasks.splat.resolve import REFINED
 from ss_flow.tasks.splat.views import CropParams, SceneViews, crop_camera, mask_of, sample_depth
 
-if TYPE_CHECKING:
-    from ss_flow.tasks.models.sam import Embedding, Sam
+Prompt = Callable[[Float32], tuple[Bool, float]]
+"""Points [n, 2] in pixels of a photo -> the segmenter's mask and its score."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +73,7 @@ def refine(
     depths: tuple[DepthMap, ...],
     instance: InstanceMasks,
     gaussians: Gaussians,
+    embeddings: tuple[Embedding, ...],
     *,
     params: RefineParams,
     model: Model | None = None,
@@ -87,7 +87,7 @@ def refine(
     segmenter's agrees better with M^gs; where it has none, the segmenter's is added when its IoU with M^gs exceeds
     `tau_iou`.
 
-    model: the segmenter. Without one (None) no mask is replaced; where a mask is missing, M^gs itself is added when
+    model: the segmenter; embeddings: its embeddings of all views, none without a segmenter. Without one (None) no mask is replaced; where a mask is missing, M^gs itself is added when
     the view's depth confirms at least `min_support` of it. New masks are marked as refined (2) in `prompted`. The
     background (id 0) and an instance without Gaussians come back as they are.
     """
@@ -95,11 +95,13 @@ def refine(
         return instance
     scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
     solid = _solid(gaussians, params)
+    segmenter = Sam(model) if model else None
     held = {int(view): row for row, view in enumerate(instance.view)}
     views, masks, prompted = [], [], []
     for view, frame in enumerate(frames):
         old = mask_of(instance, held[view]) if view in held else None
-        new = _replacement(scene, view, solid, old, params, model)
+        prompt = functools.partial(segmenter.predict_prompt, embeddings[view]) if segmenter else None
+        new = _replacement(scene, view, solid, old, params, prompt)
         if new is not None:
             views.append(view)
             masks.append(np.packbits(new))
@@ -127,7 +129,7 @@ def render_mask(
 
     Full opacity gives the outline; with it, however, the Gaussian whose centre is nearest hides the surface that it is
     part of, so the depth is that of the ordinary rendering wherever that is solid. Depth is compared no more finely
-    than the Gaussians are thick.
+    than the Gaussians are thick and a pixel is wide.
     """
     full = camera_of(scene.cameras, view)
     nothing = np.zeros((full.height, full.width), bool)
@@ -139,7 +141,7 @@ def render_mask(
     depth = np.where(solid, total / np.maximum(weight, 1e-6), 0)
     measured = sample_depth(scene.depths[view], full, camera)
     thickness = float(np.median(np.exp(gaussians.log_scales.max(axis=1))))
-    tolerance = np.maximum(scene.tau, scene.tau_relative * depth) + thickness
+    tolerance = np.maximum(scene.tau, scene.tau_relative * depth) + thickness + depth / camera.fx
     visible = solid & ((measured == 0) | (measured + tolerance >= depth))
     agrees = visible & (measured > 0) & (np.abs(measured - depth) <= tolerance)
     return RenderedMask(_pasted(visible, camera, full), float(agrees.sum() / max(1, visible.sum())))
@@ -166,10 +168,13 @@ def _solid(gaussians: Gaussians, params: RefineParams) -> Gaussians:
 
 
 def _replacement(
-    scene: SceneViews, view: int, gaussians: Gaussians, old: Bool | None, params: RefineParams, model: Model | None
+    scene: SceneViews, view: int, gaussians: Gaussians, old: Bool | None, params: RefineParams, prompt: Prompt | None
 ) -> Bool | None:
-    """The mask that takes the place of `old` in a view, None where nothing changes."""
-    if model is None and old is not None:
+    """The mask that takes the place of `old` in a view, None where nothing changes.
+
+    prompt: gives the segmenter's mask of the view, and its score, for points in the photo.
+    """
+    if prompt is None and old is not None:
         return None
     rows, column, row = scene.surface_rows(view, gaussians.means)
     if len(rows) < params.min_visible:
@@ -177,49 +182,12 @@ def _replacement(
     rendered = render_mask(gaussians, scene, view, params.alpha_threshold)
     if not rendered.mask.any():
         return None
-    if model is None:
+    if prompt is None:
         return rendered.mask if rendered.support >= params.min_support else None
     places = np.stack([column, row], axis=-1) + 0.5
     taken = greedy_farthest(places, params.prompts, alpha=params.prompt_alpha, drop_hull=params.drop_hull)
-    candidate = _prompted(scene.frames[view], places[taken], model)
+    candidate, _ = prompt(places[taken])
     agreement = iou(candidate, rendered.mask)
     if old is None:
         return candidate if agreement > params.tau_iou else None
     return candidate if agreement > iou(old, rendered.mask) else None
-
-
-def _prompted(frame: Frame, points: Float32, model: Model) -> Bool:
-    segmenter = _segmenter(model)
-    mask, _ = segmenter.predict_prompt(_embedding(segmenter, frame, model), points)
-    return mask
-
-
-@functools.lru_cache(maxsize=1)
-def _segmenter(model: Model) -> Sam:
-    from ss_flow.tasks.models.sam import Sam
-
-    return Sam(model)
-
-
-class _Slot:
-    """Where the embedding of one photo is kept; it is made by whoever comes first, while others wait."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.embedding: Embedding | None = None
-
-
-@functools.lru_cache(maxsize=100)
-def _slot(model: Model, photo: str) -> _Slot:
-    return _Slot()
-
-
-def _embedding(segmenter: Sam, frame: Frame, model: Model) -> Embedding:
-    """The segmenter's embedding of a photo, remembered by content: all instances of a scene share it (4 MB each)."""
-    from blake3 import blake3
-
-    slot = _slot(model, blake3(frame.encoded.tobytes()).hexdigest())
-    with slot.lock:
-        if slot.embedding is None:
-            slot.embedding = segmenter.encode(decode_rgb(frame))
-        return slot.embedding

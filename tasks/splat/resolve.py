@@ -31,9 +31,9 @@ def resolve(cameras: Cameras, instances: tuple[InstanceMasks, ...]) -> tuple[Lab
         for row, view in enumerate(instance.view):
             if maps[view].shape != (instance.height, instance.width):
                 raise InputError(
-                    f"Frame {cameras.names[view]} is {maps[view].shape[1]} x {maps[view].shape[0]} pixels and the masks "
-                    f"of instance {instance.instance_id} are {instance.width} x {instance.height}; both must have one "
-                    "size."
+                    f"Frame {cameras.names[view]} is {maps[view].shape[1]} x {maps[view].shape[0]} pixels and the "
+                    f"masks of instance {instance.instance_id} are {instance.width} x {instance.height}; "
+                    "both must have one size."
                 )
             area = int(mask_of(instance, row).sum())
             seen[view].append((-area, -instance.instance_id, instance, row))

@@ -35,7 +35,7 @@ class SceneViews:
     """The same as a fraction of the depth; the larger of the two counts."""
 
     def surface_rows(self, view: int, points: Float32) -> tuple[Int32, Int32, Int32]:
-        """The points that a view really sees (Split&Splat, Eq. 1-2): rows of `points` [N, 3], pixel columns and rows."""
+        """The points that a view really sees (Split&Splat, Eq. 1-2): rows of `points`, pixel columns, pixel rows."""
         camera = camera_of(self.cameras, view)
         rows, column, row, z = pixels_in_view(points, camera)
         measured = depth_at(self.depths[view], column, row, camera.width, camera.height)
@@ -49,7 +49,7 @@ class CropParams:
 
     margin_px: int = 16
     """Pixels of the photo added on every side of the box around the instance."""
-    max_side: int = 640
+    max_side: int = 480
     """Longest side of the crop, pixels; larger crops are scaled down."""
 
 
@@ -72,8 +72,8 @@ def sample_depth(depth: DepthMap, full: Camera, crop: Camera) -> Float32:
 def propagated_depth(points: Float32, camera: Camera, spacing: float) -> Float32:
     """The depth of a surface that is known by points only: [h, w] z-depth, 0 where no point is near.
 
-    points: [N, 3] world; spacing: distance between neighbours, world units. Each pixel takes the mean depth of the points
-    in front within the projected spacing, so that the surface has no holes between its points.
+    points: [N, 3] world; spacing: distance between neighbours, world units. Each pixel takes the mean depth of the
+    points in front within the projected spacing, so that the surface has no holes between its points.
     """
     import cv2
 
@@ -89,8 +89,12 @@ def propagated_depth(points: Float32, camera: Camera, spacing: float) -> Float32
     nearest = cv2.erode(own, np.ones(window, np.uint8), borderType=cv2.BORDER_REPLICATE)
     # Farther points belong to a side of the surface that shows through between those in front.
     in_front = (own < far) & (own - nearest <= 3 * max(spacing, reach * distance / camera.fx))
-    total = cv2.boxFilter(np.where(in_front, own, 0), cv2.CV_32F, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    count = cv2.boxFilter(in_front.astype(np.float32), cv2.CV_32F, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    total = cv2.boxFilter(
+        np.where(in_front, own, 0), cv2.CV_32F, window, normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    count = cv2.boxFilter(
+        in_front.astype(np.float32), cv2.CV_32F, window, normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
     return np.where(count > 0.5, total / np.maximum(count, 1), 0).astype(np.float32)
 
 

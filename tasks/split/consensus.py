@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ss_flow.tasks.artifacts import Int32
+from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.split.observation import MaskPoints, membership
 
 if TYPE_CHECKING:
@@ -22,15 +23,15 @@ if TYPE_CHECKING:
 class ConsensusParams:
     """When groups of points belong together (spec S4, global merge)."""
 
-    visible: float = 0.3
+    visible: Fraction = 0.3
     """Share of a group's points that a view must see to have a say about it."""
-    contained: float = 0.8
+    contained: Fraction = 0.8
     """Share of a group's seen points that one mask must hold to hold the group."""
-    rate: float = 0.9
+    rate: Fraction = 0.9
     """Share of the views with a say about two groups that must hold both in one mask."""
-    split: float = 0.3
+    split: Fraction = 0.3
     """A mask whose points more than this share of the views spread over several masks is left out."""
-    min_views: int = 3
+    min_views: Count = 3
     """How many views must have a say about two labels before these are merged."""
 
 

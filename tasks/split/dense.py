@@ -14,23 +14,24 @@ from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, sum_by_voxel
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.ranges import Count, NonNegative, Positive
 
 
 @dataclass(frozen=True)
 class DenseParams:
     """How densely the scene's surfaces are sampled."""
 
-    voxel: float = 0.02
+    voxel: Positive = 0.02
     """Upper limit of the side of a sampling cube, in scene units (metres where the scale is known)."""
-    voxel_pixels: float = 2.0
+    voxel_pixels: Positive = 2.0
     """The cube's side in median pixel footprints, where that is finer than `voxel`."""
-    max_points: int = 400_000
+    max_points: Count = 400_000
     """Cubes grow until no more points than this remain."""
-    tau_depth: float = 0.02
+    tolerance: Positive = 0.02
     """How far two views' depths may differ at one point, in scene units."""
-    tau_relative: float = 0.01
+    relative_tolerance: NonNegative = 0.01
     """The same as a fraction of the depth; the larger of the two counts."""
-    min_views: int = 2
+    min_views: Count = 2
     """How many views must confirm a point, where as many see it."""
 
 
@@ -58,8 +59,8 @@ def dense(
             means,
             cameras,
             depths,
-            tau=params.tau_depth * unit,
-            tau_relative=params.tau_relative,
+            tau=params.tolerance * unit,
+            tau_relative=params.relative_tolerance,
             min_views=params.min_views,
         )
         if kept.sum() <= params.max_points:
@@ -72,8 +73,8 @@ def dense(
             "The depth maps of this scene agree in no point; they should be z-depths in the unit of the camera poses."
         )
     points = means[kept].astype(np.float32)
-    colors = np.rint(colors[kept]).astype(np.uint8)
-    return PointCloud(points=points, colors=colors, unit=unit, spacing=nearest_spacing(points))
+    rounded = np.rint(colors[kept]).astype(np.uint8)
+    return PointCloud(points=points, colors=rounded, unit=unit, spacing=nearest_spacing(points))
 
 
 def scene_unit(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Int32, MaskSet
+from ss_flow.tasks.ranges import Fraction, Natural, NonNegative
 from ss_flow.tasks.split.mask_pool import canonical_order, exclusive
 
 
@@ -14,17 +15,17 @@ from ss_flow.tasks.split.mask_pool import canonical_order, exclusive
 class ErosionParams:
     """How far a mask's border is taken off before its pixels vote (spec row 13, A9)."""
 
-    radius: float = 3.0
+    radius: NonNegative = 3.0
     """Chebyshev radius for small masks, in pixels of an image `diagonal` pixels across."""
-    radius_large: float = 4.0
+    radius_large: NonNegative = 4.0
     """The same for large masks."""
-    large_area: float = 0.05
+    large_area: Fraction = 0.05
     """Share of the image from which a mask is large."""
-    diagonal: float = 800.0
+    diagonal: NonNegative = 800.0
     """Image diagonal that the radii refer to, in pixels; 0 takes them as they are for every image."""
-    keep_share: float = 0.25
+    keep_share: Fraction = 0.25
     """The radius shrinks until at least this share of the mask survives."""
-    keep_pixels: int = 30
+    keep_pixels: Natural = 30
     """And until at least this many pixels do; a smaller mask is not eroded."""
 
 

@@ -59,7 +59,7 @@ def drop_duplicates(masks: Bool, scores: Float32, max_iou: float) -> Int32:
     return suppress(shared / (areas[:, None] + areas[None] - shared), scores, max_iou)
 
 
-def suppress(overlap: Float32, scores: Float32, threshold: float) -> Int32:
+def suppress(overlap: Float32 | Float64, scores: Float32, threshold: float) -> Int32:
     """Greedy non-maximum suppression on a matrix of overlaps.
 
     overlap: [N, N]. scores: [N]; of equal scores the first row is taken first. Returns the rows that stay, ascending.

@@ -9,6 +9,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Int32, MaskSet, Visibility
 from ss_flow.tasks.geometry.clustering import main_clusters
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.erosion import ErosionParams, interiors
 
 if TYPE_CHECKING:
@@ -33,11 +34,11 @@ class MaskPoints:
 class ClusterParams:
     """Which points under a mask belong together (DBSCAN; spec rows 14 and 15)."""
 
-    eps: float = 0.0
+    eps: NonNegative = 0.0
     """Neighbourhood radius in multiples of the cloud's spacing; 0 keeps all points."""
-    min_samples: int = 10
+    min_samples: Count = 10
     """Neighbours that make a core point."""
-    keep_share: float = 0.1
+    keep_share: Fraction = 0.1
     """Clusters with at least this share of the points are kept, and always the largest; 1 keeps that one alone."""
 
 

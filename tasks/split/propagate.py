@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
-from ss_flow.errors import InputError
 from ss_flow.events import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Float64, Int32, MaskSet, PointCloud, PointLabels, Visibility
 from ss_flow.tasks.geometry.clustering import main_clusters
 from ss_flow.tasks.geometry.zbuffer import paint
+from ss_flow.tasks.ranges import Count, Fraction, Natural, Range
 from ss_flow.tasks.split.consensus import ConsensusParams, cluster_masks, merge_labels
 from ss_flow.tasks.split.erosion import ErosionParams
 from ss_flow.tasks.split.observation import ClusterParams, MaskPoints, observe
@@ -25,23 +25,23 @@ class PropagateParams:
 
     start: Literal["empty", "consensus"] = "consensus"
     """Labels that the first pass starts from: none, as in the paper, or those that the consensus of all views gives."""
-    passes: int = 1
+    passes: Count = 1
     """How often all views vote; each further pass matches every view against the labels of the pass before."""
     nested: bool = False
     """Whether a point inside two masks of a view votes for both; if not, for the smaller one."""
-    lambda_init: float = 0.25
+    lambda_init: Annotated[float, Range(0.0, 1.0, open_below=True, open_above=True)] = 0.25
     """What the first vote of a point weighs more than later ones, between 0 and 1."""
-    contested_vote: float = 0.0
+    contested_vote: Fraction = 0.0
     """Weight of a vote from a mask that touched several labels; 0 = the share of the label it went to."""
-    tau_label: float = 0.7
+    tau_label: Fraction = 0.7
     """Share of its votes that a point's label needs."""
-    min_overlap: int = 3
+    min_overlap: Natural = 3
     """Painted pixels under a mask below which it is a new object."""
-    min_overlap_share: float = 0.1
+    min_overlap_share: Fraction = 0.1
     """The same as a share of the pixels under the mask where points fall; the larger of the two counts."""
-    min_new_points: int = 10
+    min_new_points: Natural = 10
     """Points under a mask below which it founds no object."""
-    min_label_points: int = 10
+    min_label_points: Natural = 10
     """Points below which a label is dropped in the end."""
     global_merge: bool = True
     """Whether labels that the views hold together in one mask are united in the end."""
@@ -53,12 +53,6 @@ class PropagateParams:
     """Which points under a mask are kept."""
     label_clusters: ClusterParams = field(default_factory=lambda: ClusterParams(keep_share=0.05))
     """Which points of a label are kept in the end."""
-
-    def __post_init__(self) -> None:
-        if self.passes < 1:
-            raise InputError(f"propagate.passes is {self.passes}; it should be at least 1.")
-        if not 0 < self.lambda_init < 1:
-            raise InputError(f"propagate.lambda_init is {self.lambda_init}; it should lie between 0 and 1.")
 
 
 @dataclass(frozen=True)
@@ -102,14 +96,14 @@ def propagate(
             # Two phases: no mask of a view sees the votes of another mask of the same view (spec A5).
             matches = [_match(m, virtual, num_labels, params) for m in masked]
             for match in matches:
-                label = match.label
-                if not label:
+                chosen = match.label
+                if not chosen:
                     if len(match.masked.points) < params.min_new_points:
                         continue
                     num_labels += 1
-                    label = num_labels
-                _vote(votes, match, label, params)
-                matched.append((k, Match(match.masked, label, match.purity)))
+                    chosen = num_labels
+                _vote(votes, match, chosen, params)
+                matched.append((k, Match(match.masked, chosen, match.purity)))
         given = _sure(votes, params.tau_label)
 
     label = _settle(given, points, views, params)

@@ -19,6 +19,7 @@ from ss_flow.tasks.artifacts import (
     Visibility,
 )
 from ss_flow.tasks.geometry.images import pack_masks
+from ss_flow.tasks.ranges import Count
 from ss_flow.tasks.split.selection import (
     SelectionParams,
     agreement,
@@ -35,7 +36,7 @@ class ReprojectParams:
 
     selection: SelectionParams = field(default_factory=SelectionParams)
     """Which masks of a view show a label."""
-    min_views: int = 2
+    min_views: Count = 2
     """Views with a mask below which an instance is weak: kept as points, not reconstructed."""
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Frame, MaskSet, PointLabels, PromptedMasks, Visibility
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, pack_masks
+from ss_flow.tasks.geometry.images import decode_valid, pack_masks
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.sam import Embedding, Sam
+from ss_flow.tasks.ranges import Count, NonNegative
 from ss_flow.tasks.split.selection import SelectionParams, paint_labels, select_masks
 
 
@@ -18,11 +20,11 @@ from ss_flow.tasks.split.selection import SelectionParams, paint_labels, select_
 class RepromptParams:
     """Which labels are asked for, and how."""
 
-    min_points: int = 10
+    min_points: Count = 10
     """Points of a label that must be in front in a view."""
-    prompts: int = 10
+    prompts: Count = 10
     """Points that ask for the mask together, far from each other."""
-    alpha: float = 0.3
+    alpha: NonNegative = 0.3
     """How much prompts keep to the middle of the label."""
     drop_hull: bool = True
     """Whether the outermost points are no prompts."""
@@ -34,6 +36,7 @@ class RepromptParams:
 )
 def reprompt(
     frame: Frame,
+    embedding: Embedding,
     visibility: Visibility,
     masks: MaskSet,
     labels: PointLabels,
@@ -44,7 +47,7 @@ def reprompt(
 ) -> PromptedMasks:
     """Masks for the labels that are visible in a view but that none of its masks shows (spec S5).
 
-    visibility, masks: those of the frame. selection: how the view's own masks are matched to labels, as in the
+    embedding, visibility, masks: those of the frame. selection: how the view's own masks are matched to labels, as in the
     re-projection. Each missing label gets one mask, prompted at points spread over it. Whether
     the mask agrees with the label is for `split.reproject` to judge. Raises InputError when the model cannot be opened.
     """
@@ -58,10 +61,7 @@ def reprompt(
     ]
     found: list[Bool] = []
     if missing:
-        from ss_flow.tasks.models.sam import Sam
-
         sam = Sam(model)
-        embedding = sam.encode(decode_rgb(frame))
         valid = decode_valid(frame)
         for label in missing:
             v, u = np.divmod(painted.pixel[painted.label == label], visibility.width)

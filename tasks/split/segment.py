@@ -12,8 +12,10 @@ from ss_flow.errors import InputError
 from ss_flow.events import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, MaskSet
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.sam import Embedding, Sam
+from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
 from ss_flow.tasks.split.mask_pool import (
     canonical_order,
     drop_duplicates,
@@ -28,35 +30,35 @@ from ss_flow.tasks.split.mask_pool import (
 class SegmentParams:
     """How masks are prompted, filtered and merged; tuples have one value for each grid."""
 
-    grids: tuple[int, ...] = (1, 4, 8, 16)
+    grids: tuple[Count, ...] = (1, 4, 8, 16)
     """Prompt points a side of each grid, coarse to fine (row 2)."""
     adaptive: bool = True
     """Whether a finer grid leaves out the points that a small accepted mask already covers."""
-    settled_area: float = 0.1
+    settled_area: Fraction = 0.1
     """Largest share of the image of a mask that keeps finer prompts away; under larger ones parts may hide."""
-    pred_iou: float = 0.8
+    pred_iou: Fraction = 0.8
     """Least quality that the segmenter itself predicts (row 3)."""
-    stability: tuple[float, ...] | None = None
+    stability: tuple[Fraction, ...] | None = None
     """Least IoU of a mask cut above and below its threshold (row 4); None takes the model's own figure."""
-    stability_offset: tuple[float, ...] = (0.85, 0.85, 0.85, 1.0)
+    stability_offset: tuple[NonNegative, ...] = (0.85, 0.85, 0.85, 1.0)
     """Distance of those two cuts from the threshold, in logits (row 4)."""
     mask_threshold: tuple[float, ...] = (0.5, 0.5, 0.3, 0.3)
     """Logit above which a pixel belongs to a mask (row 5)."""
-    box_nms: tuple[float, ...] = (0.3, 0.3, 0.5, 0.3)
+    box_nms: tuple[Fraction, ...] = (0.3, 0.3, 0.5, 0.3)
     """IoU of bounding boxes above which the worse of two masks of one grid is dropped (row 6)."""
-    min_area: float = 0.0025
+    min_area: Fraction = 0.0025
     """Smallest mask, as a share of the image (row 7); dense scenes want 0.0005."""
-    min_pixels: int = 64
+    min_pixels: Natural = 64
     """Smallest mask, in pixels (row 7)."""
     merge: Literal["child", "union"] = "child"
     """What becomes of masks of several grids that overlap: a mask tree, or one mask (rows 8 and 9)."""
-    duplicate_iou: float = 0.9
+    duplicate_iou: Fraction = 0.9
     """With "child": IoU above which the worse of two masks is dropped."""
-    contained: float = 0.9
+    contained: Fraction = 0.9
     """With "child": share of a mask that its parent holds."""
-    duplicate_overlap: float = 0.95
+    duplicate_overlap: Fraction = 0.95
     """With "union": share of the smaller of two masks of one grid above which the later is dropped (row 8)."""
-    union_overlap: float = 0.3
+    union_overlap: Fraction = 0.3
     """With "union": share of the smaller mask above which a finer one is united with a coarser one (row 9)."""
 
     def __post_init__(self) -> None:
@@ -101,17 +103,14 @@ class _Candidates:
     resources=Resources(cores=1, memory_mb=1500),
     uses=("onnxruntime", "onnx", "opencv-contrib-python-headless"),
 )
-def segment(frame: Frame, *, params: SegmentParams, model: Model) -> MaskSet:
+def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model: Model) -> MaskSet:
     """The masks that Segment Anything finds in one view (Split&Splat, M_k; spec S1).
 
-    Pixels that the frame marks as not valid belong to no mask. The masks come in canonical order: area descending.
+    embedding: the frame's, by the same model. Pixels that the frame marks as not valid belong to no mask. The masks come in canonical order: area descending.
     Raises InputError when the model's files are missing, damaged or other networks.
     """
-    from ss_flow.tasks.models.sam import Sam
-
     sam = Sam(model)
     valid = decode_valid(frame)
-    embedding = sam.encode(decode_rgb(frame))
     valid_low = _low_resolution(valid)
 
     found: _Candidates | None = None

@@ -11,6 +11,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Int32, MaskSet
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size
+from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, NonNegative, Positive
 from ss_flow.tasks.split.graph_segmentation import (
     RegionGraph,
     boundaries,
@@ -25,31 +26,31 @@ from ss_flow.tasks.split.mask_pool import canonical_order, drop_duplicates, mask
 class SegmentRgbdParams:
     """How regions grow together."""
 
-    side: int = 320
+    side: Count = 320
     """Longer side of the image that regions are grown on, in pixels; masks are scaled back to the frame."""
-    levels: tuple[float, ...] = (0.17, 0.28, 0.45)
+    levels: tuple[NonNegative, ...] = (0.17, 0.28, 0.45)
     """Boundary strengths up to which regions merge; each level gives masks, and the lowest gives the finest."""
-    depth_jump: float = 0.02
+    depth_jump: Positive = 0.02
     """Step in depth, as a share of the depth, at which a surface ends."""
-    crease: float = 45.0
+    crease: Angle = 45.0
     """Angle of a concave crease at which an object ends, in degrees."""
-    color_weight: float = 0.2
+    color_weight: NonNegative = 0.2
     """Strength that a difference of colour adds to a boundary whose depth is known."""
-    color_scale: float = 30.0
+    color_scale: Positive = 30.0
     """Lab distance at which colours count as different."""
-    superpixel: int = 20
+    superpixel: Count = 20
     """Least size of the regions that everything starts from, in pixels of the working image."""
-    plane_share: float = 0.05
+    plane_share: Fraction = 0.05
     """Least share of the image of a plane that gets a mask of its own."""
-    plane_tolerance: float = 0.01
+    plane_tolerance: Positive = 0.01
     """Distance from a plane of its points, as a share of the depth."""
-    min_area: float = 0.0025
+    min_area: Fraction = 0.0025
     """Smallest mask, as a share of the image."""
-    min_pixels: int = 64
+    min_pixels: Natural = 64
     """Smallest mask, in pixels of the frame."""
-    duplicate_iou: float = 0.9
+    duplicate_iou: Fraction = 0.9
     """IoU above which the worse of two masks is dropped."""
-    contained: float = 0.9
+    contained: Fraction = 0.9
     """Share of a mask that its parent holds."""
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float64, Int32, MaskSet, Visibility
 from ss_flow.tasks.geometry.zbuffer import paint
+from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.split.erosion import ErosionParams, interiors
 from ss_flow.tasks.split.mask_pool import canonical_order
 
@@ -19,7 +20,7 @@ class SelectionParams:
 
     masks: Literal["best", "all"] = "best"
     """The masks that together agree best with a label's points, or, as in the paper, all that overlap it most."""
-    min_iou: float = 0.3
+    min_iou: Fraction = 0.3
     """IoU with a label's painted points below which no mask shows the label (only with "best")."""
     erosion: ErosionParams = field(default_factory=ErosionParams)
     """How far a mask's border is taken off before its majority is counted (only with "all")."""

@@ -1,8 +1,9 @@
-"""A scene made by ray casting: a floor (0), a turned box (1) and a ball (2) that touches its corner, seen from a ring."""
+"""A scene made by ray casting: a floor (0), a turned box (1) and a ball (2) at its corner, seen from a ring."""
 
 from __future__ import annotations
 
 import numpy as np
+
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, InstanceMasks, LabelMap
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.images import encode_png, pack_masks
@@ -33,9 +34,7 @@ class SmallScene:
             rgb = _texture(places, ids).reshape(HEIGHT, WIDTH, 3)
             self.images.append(rgb)
             self.ids.append(ids.reshape(HEIGHT, WIDTH))
-            frames.append(
-                Frame(name, WIDTH, HEIGHT, encode_png(rgb), np.zeros(0, np.uint8), WIDTH, HEIGHT)
-            )
+            frames.append(Frame(name, WIDTH, HEIGHT, encode_png(rgb), np.zeros(0, np.uint8), WIDTH, HEIGHT))
             depths.append(DepthMap(name, z.reshape(HEIGHT, WIDTH).astype(np.float32), "sensor"))
             maps.append(LabelMap(name, self.ids[-1].astype(np.uint16)))
             points.append(places)
@@ -47,7 +46,7 @@ class SmallScene:
 
     def instance(self, instance_id: int, views: tuple[int, ...] = tuple(range(VIEWS)), every: int = 3) -> InstanceMasks:
         mine = np.flatnonzero(self.labels == instance_id)[::every]
-        masks = np.array([self.ids[k] == instance_id for k in views]).reshape(-1, HEIGHT, WIDTH)
+        masks = np.array([self.ids[k] == instance_id for k in views], bool).reshape(-1, HEIGHT, WIDTH)
         return InstanceMasks(
             instance_id=instance_id,
             points=self.points[mine],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from ss_flow.tasks.artifacts import Cameras, Frame
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import encode_png

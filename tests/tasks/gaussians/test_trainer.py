@@ -94,7 +94,7 @@ def test_the_mask_loss_gives_pixels_back_to_their_instance():
         world_y = (view.depth * ((np.mgrid[:SIZE, :SIZE][0] + 0.5 - SIZE / 2) / 60.0)).astype(np.float32)
         ids = np.where(view.inside, np.where(world_y < 0, 0, 1), -2).astype(np.int32)
         views.append(replace(view, ids=ids))
-    params = TrainParams(iterations=150, densify=False, mask_weight=0.25, reset_opacity=True, prune_opacity=0.0)
+    params = TrainParams(iterations=150, densify=False, mask_weight=1.0, reset_opacity=True, prune_opacity=0.0)
     params = replace(params, prune_contribution=0.0)
     mixed = replace(half, instance_id=wrong)
 

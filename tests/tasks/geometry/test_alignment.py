@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from ss_flow.tasks.geometry.alignment import fit_scale_shift
 
 

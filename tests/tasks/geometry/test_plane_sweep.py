@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from generated_views import views
+
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.plane_sweep import (
     SweepView,

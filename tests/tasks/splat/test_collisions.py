@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.splat.collisions import collision_matrix, group_box, match_pairs
 from ss_flow.tasks.splat.plan import PlanParams, plan
@@ -52,8 +53,12 @@ def table_cup_book_floor_lamp() -> dict[str, Gaussians]:
     return {
         "A": group(table, 1),
         "B": group([cup[0], *spread(17, [1.11, 0, 0], [1.19, 0, 0]), [1.3, 0, 0], cup[1]], 2),
-        "C": group([book[0], *spread(17, [0, 1.11, 0], [0, 1.19, 0]), *spread(11, [0, 1.3, 0], [0, 1.39, 0]), book[1]], 3),
-        "D": group([floor[0], *spread(19, [0, 0, -0.99], [0, 0, -0.9]), *spread(179, [0, 0, -1.9], [0, 0, -1.1]), floor[1]], 4),
+        "C": group(
+            [book[0], *spread(17, [0, 1.11, 0], [0, 1.19, 0]), *spread(11, [0, 1.3, 0], [0, 1.39, 0]), book[1]], 3
+        ),
+        "D": group(
+            [floor[0], *spread(19, [0, 0, -0.99], [0, 0, -0.9]), *spread(179, [0, 0, -1.9], [0, 0, -1.1]), floor[1]], 4
+        ),
         "E": group(spread(10, [9, 9, 9], [10, 10, 10]), 5),
     }  # fmt: skip
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, InstanceMasks, LabelMap
 from ss_flow.tasks.geometry.images import pack_masks
@@ -41,9 +42,7 @@ def test_the_order_of_instances_and_the_background_do_not_matter():
 
 
 def test_masks_of_another_size_are_refused_by_name():
-    other = Cameras(
-        ("a",), np.array([[5, 3]], np.int32), np.ones((1, 4)), np.eye(4)[None], metric=True
-    )
+    other = Cameras(("a",), np.array([[5, 3]], np.int32), np.ones((1, 4)), np.eye(4)[None], metric=True)
     with pytest.raises(InputError, match="Frame a is 5 x 3 pixels and the masks of instance 2 are 4 x 3"):
         resolve(other, (SMALL,))
 

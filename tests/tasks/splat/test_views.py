@@ -2,9 +2,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from ball_and_box import HEIGHT, WIDTH, SmallScene
+
 from ss_flow.errors import InputError
 from ss_flow.tasks.geometry.cameras import camera_of, project
 from ss_flow.tasks.geometry.images import encode_png
@@ -18,8 +20,6 @@ from ss_flow.tasks.splat.views import (
     sample_depth,
     training_view,
 )
-
-pytest.importorskip("ss_flow.tasks.gaussians.trainer")
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +41,7 @@ def built(small: SmallScene, view: int, instance_id: int, scene: SceneViews | No
 def hidden_by_box(small: SmallScene, view: int) -> np.ndarray:
     """Pixels of the box behind which a part of the ball lies, by the ball's equation."""
     from ball_and_box import BALL, RADIUS
+
     from ss_flow.tasks.geometry.cameras import backproject
 
     camera = camera_of(small.cameras, view)
@@ -79,7 +80,8 @@ def test_where_the_box_hides_the_ball_the_ball_is_ignored_and_elsewhere_free(sma
         # What no view shows has no points; what they show must be found, up to a pixel of border.
         if hidden.sum() > 40:
             assert (ignored & hidden).sum() > 0.6 * hidden.sum()
-        assert (ignored & ~hidden).sum() <= 0.12 * (small.ids[view] == 2).sum() + 12
+        border = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        assert (ignored & ~border).sum() <= 4
     assert hidden_somewhere > 200
 
 
@@ -91,7 +93,9 @@ def test_the_paper_calls_hidden_pixels_empty(small):
 
 def test_the_background_is_unknown_behind_the_objects(small):
     made = built(small, 0, 0, fills_scene=True)
-    assert not made.free.any()
+    # At the foot of an object the floor in front of it is taken to go on for a pixel.
+    assert made.free.sum() <= 0.05 * (small.ids[0] != 0).sum()
+    assert built(small, 0, 0).free.sum() > made.free.sum()
     np.testing.assert_array_equal(whole(small, 0, made.inside, made.camera), small.ids[0] == 0)
 
 
@@ -118,7 +122,9 @@ def test_a_crop_sees_the_same_points_at_its_own_pixels(small):
     crop = crop_camera(full, small.ids[3] == 2, points, CropParams(margin_px=4, max_side=15))
     assert max(crop.width, crop.height) == 15
     inside, _ = project(points, crop)
-    assert (inside > -0.5).all() and (inside[:, 0] < crop.width + 0.5).all() and (inside[:, 1] < crop.height + 0.5).all()
+    assert (
+        (inside > -0.5).all() and (inside[:, 0] < crop.width + 0.5).all() and (inside[:, 1] < crop.height + 0.5).all()
+    )
 
 
 def test_the_depth_of_a_crop_is_the_depth_at_the_pixels_it_shows(small):

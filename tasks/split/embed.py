@@ -1,0 +1,18 @@
+"""The segmenter's embedding of a view: made once, and prompted by every later step."""
+
+from __future__ import annotations
+
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Frame
+from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.sam import Embedding, Sam
+
+
+@task(resources=Resources(cores=1, memory_mb=1500), uses=("onnxruntime", "onnx", "opencv-contrib-python-headless"))
+def embed(frame: Frame, *, model: Model) -> Embedding:
+    """The embedding of one photo (4 MB); it takes as long as some twenty prompts.
+
+    Raises InputError when the model's files are missing, damaged or other networks.
+    """
+    return Sam(model).encode(decode_rgb(frame))

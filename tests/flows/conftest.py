@@ -1,0 +1,58 @@
+"""One tiny capture and one run of it, for all the tests that only look."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from tiny_runs import Called, run_tiny, write_room
+
+
+@dataclass(frozen=True)
+class TinyRun:
+    """A finished run; its files are not to be changed."""
+
+    scene: Path
+    store: Path
+    out: Path
+    called: Called
+
+
+@pytest.fixture(autouse=True)
+def no_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """No network of this machine, and no store of its user, has a part in these tests."""
+    monkeypatch.setenv("SS_FLOW_MODELS", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user-cache"))
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.delenv("SS_FLOW_CACHE", raising=False)
+    yield
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The capture; not to be changed."""
+    return write_room(tmp_path_factory.mktemp("capture") / "room")
+
+
+@pytest.fixture(scope="session")
+def tiny(room: Path, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
+    """A run of it."""
+    base = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SS_FLOW_MODELS", "")
+        patch.setenv("XDG_CACHE_HOME", str(base / "user-cache"))
+        called = run_tiny(room, base / "store", out=base / "out")
+    assert called.code == 0, called.err
+    return TinyRun(room, base / "store", base / "out", called)
+
+
+@pytest.fixture
+def warm(tiny: TinyRun, tmp_path: Path) -> TinyRun:
+    """A copy of the run's store and output, to go on from."""
+    store, out = tmp_path / "store", tmp_path / "out"
+    shutil.copytree(tiny.store, store)
+    shutil.copytree(tiny.out, out)
+    return TinyRun(tiny.scene, store, out, tiny.called)

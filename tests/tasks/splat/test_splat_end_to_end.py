@@ -1,0 +1,143 @@
+"""Reconstruction, refinement and merging of the ray-cast scene, with a few seconds of training."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from ball_and_box import VIEWS, SmallScene
+
+from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.splat import merge as module
+from ss_flow.tasks.splat.merge import MergeParams, assemble, global_pass, merge_pair
+from ss_flow.tasks.splat.plan import PlanParams, plan
+from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
+from ss_flow.tasks.splat.refine import iou
+from ss_flow.tasks.splat.resolve import REFINED
+
+TRAIN = ReconstructParams(min_iterations=300, max_iterations=300, max_points=900)
+MERGE = MergeParams(min_iterations=300, max_iterations=300, global_iterations=200)
+
+
+@dataclass
+class Built:
+    scene: SmallScene
+    box: Gaussians
+    ball: Gaussians
+    background: Gaussians
+
+    @property
+    def views(self):
+        return self.scene.frames, self.scene.cameras, self.scene.depths
+
+
+@pytest.fixture(scope="module")
+def built() -> Built:
+    scene = SmallScene()
+    views = scene.frames, scene.cameras, scene.depths
+    return Built(scene, *(reconstruct(*views, scene.instance(i), params=TRAIN) for i in (1, 2, 0)))
+
+
+@pytest.fixture(scope="module")
+def merged(built: Built) -> Gaussians:
+    return merge_pair(*built.views, built.box, built.ball, built.scene.maps, params=MERGE, w_mask=0.05)
+
+
+@pytest.fixture(scope="module")
+def whole(built: Built, merged: Gaussians) -> Gaussians:
+    return global_pass(*built.views, assemble((merged, built.background)), built.scene.maps, params=MERGE)
+
+
+def psnr(a, b) -> float:
+    return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in vars(a))
+
+
+def test_an_instance_alone_shows_its_own_pixels_and_nothing_where_it_is_not(built):
+    for gaussians, instance_id in ((built.box, 1), (built.ball, 2)):
+        assert (gaussians.instance_id == instance_id).all()
+        for view in range(VIEWS):
+            rendering = render(gaussians, camera_of(built.scene.cameras, view))
+            own, floor = built.scene.ids[view] == instance_id, built.scene.ids[view] == 0
+            assert psnr(rendering.rgb[own], built.scene.images[view][own] / 255) > 18
+            assert rendering.alpha[own].mean() > 0.85
+            assert rendering.alpha[floor].mean() < 0.05
+
+
+def test_the_merged_scene_shows_the_photos_and_keeps_the_instances_apart(built, whole):
+    assert set(np.unique(whole.instance_id)) == {0, 1, 2}
+    assert (np.diff(whole.instance_id) >= 0).all()
+    for view in range(VIEWS):
+        rendering = render(whole, camera_of(built.scene.cameras, view), label_ids=[0, 1, 2])
+        assert psnr(rendering.rgb, built.scene.images[view] / 255) > 26
+        for label in (0, 1, 2):
+            target = built.scene.ids[view] == label
+            if target.sum() > 50:
+                assert iou(rendering.label_masks[label] >= 0.5, target) > 0.8
+
+
+def test_training_twice_gives_the_same_bytes_and_the_order_of_a_pair_does_not_matter(built, merged):
+    again = reconstruct(*built.views, built.scene.instance(2), params=TRAIN)
+    assert same(again, built.ball)
+    assert same(merge_pair(*built.views, built.ball, built.box, built.scene.maps, params=MERGE, w_mask=0.05), merged)
+
+
+def test_touching_instances_collide_and_are_planned_as_a_pair(built):
+    assert plan((built.ball, built.box), params=PlanParams(), round=0).pairs.tolist() == [[1, 0]]
+
+
+def test_a_weak_instance_and_one_without_masks_stay_as_their_points(built):
+    few = built.scene.instance(2)
+    points = reconstruct(*built.views, replace(few, weak=True), params=TRAIN)
+    np.testing.assert_array_equal(points.means, few.points[thin(few.points, 900)])
+    assert same(reconstruct(*built.views, built.scene.instance(2, views=()), params=TRAIN), points)
+    empty = replace(few, points=few.points[:0], colors=few.colors[:0], point_confidence=few.point_confidence[:0])
+    assert len(reconstruct(*built.views, empty, params=TRAIN)) == 0
+
+
+def test_retraining_happens_only_where_refinement_changed_a_mask(built):
+    instance = built.scene.instance(2)
+    assert retrain(*built.views, instance, built.ball, params=TRAIN) is built.ball
+    changed = replace(instance, prompted=np.where(instance.view == 3, REFINED, 0).astype(np.uint8))
+    result = retrain(*built.views, changed, built.ball, params=replace(TRAIN, retrain_share=0.1))
+    assert not same(result, built.ball) and len(result)
+
+
+def test_a_refinement_that_ruins_the_pair_is_undone_with_a_warning(built, monkeypatch):
+    trained = module.train
+
+    def ruined(*args, **options):
+        result = trained(*args, **options)
+        return replace(result, gaussians=replace(result.gaussians, opacity_logits=result.gaussians.opacity_logits - 9))
+
+    monkeypatch.setattr(module, "train", ruined)
+    with pytest.warns(UserWarning, match="Refining instances 1, 2 together was undone"):
+        result = merge_pair(*built.views, built.box, built.ball, built.scene.maps, params=MERGE, w_mask=0.05)
+    assert len(result) == len(built.box) + len(built.ball)
+    np.testing.assert_array_equal(result.means[: len(built.box)], built.box.means)
+
+
+def test_merging_with_nothing_or_without_views_is_the_plain_union(built):
+    nothing = module.NO_GAUSSIANS
+    assert same(merge_pair(*built.views, nothing, built.ball, built.scene.maps, params=MERGE, w_mask=0.05), built.ball)
+    unseen = tuple(replace(m, ids=np.zeros_like(m.ids)) for m in built.scene.maps)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        union = merge_pair(*built.views, built.box, built.ball, unseen, params=MERGE, w_mask=0.05)
+    assert same(union, assemble((built.ball, built.box)))
+    assert len(assemble(())) == 0
+
+
+def test_thinning_keeps_points_spread_over_the_whole_surface():
+    points = np.random.default_rng(0).random((20_000, 3)).astype(np.float32) * [1, 1, 0.01]
+    rows = thin(points.astype(np.float32), 500)
+    assert 250 < len(rows) <= 500 and (np.diff(rows) > 0).all()
+    cells = np.histogram2d(*points[rows, :2].T, bins=5, range=[[0, 1], [0, 1]])[0]
+    assert cells.min() > 5
