@@ -7,9 +7,9 @@ of the presets from their files, so that the page cannot drift from the code; a 
 from __future__ import annotations
 
 import ast
-import dataclasses
 import functools
 import importlib.util
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from ss_flow.flows.params import Params
 
 PAGE = Path(__file__).with_name("parameters.md")
 BEGIN, END = "<!-- table of parameters: written by make_parameters.py -->", "<!-- end of the table -->"
+HEAD = ("| parameter | default | presets | what it is |", "|---|---|---|---|")
 PRESETS = ("paper", "reference", "fast")
 HEADINGS = {
     "capture": "Capture: photos, poses, depth",
@@ -37,33 +38,37 @@ def table() -> str:
     for path, value in settings.leaves(params):
         if path[0] != part:
             part = path[0]
-            blocks += ["", f"### {HEADINGS[part]}", "", "| parameter | default | presets | what it is |", "|---|---|---|---|"]
+            blocks += [
+                "",
+                f"### {HEADINGS[part]}",
+                "",
+                "| parameter | default | presets | what it is |",
+                "|---|---|---|---|",
+            ]
         name = ".".join(path)
         others = [f"{preset} {_shown(flat[name])}" for preset, flat in presets.items() if flat[name] != value]
         owner = type(functools.reduce(getattr, path[:-1], params))
-        said = first_sentence(docstrings_of(owner)[path[-1]])
+        said = first_sentence(docstrings_of(owner.__module__, owner.__name__)[path[-1]])
         blocks.append(f"| `{name}` | {_shown(value)} | {'<br>'.join(others)} | {said} |")
     return "\n".join(blocks).strip() + "\n"
 
 
 @functools.cache
-def docstrings_of(kind: type) -> dict[str, str]:
-    """The docstring under each field of a dataclass. Raises KeyError for a field without one."""
-    spec = importlib.util.find_spec(kind.__module__)
+def docstrings_of(module: str, name: str) -> dict[str, str]:
+    """The docstring under each field of a dataclass that has one."""
+    spec = importlib.util.find_spec(module)
     assert spec is not None and spec.origin is not None
     tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
-    body = next(n.body for n in ast.walk(tree) if isinstance(n, ast.ClassDef) and n.name == kind.__name__)
-    said = {
+    body = next(n.body for n in ast.walk(tree) if isinstance(n, ast.ClassDef) and n.name == name)
+    return {
         field.target.id: " ".join(text.value.value.split())
-        for field, text in zip(body, body[1:], strict=False)
+        for field, text in itertools.pairwise(body)
         if isinstance(field, ast.AnnAssign)
         and isinstance(field.target, ast.Name)
         and isinstance(text, ast.Expr)
         and isinstance(text.value, ast.Constant)
         and isinstance(text.value.value, str)
     }
-    leaves = [f.name for f in dataclasses.fields(kind) if not dataclasses.is_dataclass(f.type)]
-    return {name: said.get(name, "") for name in leaves}
 
 
 def first_sentence(text: str) -> str:

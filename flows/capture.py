@@ -120,7 +120,9 @@ def _depths(
     if source == "mono" and monodepth is None:
         raise InputError("capture.depth=mono needs a monocular depth network; `ss-flow models list` names some.")
     swept = each(
-        frames, names=names, build=lambda frame: depth_steps.sweep(frames, cameras, view=frame.index, params=params.sweep)
+        frames,
+        names=names,
+        build=lambda frame: depth_steps.sweep(frames, cameras, view=frame.index, params=params.sweep),
     )
     agreed = depth_steps.agree(swept, cameras, params=params.agreement)
     if source == "mvs" or monodepth is None:

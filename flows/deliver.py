@@ -103,9 +103,7 @@ def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
     write_masks(folder / "masks_split", frames, split_maps)
     write_masks(folder / "masks", frames, maps)
     pictures = report_pictures(frames, cameras, several("depth"), split_maps, maps, scene)
-    (folder / "report.html").write_text(
-        report_html(document, pictures=pictures, instances=instances), encoding="utf-8"
-    )
+    (folder / "report.html").write_text(report_html(document, pictures=pictures, instances=instances), encoding="utf-8")
 
 
 def _content_of(folder: Path) -> str | None:

@@ -23,12 +23,18 @@ def demo_scene(out: Path, masks: Literal["auto", "truth", "degraded"], objects: 
     """
     folder = out / "scene"
     params = RoomParams(objects=objects, views=views, seed=seed)
-    recipe = {"room": asdict(params), "masks": masks, "code": digest(code_closure(generate) | code_closure(write_scene))}
+    recipe = {
+        "room": asdict(params),
+        "masks": masks,
+        "code": digest(code_closure(generate) | code_closure(write_scene)),
+    }
     if folder.exists():
         try:
             known = json.loads((folder / RECIPE).read_text())
         except (OSError, ValueError):
-            raise InputError(f"{folder} holds something else than a demo scene; name another folder with --out.") from None
+            raise InputError(
+                f"{folder} holds something else than a demo scene; name another folder with --out."
+            ) from None
         if known == recipe:
             return folder
     with replacing(folder) as filling:

@@ -142,7 +142,10 @@ def _converted(text: str, kind: Any) -> Any:
 
 def _check(value: Any, kind: Any, name: str) -> None:
     """Raises InputError when a value, or an item of it, is out of its declared range or choice."""
-    if typing.get_origin(kind) is tuple:
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
+        if value is not None:
+            _check(value, next(k for k in typing.get_args(kind) if k is not type(None)), name)
+    elif typing.get_origin(kind) is tuple:
         for item in value:
             _check(item, typing.get_args(kind)[0], name)
     elif typing.get_origin(kind) is typing.Annotated:

@@ -67,9 +67,7 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         "masks_split": masks_split,
     }
     if capture.truth is not None:
-        results["metrics_split"] = evaluate_masks(
-            masks_split, capture.truth, zero_is_void=params.evaluate.zero_is_void
-        )
+        results["metrics_split"] = evaluate_masks(masks_split, capture.truth, zero_is_void=params.evaluate.zero_is_void)
     results |= splat(capture, halved, networks, params)
     if capture.truth is not None:
         results["metrics_splat"] = evaluate_masks(

@@ -43,6 +43,12 @@ def code_closure(function: Callable[..., Any]) -> dict[str, str]:
     return dict(_closure(function.__module__, function.__qualname__))
 
 
+def forget() -> None:
+    """Read the sources anew the next time; a process reads each of them once."""
+    for remembered in (_closure, _digests, _needed, _module):
+        remembered.cache_clear()
+
+
 @functools.cache
 def _closure(module_name: str, function_name: str) -> tuple[tuple[str, str], ...]:
     followed = (*FOLLOWED, module_name.partition(".")[0]) if not module_name.startswith("ss_flow.") else FOLLOWED

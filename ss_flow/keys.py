@@ -50,7 +50,9 @@ def _flat(name: str, value: Any) -> dict[str, Any]:
     if isinstance(value, FileRef):
         return {name: value.digest}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        items: Any = ((f.name, getattr(value, f.name)) for f in dataclasses.fields(value) if f.metadata.get("key", True))
+        items: Any = (
+            (f.name, getattr(value, f.name)) for f in dataclasses.fields(value) if f.metadata.get("key", True)
+        )
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes) and any(map(_is_nested, value)):
         items = ((str(i), item) for i, item in enumerate(value))
     else:

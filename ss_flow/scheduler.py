@@ -111,11 +111,12 @@ class Scheduler:
     def producer(self, node: Node) -> str:
         """The step whose result a node's value is (seen through lists and expansions)."""
         while not isinstance(node, Call):
-            inner = self._expanded.get(node)
-            sources = [inner] if inner is not None else sources_of(node)
-            if not sources:
+            if isinstance(node, Gather) and node.rows:
+                node = node.rows[0][node.position]
+            elif sources := [self._expanded[node]] if node in self._expanded else sources_of(node):
+                node = sources[0]
+            else:
                 return node.step
-            node = sources[0]
         return node.step
 
     def _need(self, node: Node) -> None:

@@ -176,7 +176,7 @@ class PromptedMasks:
 
 @dataclass(frozen=True)
 class InstanceMasks:
-    """One instance after Split: its points and its view-consistent masks (Split&Splat, M~_{k,l}). Id 0 is the background."""
+    """One instance after Split: its points and view-consistent masks (Split&Splat, M~_{k,l}). Id 0 is background."""
 
     instance_id: int
     points: Float32

@@ -21,9 +21,20 @@ class StoreOptions:
     cache: Path | None = None
     """Folder of the store; by default SS_FLOW_CACHE, or else ss-flow in the user's cache folder."""
 
+    @property
+    def root(self) -> Path:
+        """The store's folder."""
+        return self.cache or Path(os.environ.get("SS_FLOW_CACHE", "") or default_cache()).expanduser()
+
+    def existing_store(self) -> Store:
+        """The store, to look into. Raises InputError when there is none, or it cannot be used."""
+        if not self.root.exists():
+            raise InputError(f"there is no store {self.root}; `ss-flow run SCENE` makes one, --cache names another.")
+        return self.open_store()
+
     def open_store(self) -> Store:
-        """Raises InputError when the folder cannot be used."""
-        root = self.cache or Path(os.environ.get("SS_FLOW_CACHE", "") or default_cache()).expanduser()
+        """The store, made where there is none. Raises InputError when the folder cannot be used."""
+        root = self.root
         try:
             store = Store(root.resolve())
             if not os.access(root, os.W_OK):
@@ -46,23 +57,25 @@ def file_digests(store: Store, *, verify: bool = False) -> FileDigests:
     return FileDigests(store.root / "files.json", verify=verify)
 
 
-def choose_model(kind: str, name: str, digests: FileDigests) -> catalogue.Model | None:
+def choose_model(kind: str, name: str, digests: FileDigests, *, wanted: bool = True) -> catalogue.Model | None:
     """The model of a kind to use.
 
     name: "auto" takes the first of the catalogue that is on this machine, or None (the stated fallback); "none" is the
     fallback; any other name must be on this machine. The weights are checked against the catalogue once a content.
+    wanted: whether the run has a use for it; otherwise only the name is checked.
     Raises InputError when a named model is not here, is of another kind, or its weights are damaged.
     """
     if name == "none":
+        return None
+    if name != "auto" and (known := catalogue.entry_of(name)).kind != kind:
+        raise InputError(f"model {name!r} is a {known.kind}, not a {kind}.")
+    if not wanted:
         return None
     if name == "auto":
         here = catalogue.available(kind)
         if not here:
             return None
         name = here[0].name
-    entry = catalogue.entry_of(name)
-    if entry.kind != kind:
-        raise InputError(f"model {name!r} is a {entry.kind}, not a {kind}.")
     model = catalogue.find(name, None, digests)
     if model is None:
         raise InputError(

@@ -34,7 +34,7 @@ class Status:
     """Where results are kept."""
 
     def run(self) -> int:
-        run = latest_run(self.store.open_store(), self.scene)
+        run = latest_run(self.store.existing_store(), self.scene)
         events = list(run.events())
         steps: dict[str, dict[str, Any]] = defaultdict(
             lambda: {"hit": 0, "finished": 0, "failed": 0, "skipped": 0, "running": 0, "seconds": 0.0}
@@ -84,7 +84,7 @@ class Why:
     """Where results are kept."""
 
     def run(self) -> int:
-        run = latest_run(self.store.open_store(), self.scene)
+        run = latest_run(self.store.existing_store(), self.scene)
         nodes = [e for e in run.events() if e["event"] in ("hit", "finished", "failed", "started")]
         asked = [n for n in nodes if _is_named(n, self.step)]
         if not asked:
@@ -105,7 +105,9 @@ class Why:
 
 
 def _is_named(node: dict[str, Any], name: str) -> bool:
-    return name in (node["label"], node["step"]) or node["label"].endswith(f".{name}") or node["step"].endswith(f".{name}")
+    return (
+        name in (node["label"], node["step"]) or node["label"].endswith(f".{name}") or node["step"].endswith(f".{name}")
+    )
 
 
 def _times(nodes: list[dict[str, Any]]) -> str:
@@ -137,7 +139,7 @@ class Graph:
     """Where results are kept."""
 
     def run(self) -> int:
-        run = latest_run(self.store.open_store(), self.scene)
+        run = latest_run(self.store.existing_store(), self.scene)
         counts: dict[str, int] = defaultdict(int)
         edges: dict[tuple[str, str, str], None] = {}
         for node in run.nodes():
@@ -165,10 +167,12 @@ class CacheList:
     """Where results are kept."""
 
     def run(self) -> int:
-        store = self.store.open_store()
+        store = self.store.existing_store()
         rows = []
         for node in latest_run(store, self.scene).nodes():
-            size = sum(f.stat().st_size for d in node["outputs"] for f in store.object_path(d).rglob("*") if f.is_file())
+            size = sum(
+                f.stat().st_size for d in node["outputs"] for f in store.object_path(d).rglob("*") if f.is_file()
+            )
             rows.append({k: node[k] for k in ("label", "key", "outputs", "seconds")} | {"bytes": size})
         if self.json:
             print(json.dumps(rows, indent=1))
@@ -199,7 +203,9 @@ class CacheShow:
     """Where results are kept."""
 
     def run(self) -> int:
-        store = self.store.open_store()
+        store = self.store.existing_store()
+        if self.png and (self.png.is_dir() or not next(p for p in self.png.absolute().parents if p.exists()).is_dir()):
+            raise InputError(f"{self.png} cannot be written; --png must name a file in a folder.")
         values = [store.get(digest) for digest in self._digests(store)]
         out = console(json=False)
         for value in values[:1] if len(values) > 8 else values:

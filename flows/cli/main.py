@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 # Tasks run side by side, one a core: a library that starts threads of its own only gets in their way. To be set
 # before the first of them is imported.
@@ -80,7 +81,7 @@ def main(arguments: list[str]) -> int:
         )
         return int(command.run())
     except InputError as error:
-        errors.print(f"[red]ss-flow:[/] {error}", markup=True)
+        errors.print(f"[red]ss-flow:[/] {escape(str(error))}")
         return BAD_INPUT
     except KeyboardInterrupt:
         errors.print("[yellow]ss-flow: interrupted; what was finished is kept, and the next run goes on from it.[/]")
@@ -90,7 +91,7 @@ def main(arguments: list[str]) -> int:
     except Exception as error:
         if os.environ.get("SS_FLOW_DEBUG"):
             raise
-        errors.print(f"[red]ss-flow:[/] failed: {type(error).__name__}: {error}", markup=False)
+        errors.print(f"[red]ss-flow:[/] failed: {escape(f'{type(error).__name__}: {error}')}")
         errors.print("Set SS_FLOW_DEBUG=1 to see where.")
         return FAILED
 

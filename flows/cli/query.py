@@ -37,8 +37,9 @@ class Query:
 
     def run(self) -> int:
         document = read_run(self.result)
+        instances = _read_json(self.result / "instances.json")
         own_store = self.store if self.store.cache else StoreOptions(Path(document["store"]))
-        store = own_store.open_store()
+        store = own_store.existing_store()
         descriptors = tuple(document["results"]["describe"])
         if not all(value in store for value in descriptors):
             raise InputError(f"the store {store.root} no longer holds the descriptors of {self.result}; run it again.")
@@ -61,7 +62,7 @@ class Query:
         if isinstance(value, Failure):
             raise value.error
         assert isinstance(value, str)
-        self._tell(store.get(value), json.loads((self.result / "instances.json").read_text()))
+        self._tell(store.get(value), instances)
         return 0
 
     def _tell(self, found: Any, instances: dict[str, Any]) -> None:
@@ -98,10 +99,18 @@ def _encoder_name(store: Store, descriptors: tuple[str, ...]) -> str:
 
 
 def read_run(folder: Path) -> dict[str, Any]:
-    """The document run.json of an output folder. Raises InputError when there is none."""
+    """The document run.json of an output folder. Raises InputError when there is none, or it is damaged."""
+    file = folder / RUN_FILE
+    if not file.is_file():
+        raise InputError(f"{folder} is not the output folder of a run: it has no {RUN_FILE}.")
+    document = _read_json(file)
+    if not {"store", "scene", "params", "results"} <= document.keys():
+        raise InputError(f"{file} is damaged: it lacks what a run writes; run the scene again.")
+    return document
+
+
+def _read_json(file: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads((folder / RUN_FILE).read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise InputError(f"{folder} is not the output folder of a run: it has no {RUN_FILE}.") from None
-    except ValueError as error:
-        raise InputError(f"{folder / RUN_FILE} is damaged ({error}); run the scene again.") from None
+        return dict(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{file} is damaged ({error}); run the scene again.") from None

@@ -96,6 +96,7 @@ class Demo:
     def run(self) -> int:
         from ss_flow.flows.demo import demo_scene
 
+        check_place(self.out / "result")
         scene = demo_scene(self.out, self.masks, self.objects, self.views, self.seed)
         params = settings.preset(Params(), self.options.preset)
         params = dataclasses.replace(params, evaluate=dataclasses.replace(params.evaluate, zero_is_void=False))
@@ -114,11 +115,9 @@ def run_scene(scene_path: Path, masks: Path | None, out: Path, params: Params, o
     store = options.store.open_store()
     digests = file_digests(store, verify=options.verify)
     networks = Networks(
-        segmenter=None if scene.ready_masks else choose_model("segmenter", params.split.segmenter, digests),
+        segmenter=choose_model("segmenter", params.split.segmenter, digests, wanted=not scene.ready_masks),
         encoder=choose_model("text-image", params.semantics.encoder, digests),
-        monodepth=choose_model("monodepth", params.capture.monodepth, digests)
-        if params.capture.depth == "mono"
-        else None,
+        monodepth=choose_model("monodepth", params.capture.monodepth, digests, wanted=params.capture.depth == "mono"),
     )
 
     def reference(path: Path) -> FileRef:
@@ -128,7 +127,7 @@ def run_scene(scene_path: Path, masks: Path | None, out: Path, params: Params, o
         held_out = scene.root / "held_out"
         extra: Capture | None = None
         if held_out.is_dir():
-            extra = capture(open_scene(held_out), reference, params.capture, None)
+            extra = capture(open_scene(held_out), reference, params.capture, networks.monodepth)
         results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
         if options.until is not None and options.until not in results:
             raise InputError(f"--until {options.until!r} names no step; there are {', '.join(results)}.")
@@ -193,10 +192,14 @@ def _tell(document: dict[str, Any], out_folder: Path | None, out: Console) -> No
         table = Table("measured against the ground truth", "mIoU", "mAcc(25)", "mAcc(50)", "PQ", box=None)
         for stage in ("split", "splat"):
             if row := document["metrics"].get(stage):
-                table.add_row(f"after {stage.title()}", *(f"{100 * row[k]:.1f}" for k in ("miou", "macc25", "macc50", "pq")))
+                table.add_row(
+                    f"after {stage.title()}", *(f"{100 * row[k]:.1f}" for k in ("miou", "macc25", "macc50", "pq"))
+                )
         out.print(table)
         if views := document["metrics"].get("novel_view"):
             out.print(f"views that were kept back: PSNR {views['psnr']:.2f} dB, SSIM {views['ssim']:.3f}")
     hits = sum(node["hit"] for node in document["nodes"])
     made = len(document["nodes"]) - hits
-    out.print(f"{document['status']}: {made} results computed, {hits} reused" + (f"; see {out_folder}" if out_folder else ""))
+    out.print(
+        f"{document['status']}: {made} results computed, {hits} reused" + (f"; see {out_folder}" if out_folder else "")
+    )

@@ -76,6 +76,8 @@ class ModelsVerify:
         found = [model for model in map(catalogue.find, names) if model]
         if self.name and not found:
             raise InputError(f"the weights of {self.name!r} are not on this machine.")
+        if not found:
+            console(json=False).print("no weights are on this machine")
         for model in found:
             catalogue.verify(model)
             console(json=False).print(f"{model.name}: as they should be")

@@ -59,7 +59,7 @@ def mono(
     """
     predicted = _predict(frame, model, params)
     if params.predicts == "depth":
-        predicted = np.float32(1) / np.maximum(predicted, np.float32(1e-6))
+        predicted = np.reciprocal(np.maximum(predicted, np.float32(1e-6)))
     relative, depth = _known_depths(frame, cameras, known, predicted, params)
     fit = fit_scale_shift(relative, 1 / depth, params.max_relative) if len(depth) >= params.min_points else None
     if fit is None or fit[2] < params.min_met:

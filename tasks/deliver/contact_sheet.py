@@ -12,6 +12,7 @@ from ss_flow.tasks.artifacts import UInt8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
 
 PAPER = (250, 250, 248)
 INK = "#22242a"

@@ -29,7 +29,9 @@ def check_place(folder: Path) -> None:
         raise InputError(f"{folder} holds something else than an earlier result; name another folder with --out.")
     parent = next(p for p in folder.absolute().parents if p.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError(f"{folder} cannot be written: {parent} is not writable; name another folder with --out.")
+        raise InputError(
+            f"{folder} cannot be written: {parent} is not a writable folder; name another folder with --out."
+        )
 
 
 @contextmanager

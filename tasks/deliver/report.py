@@ -35,6 +35,11 @@ _METRIC_NAMES = {
     "ap": "AP",
     "ap50": "AP @ 0.5",
     "ap25": "AP @ 0.25",
+    "hungarian_miou": "mIoU, one-to-one",
+    "over_segmentation": "Instances split up",
+    "under_segmentation": "Predictions that mix instances",
+    "num_truth": "True instances",
+    "num_predicted": "Predicted instances",
 }
 _STAGES = {"split": "After Split", "splat": "After Splat", "novel_view": "Novel views", "openvocab": "Open vocabulary"}
 _WIDEST = 960
@@ -147,17 +152,25 @@ def _metrics(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     loose = []
     for stage, values in metrics.items():
         if isinstance(values, Mapping):
-            figures = [(_METRIC_NAMES.get(name, name), _figure(name, value)) for name, value in values.items()]
-            groups.append({"stage": _STAGES.get(stage, stage), "figures": figures})
+            figures = [(_words(name), _figure(name, value)) for name, value in values.items()]
+            groups.append({"stage": _STAGES.get(stage) or _words(stage), "figures": figures})
         else:
-            loose.append((_METRIC_NAMES.get(stage, stage), _figure(stage, values)))
+            loose.append((_words(stage), _figure(stage, values)))
     return groups + ([{"stage": "Measured", "figures": loose}] if loose else [])
+
+
+def _words(name: str) -> str:
+    """What a metric is called: its field's name for it, or its key as words."""
+    text = name.replace("_", " ")
+    return _METRIC_NAMES.get(name, text[:1].upper() + text[1:])
 
 
 def _figure(name: str, value: object) -> str:
     if not isinstance(value, int | float):
         return "–" if value is None else str(value)
-    return f"{value:.2f} dB" if name == "psnr" else f"{value:.3f}" if isinstance(value, float) else str(value)
+    if name.startswith("num_") or isinstance(value, int):
+        return f"{value:.0f}"
+    return f"{value:.2f} dB" if name == "psnr" else f"{value:.3f}"
 
 
 def _steps(nodes: list[Mapping[str, Any]]) -> list[dict[str, Any]]:

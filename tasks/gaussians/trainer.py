@@ -50,9 +50,9 @@ class TrainParams:
     """Steps, one view each."""
     sh_degree: HarmonicsDegree = 3
     """Highest degree of the colours; 0 is used below 2,000 iterations, otherwise one more every 1,000 steps."""
-    position_lr: Positive = 1.6e-4
+    position_lr: NonNegative = 1.6e-4
     """Learning rate of the means at the start, times the extent."""
-    position_lr_final: Positive = 1.6e-6
+    position_lr_final: NonNegative = 1.6e-6
     """Learning rate of the means at the last step, times the extent; the decay is exponential."""
     color_lr: NonNegative = 1e-2
     """Learning rate of the colours (four times that of 3DGS, which trains longer); a twentieth above degree 0."""
@@ -66,9 +66,9 @@ class TrainParams:
     """Share of 1 - SSIM in the colour loss; the rest is L1."""
     alpha_weight: NonNegative = 0.5
     """Weight of the mean absolute error of alpha."""
-    depth_weight_start: Positive = 1.0
+    depth_weight_start: NonNegative = 1.0
     """Weight of the relative depth error at the first step."""
-    depth_weight_final: Positive = 0.01
+    depth_weight_final: NonNegative = 0.01
     """Weight of the relative depth error at the last step; the decay is exponential."""
     mask_weight: NonNegative = 0.0
     """Weight of the mask loss of merging (spec A25)."""

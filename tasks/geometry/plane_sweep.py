@@ -178,7 +178,7 @@ def smooth_cost(cost: Float32, guide: Float32, small_step: float, large_step: fl
             _add_paths(cost.transpose(1, 0, 2), guide.T, total.transpose(1, 0, 2), du, 0, small_step, large_step)
         else:
             _add_paths(cost, guide, total, dv, du, small_step, large_step)
-    return total / 8
+    return total / np.float32(8)
 
 
 def _add_paths(
@@ -228,8 +228,8 @@ def cheapest_depth(cost: Float32, inverse_depths: Float64) -> tuple[Float32, Flo
     elsewhere = np.full(best.shape, np.inf, np.float32)
     for d in range(planes):
         np.minimum(elsewhere, np.where(np.abs(best - d) > 2, cost[:, :, d], np.inf), out=elsewhere)
-    lowest = at(best)
-    return depth.astype(np.float32), (elsewhere - lowest) / np.maximum(elsewhere, 1e-6)
+    whole: Float32 = np.maximum(elsewhere, np.float32(1e-6))
+    return depth.astype(np.float32), (elsewhere - at(best)) / whole
 
 
 def agreeing_depth(

@@ -5,50 +5,58 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, Int32, LabelMap
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import concatenate, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainParams, TrainView, train
+from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
+from ss_flow.tasks.splat.collisions import group_box
 from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
-from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, training_view
+from ss_flow.tasks.splat.views import IGNORED, NONE_OF_MINE, CropParams, SceneViews, training_view
 
 
 @dataclass(frozen=True)
 class MergeParams:
     """How merged Gaussians are refined together, without densification."""
 
-    iterations_per_view: int = 10
+    iterations_per_view: Count = 10
     """Training steps of a pair for each view that sees it, within the two limits below."""
-    min_iterations: int = 100
+    min_iterations: Count = 100
     """Fewest steps of a pair."""
-    max_iterations: int = 300
+    max_iterations: Count = 300
     """Most steps of a pair."""
-    global_iterations: int = 1000
+    global_iterations: Natural = 1000
     """Steps of the last pass over the whole scene; 0 leaves it out."""
-    global_mask_weight: float = 0.25
+    global_mask_weight: NonNegative = 0.25
     """w_mask of the last pass."""
     reset_opacity: bool = True
     """Whether a pair starts from opacities of at most 0.01."""
-    prune_opacity: float = 0.005
+    prune_opacity: Fraction = 0.005
     """Fainter Gaussians are dropped in the end."""
-    prune_contribution: float = 1 / 255
+    prune_contribution: Fraction = 1 / 255
     """Gaussians that add no more than this to any pixel of any view are dropped in the end."""
-    sh_degree: int = 3
+    sh_degree: HarmonicsDegree = 3
     """Highest degree of the colour's spherical harmonics."""
-    background: str = "random"
+    background: Literal["random", "black"] = "random"
     """Colour behind the Gaussians: "random" in each step, or "black"."""
     ignore_occluded: bool = True
     """Whether pixels where something else is in front are left out; False calls them empty."""
-    guard_iou: float = 0.02
+    local: bool = True
+    """Whether only what is inside the box of the smaller group is refined; False refines both groups whole."""
+    collision_margin: NonNegative = 0.05
+    """By how much that box is widened on every side, as a share of its diagonal."""
+    guard_iou: Fraction = 0.02
     """A refinement that lowers the mean IoU of the masks by more than this is undone."""
-    guard_psnr: float = 1.0
+    guard_psnr: NonNegative = 1.0
     """A refinement that lowers the PSNR by more than this, in dB, is undone."""
-    guard_views: int = 12
+    guard_views: Count = 12
     """Views that the two are measured on."""
     crop: CropParams = CropParams()
     """The part of each view that is rendered."""
@@ -87,11 +95,13 @@ def merge_pair(
     tau_depth: float = 0.02,
     tau_relative: float = 0.0,
 ) -> Gaussians:
-    """Two groups as one, refined together in the views that see either (Split&Splat, Eqs. of l and l_mask).
+    """Two groups as one, refined together where they collide (Split&Splat, Eqs. of l and l_mask).
 
-    Opacities start from min(alpha, 0.01), so that what only explained an occluder does not come back (spec A23). The
-    loss is l_RGB + w_mask * l_mask with the masks of all instances composited jointly (spec A25, A26). When refinement
-    makes masks or colours worse than `params` allows, the plain union comes back, with a warning (spec P4).
+    What collides are the Gaussians inside the box of the smaller group, and the instances they belong to; all else is
+    kept as it is, and with it the time that a merge takes grows with the smaller group, not with the scene. Opacities
+    of what collides start from min(alpha, 0.01), so that what only explained an occluder does not come back (spec A23).
+    The loss is l_RGB + w_mask * l_mask with the masks of those instances composited jointly (spec A25, A26). When
+    refinement makes masks or colours worse than `params` allows, the plain union comes back, with a warning (spec P4).
 
     masks: exclusive label maps of all views, in the order of `cameras`. The order of a and b does not matter.
     """
@@ -99,32 +109,66 @@ def merge_pair(
     if len(parts) < 2:
         return parts[0] if parts else NO_GAUSSIANS
     union = concatenate(parts)
-    ids = np.unique(union.instance_id)
+    low, high = collision_box(min(parts, key=len), params.collision_margin)
+    reach = ((union.means >= low) & (union.means <= high)).all(axis=1) | (not params.local)
+    near = np.isin(union.instance_id, union.instance_id[reach])
+    colliding, reach = select(union, near), reach[near]
+    ids = np.unique(colliding.instance_id)
     scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
-    surface = select(union, union.opacity_logits >= np.log(0.1 / 0.9)).means
-    surface = surface if len(surface) > 1 else union.means
-    views = _views(scene, masks, ids, surface, params)
+    views = _views(
+        scene, masks, ids, _surface(colliding), params, others=union.instance_id, around=colliding.means[reach]
+    )
     if not views:
         return union
+    started = _faded(colliding, reach) if params.reset_opacity else colliding
     settings = TrainParams(
         iterations=params.iterations(len(views)),
         sh_degree=params.sh_degree,
         background=params.background,
         densify=False,
         mask_weight=w_mask,
-        reset_opacity=params.reset_opacity,
-        prune_opacity=params.prune_opacity,
-        prune_contribution=params.prune_contribution,
+        prune_opacity=0.0,
+        prune_contribution=0.0,
     )
-    refined = train(
-        union,
+    trained = train(
+        started,
         views,
         params=settings,
-        extent=box_diagonal(surface),
+        extent=box_diagonal(_surface(colliding)),
         seed=int(ids[0]),
         label_ids=ids.tolist(),
     ).gaussians
-    return _guarded(union, refined, views, ids, params)
+    refined = select(trained, ~reach | _shows(trained, views, params))
+    merged = _guarded(colliding, refined, views, ids, params)
+    return concatenate([select(union, ~near), merged]) if not near.all() else merged
+
+
+def collision_box(group: Gaussians, margin: float) -> Float64:
+    """The box of a group's solid centres, widened on every side by `margin` of its diagonal: [2, 3], world."""
+    low, high = group_box(group, min_opacity=0.1, quantile=0.005)
+    wider = margin * float(np.linalg.norm(high - low))
+    return np.array([low - wider, high + wider])
+
+
+def _surface(gaussians: Gaussians) -> Float32:
+    """Centres of the Gaussians that are not faint; of all where hardly any is left."""
+    solid = gaussians.means[gaussians.opacity_logits >= np.log(0.1 / 0.9)]
+    return solid if len(solid) > 1 else gaussians.means
+
+
+def _faded(gaussians: Gaussians, rows: Bool) -> Gaussians:
+    """With opacities of at most 0.01 in these rows (Kerbl et al. 2023; spec A23)."""
+    faded = np.minimum(gaussians.opacity_logits, np.float32(np.log(0.01 / 0.99)))
+    return replace(gaussians, opacity_logits=np.where(rows, faded, gaussians.opacity_logits))
+
+
+def _shows(gaussians: Gaussians, views: Sequence[TrainView], params: MergeParams) -> Bool:
+    """[N] which Gaussians are worth keeping (spec row 37)."""
+    strongest = np.zeros(len(gaussians), np.float32)
+    for view in views:
+        np.maximum(strongest, render(gaussians, view.camera).max_contribution, out=strongest)
+    opaque = gaussians.opacity_logits >= np.log(params.prune_opacity / (1 - params.prune_opacity))
+    return opaque & (strongest >= params.prune_contribution)
 
 
 @task(name="splat.assemble")
@@ -205,19 +249,28 @@ def _views(
     surface: np.ndarray,
     params: MergeParams,
     *,
+    others: Int32 | None = None,
+    around: Float32 | None = None,
     whole: bool = False,
 ) -> list[TrainView]:
-    """The views that see any of the instances; `whole`: with no pixel outside them, and the entire photo."""
+    """The views that see any of the instances.
+
+    others: ids of instances that are not trained, whose pixels say nothing. around: [N, 3] what the crops show, where
+    that is not all of the instances. whole: the entire photos, in which no pixel is without an instance.
+    """
     # On whole photos, what has no Gaussians of its own can only be explained by the background.
     rest = 0 if whole and ids[0] == 0 else NONE_OF_MINE
     channel_of = np.full(np.iinfo(np.uint16).max + 1, rest, np.int32)
+    if others is not None:
+        channel_of[others] = IGNORED
     channel_of[ids] = np.arange(len(ids))
     spacing = nearest_spacing(surface)
     crop = replace(params.crop, margin_px=int(scene.cameras.sizes.max())) if whole else params.crop
     views = []
     for view, label_map in enumerate(masks):
         channels = channel_of[label_map.ids]
-        if (channels >= 0).any():
+        in_sight = around is None or len(pixels_in_view(around, camera_of(scene.cameras, view))[0]) > 0
+        if in_sight and (channels >= 0).any():
             built = training_view(
                 scene,
                 view,
@@ -227,6 +280,7 @@ def _views(
                 crop=crop,
                 ignore_occluded=params.ignore_occluded and not whole,
                 with_ids=True,
+                around=around,
             )
             views.append(built)
     return [view for view in views if view.inside.any()]

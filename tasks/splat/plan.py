@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.ranges import Fraction, NonNegative, Range
 from ss_flow.tasks.splat.collisions import MergePlan, collision_matrix, group_box, match_pairs
 
 
@@ -15,13 +17,13 @@ from ss_flow.tasks.splat.collisions import MergePlan, collision_matrix, group_bo
 class PlanParams:
     """When two groups of instances count as colliding."""
 
-    min_opacity: float = 0.1
+    min_opacity: Fraction = 0.1
     """Fainter Gaussians do not widen the box of their group."""
-    bbox_quantile: float = 0.005
+    bbox_quantile: Annotated[float, Range(0.0, 0.5, open_above=True)] = 0.005
     """Share of the centres trimmed off at both ends of each axis of the box; 0 in the paper."""
-    min_score: float = 0.0
+    min_score: Fraction = 0.0
     """Pairs that overlap by no more than this are left apart."""
-    mask_weights: tuple[float, ...] = (0.05, 0.15, 0.25)
+    mask_weights: tuple[NonNegative, ...] = (0.05, 0.15, 0.25)
     """w_mask of each round; the last one holds for all further rounds."""
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame, Gaussians
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.ranges import Count, HarmonicsDegree, NonNegative, Positive
 from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
 from ss_flow.tasks.splat.resolve import REFINED
 from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask_of, training_view
@@ -22,33 +23,33 @@ from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask
 class ReconstructParams:
     """How an instance is trained."""
 
-    iterations_per_view: int = 20
+    iterations_per_view: Count = 20
     """Training steps for each view of the instance, within the two limits below."""
-    min_iterations: int = 300
+    min_iterations: Count = 300
     """Fewest steps."""
-    max_iterations: int = 1000
+    max_iterations: Count = 1000
     """Most steps."""
-    retrain_share: float = 0.5
+    retrain_share: NonNegative = 0.5
     """Steps of training after refinement, as a share of the first training's."""
     warm_start: bool = True
     """Whether training after refinement goes on from the Gaussians of the first, or starts over."""
-    sh_degree: int = 3
+    sh_degree: HarmonicsDegree = 3
     """Highest degree of the colour's spherical harmonics; they stay at 0 below 2000 steps."""
-    max_points: int = 10_000
+    max_points: Count = 10_000
     """Most points that training starts from; more are thinned out."""
-    max_gaussians: int = 30_000
+    max_gaussians: Count = 30_000
     """Most Gaussians of an instance."""
-    background_scale: float = 2.0
+    background_scale: Positive = 2.0
     """Factor on both limits for the background."""
-    background: str = "random"
+    background: Literal["random", "black"] = "random"
     """Colour behind the Gaussians: "random" in each step, or "black" as in the paper."""
     ignore_occluded: bool = True
     """Whether pixels where something else is in front are left out; False calls them empty, as in the paper."""
     densify: bool = True
     """Whether Gaussians are split and cloned where the picture is still wrong."""
-    depth_weight_start: float = 1.0
+    depth_weight_start: NonNegative = 1.0
     """Weight of the depth loss at the first step."""
-    depth_weight_final: float = 0.01
+    depth_weight_final: NonNegative = 0.01
     """Weight of the depth loss at the last step."""
     crop: CropParams = CropParams()
     """The part of each view that is rendered."""
@@ -77,18 +78,16 @@ def reconstruct(
     """Gaussians of one instance, or of the background (id 0), from its own pixels alone (spec P1, A28).
 
     Training starts from the labelled points and sees, in the views that have a mask, the three kinds of pixels that
-    `training_view` tells apart. A weak instance, or one without masks, stays as its points. An instance without points
-    gives no Gaussians.
+    `training_view` tells apart. A weak instance, and one without masks or points, gives no Gaussians: it is kept as
+    points alone (spec row 21), and the last pass over the whole scene lets the background fill its place.
 
     frames, depths: all views of the scene, in the order of `cameras`. tau_depth: in scene units; tau_relative: as a
     fraction of the depth; the larger of the two says when one surface is in front of another.
     Raises InputError when a frame's size is not that of the masks.
     """
-    if not len(instance.points):
+    if instance.weak or not len(instance.points) or not len(instance.view):
         return NO_GAUSSIANS
     initial = _from_points(instance, params)
-    if instance.weak or not len(instance.view):
-        return initial
     scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
     return _trained(scene, instance, initial, params, params.iterations(len(instance.view)))
 
@@ -171,7 +170,7 @@ def _trained(
     result = train(
         initial,
         views,
-        params=TrainParams(**_settings(params, iterations, fills_scene)),
+        params=_settings(params, iterations, fills_scene),
         extent=max(box_diagonal(surface), spacing),
         seed=instance.instance_id,
     )
@@ -183,14 +182,14 @@ def _trained(
     return result.gaussians
 
 
-def _settings(params: ReconstructParams, iterations: int, fills_scene: bool) -> Mapping[str, object]:
+def _settings(params: ReconstructParams, iterations: int, fills_scene: bool) -> TrainParams:
     limit = params.max_gaussians * (params.background_scale if fills_scene else 1)
-    return {
-        "iterations": iterations,
-        "sh_degree": params.sh_degree,
-        "background": params.background,
-        "densify": params.densify,
-        "max_gaussians": round(limit),
-        "depth_weight_start": params.depth_weight_start,
-        "depth_weight_final": params.depth_weight_final,
-    }
+    return TrainParams(
+        iterations=iterations,
+        sh_degree=params.sh_degree,
+        background=params.background,
+        densify=params.densify,
+        max_gaussians=round(limit),
+        depth_weight_start=params.depth_weight_start,
+        depth_weight_final=params.depth_weight_final,
+    )

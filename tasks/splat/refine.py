@@ -17,6 +17,7 @@ from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive
 from ss_flow.tasks.splat.groups import box_diagonal, rasterizer, scene_views
 from ss_flow.tasks.splat.resolve import REFINED
 from ss_flow.tasks.splat.views import CropParams, SceneViews, crop_camera, mask_of, sample_depth
@@ -29,25 +30,25 @@ Prompt = Callable[[Float32], tuple[Bool, float]]
 class RefineParams:
     """How masks are compared and replaced."""
 
-    prompts: int = 5
+    prompts: Count = 5
     """Points that the segmenter is asked with."""
-    prompt_alpha: float = 0.3
+    prompt_alpha: NonNegative = 0.3
     """How much a prompt's distance to the mean counts against it; 0 in the paper."""
     drop_hull: bool = True
     """Whether points at the corners of the visible region are left out as prompts; False in the paper."""
-    min_visible: int = 10
+    min_visible: Count = 10
     """Fewest visible Gaussians of a view that is looked at."""
-    alpha_threshold: float = 0.5
+    alpha_threshold: Fraction = 0.5
     """Accumulated alpha from which a pixel belongs to the rendered mask."""
-    min_opacity: float = 0.05
+    min_opacity: Fraction = 0.05
     """Fainter Gaussians are not rendered."""
-    max_scale: float = 0.5
+    max_scale: Positive = 0.5
     """Gaussians longer than this share of the instance's box diagonal are not rendered."""
-    tau_iou: float = 0.5
+    tau_iou: Fraction = 0.5
     """IoU with the rendered mask from which a mask is added to a view that had none; 0.95 in the paper."""
-    min_support: float = 0.7
+    min_support: Fraction = 0.7
     """Without a segmenter: share of the rendered mask that the view's depth must confirm for it to be added."""
-    min_views: int = 2
+    min_views: Count = 2
     """An instance with masks in fewer views stays weak."""
 
 
@@ -87,9 +88,10 @@ def refine(
     segmenter's agrees better with M^gs; where it has none, the segmenter's is added when its IoU with M^gs exceeds
     `tau_iou`.
 
-    model: the segmenter; embeddings: its embeddings of all views, none without a segmenter. Without one (None) no mask is replaced; where a mask is missing, M^gs itself is added when
-    the view's depth confirms at least `min_support` of it. New masks are marked as refined (2) in `prompted`. The
-    background (id 0) and an instance without Gaussians come back as they are.
+    model: the segmenter; embeddings: its embeddings of all views, none without a segmenter. Without one (None) no mask
+    is replaced; where a mask is missing, M^gs itself is added when the view's depth confirms at least `min_support` of
+    it. New masks are marked as refined (2) in `prompted`. The background (id 0) and an instance without Gaussians come
+    back as they are.
     """
     if instance.instance_id == 0 or not len(gaussians):
         return instance

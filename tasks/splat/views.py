@@ -13,6 +13,7 @@ from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view
 from ss_flow.tasks.geometry.fusion import depth_at
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
+from ss_flow.tasks.ranges import Count, Natural
 
 if TYPE_CHECKING:
     from ss_flow.tasks.gaussians.trainer import TrainView
@@ -47,9 +48,9 @@ class SceneViews:
 class CropParams:
     """Which part of a view is used, and how large."""
 
-    margin_px: int = 16
+    margin_px: Natural = 16
     """Pixels of the photo added on every side of the box around the instance."""
-    max_side: int = 480
+    max_side: Count = 480
     """Longest side of the crop, pixels; larger crops are scaled down."""
 
 
@@ -130,6 +131,7 @@ def training_view(
     ignore_occluded: bool = True,
     fills_scene: bool = False,
     with_ids: bool = False,
+    around: Float32 | None = None,
 ) -> TrainView:
     """One view of a group of instances (spec P1).
 
@@ -137,7 +139,8 @@ def training_view(
     where something lies in front of the group's surface, where a depth needed to tell is unknown, or where the frame
     is masked out.
 
-    channels: [H, W] index of the group's instance at each pixel, -2 where there is none. points: [N, 3] the group's
+    channels: [H, W] index of the group's instance at each pixel, -2 where there is none, -1 where the pixel says
+    nothing. around: [M, 3] the part of the group that the crop shows, in place of all of it. points: [N, 3] the group's
     surface, `spacing` apart. ignore_occluded: False calls every pixel outside the masks free, as in the paper.
     fills_scene: the group is the background, which goes on unseen behind all else: only pixels that look through its
     surface are free.
@@ -153,7 +156,10 @@ def training_view(
             f"Frame {frame.name} is {frame.width} x {frame.height} pixels and its masks are "
             f"{channels.shape[1]} x {channels.shape[0]}; both must have one size."
         )
-    camera = crop_camera(full, channels >= 0, points, crop)
+    if around is None:
+        camera = crop_camera(full, channels >= 0, points, crop)
+    else:
+        camera = crop_camera(full, np.zeros(channels.shape, bool), around, crop)
     column, row = _pixels_of_crop(full, camera)
     x0, y0, width, height = _box(full, camera)
     photo = decode_rgb(frame)[y0 : y0 + height, x0 : x0 + width]
@@ -164,7 +170,7 @@ def training_view(
     depth = sample_depth(scene.depths[view], full, camera)
 
     inside = (ids >= 0) & valid
-    free = ~inside & valid
+    free = ~inside & valid & (ids != IGNORED)
     if ignore_occluded:
         surface = propagated_depth(points, camera, spacing)
         tolerance = np.maximum(scene.tau, scene.tau_relative * surface)
@@ -175,7 +181,7 @@ def training_view(
             free &= (surface == 0) | (known & (depth + tolerance >= surface))
     return TrainView(
         camera=camera,
-        image=photo.astype(np.float32) / 255,
+        image=photo.astype(np.float32) / np.float32(255),
         inside=inside,
         free=free,
         depth=np.where(inside, depth, 0).astype(np.float32),

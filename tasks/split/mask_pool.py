@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, Int32, MaskSet
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, MaskSet
 
 
 def canonical_order(masks: Bool) -> Int32:

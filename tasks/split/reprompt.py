@@ -47,9 +47,9 @@ def reprompt(
 ) -> PromptedMasks:
     """Masks for the labels that are visible in a view but that none of its masks shows (spec S5).
 
-    embedding, visibility, masks: those of the frame. selection: how the view's own masks are matched to labels, as in the
-    re-projection. Each missing label gets one mask, prompted at points spread over it. Whether
-    the mask agrees with the label is for `split.reproject` to judge. Raises InputError when the model cannot be opened.
+    embedding, visibility, masks: those of the frame. selection: how the view's own masks are matched to labels, as in
+    the re-projection. Each missing label gets one mask, prompted at points spread over it. Whether the mask agrees with
+    the label is for `split.reproject` to judge. Raises InputError when the model cannot be opened.
     """
     painted = paint_labels(visibility, labels.label)
     shown = select_masks(painted, masks, selection)

@@ -106,7 +106,8 @@ class _Candidates:
 def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model: Model) -> MaskSet:
     """The masks that Segment Anything finds in one view (Split&Splat, M_k; spec S1).
 
-    embedding: the frame's, by the same model. Pixels that the frame marks as not valid belong to no mask. The masks come in canonical order: area descending.
+    embedding: the frame's, by the same model. Pixels that the frame marks as not valid belong to no mask. The masks
+    come in canonical order: area descending.
     Raises InputError when the model's files are missing, damaged or other networks.
     """
     sam = Sam(model)
@@ -131,9 +132,9 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
     masks = sam.upsample(embedding, found.logits) > thresholds[:, None, None]
     masks &= valid
     if params.merge == "union":
-        rows = np.flatnonzero(_large_enough(masks, params))
-        masks, origin = merge_union(masks[rows], found.grid[rows], params.duplicate_overlap, params.union_overlap)
-        found = found[rows[origin].astype(np.int32)]
+        large = np.flatnonzero(_large_enough(masks, params)).astype(np.int32)
+        masks, origin = merge_union(masks[large], found.grid[large], params.duplicate_overlap, params.union_overlap)
+        found = found[large[origin]]
     rows = np.flatnonzero(_large_enough(masks, params)).astype(np.int32)
     rows = rows[canonical_order(masks[rows])]
     masks, found = masks[rows], found[rows]
@@ -191,7 +192,8 @@ def _settled(points: Float64, found: _Candidates, params: SegmentParams, frame: 
 
 def _box_iou(masks: Bool) -> Float32:
     """IoU of the bounding boxes of masks [N, h, w], none empty: [N, N]."""
-    rows, columns = masks.any(axis=2), masks.any(axis=1)
+    rows: Bool = np.logical_or.reduce(masks, axis=2)
+    columns: Bool = np.logical_or.reduce(masks, axis=1)
     low = np.stack([columns.argmax(axis=1), rows.argmax(axis=1)], axis=1)
     high = np.stack(
         [columns.shape[1] - columns[:, ::-1].argmax(axis=1), rows.shape[1] - rows[:, ::-1].argmax(axis=1)], axis=1

@@ -25,7 +25,8 @@ class TinyRun:
 def no_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """No network of this machine, and no store of its user, has a part in these tests."""
     monkeypatch.setenv("SS_FLOW_MODELS", "")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user-cache"))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home/.cache"))
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.delenv("SS_FLOW_CACHE", raising=False)
     yield
@@ -43,7 +44,7 @@ def tiny(room: Path, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
     base = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SS_FLOW_MODELS", "")
-        patch.setenv("XDG_CACHE_HOME", str(base / "user-cache"))
+        patch.setenv("HOME", str(base))
         called = run_tiny(room, base / "store", out=base / "out")
     assert called.code == 0, called.err
     return TinyRun(room, base / "store", base / "out", called)

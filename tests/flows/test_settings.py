@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import functools
+import typing
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -76,6 +78,47 @@ def test_a_bad_assignment_is_refused_in_one_sentence(text, sentence):
 @pytest.mark.parametrize("name", ["default", "paper", "reference", "fast"])
 def test_every_preset_names_only_parameters_that_exist(name):
     settings.preset(Params(), name)
+
+
+@pytest.mark.parametrize("name", ["default", "paper", "reference", "fast"])
+def test_every_value_of_a_preset_is_in_its_range(name):
+    params = settings.preset(Params(), name)
+    assert settings.apply(params, [f"{path}={value}" for path, value in settings.flat(params).items()]) == params
+
+
+def test_every_number_declares_its_range():
+    free = []
+    for path, _ in settings.leaves(Params()):
+        owner = functools.reduce(getattr, path[:-1], Params())
+        if {int, float} & parts(typing.get_type_hints(type(owner), include_extras=True)[path[-1]]):
+            free.append(".".join(path))
+    assert free == ["split.segment.mask_threshold"]
+
+
+def parts(kind):
+    """The types that a type is made of, down to those that declare something."""
+    inner = () if typing.get_origin(kind) in (None, typing.Annotated) else typing.get_args(kind)
+    return {kind}.union(*map(parts, inner)) if typing.get_origin(kind) is not typing.Literal else set()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("split.propagate.passes=0", "out of range: 0; it must be at least 1"),
+        ("split.propagate.lambda_init=1", "greater than 0 and less than 1"),
+        ("split.propagate.tau_label=1.5", "out of range: 1.5; it must be between 0 and 1"),
+        ("split.segment.stability=0.9,0.9,0.9,1.1", "out of range: 1.1"),
+        ("split.rgbd.crease=200", "greater than 0 and at most 180"),
+        ("capture.sfm.matching=all", "it takes 'auto' or 'exhaustive' or 'sequential'"),
+        ("capture.ingest.jpeg_quality=101", "between 0 and 100"),
+        ("capture.sweep.planes=2", "at least 3"),
+        ("splat.plan.bbox_quantile=0.5", "at least 0 and less than 0.5"),
+        ("splat.reconstruct.background=white", "it takes 'random' or 'black'"),
+    ],
+)
+def test_a_value_that_a_step_cannot_take_is_refused_before_any_work(text, sentence):
+    with pytest.raises(InputError, match=sentence):
+        settings.apply(Params(), [text])
 
 
 def test_an_unknown_preset_is_refused_with_the_known_ones():

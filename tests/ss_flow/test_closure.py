@@ -23,8 +23,7 @@ def package(tmp_path, monkeypatch):
         for name in [n for n in sys.modules if n.partition(".")[0] == "probe"]:
             del sys.modules[name]
         importlib.invalidate_caches()
-        closure._module.cache_clear()
-        closure._closure.cache_clear()
+        closure.forget()
         return closure.code_closure(importlib.import_module("probe.step").run)
 
     return closure_of

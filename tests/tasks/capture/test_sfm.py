@@ -7,7 +7,7 @@ from generated_views import views
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, Frame
-from ss_flow.tasks.capture.sfm import SfmParams, registered, sfm
+from ss_flow.tasks.capture.sfm import registered, sfm
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
 
 EYES = [(x, y, 0.1 * x) for x in (-0.9, -0.3, 0.3, 0.9) for y in (-0.3, 0.3)]
@@ -79,11 +79,6 @@ def test_photos_that_do_not_overlap_are_refused_with_their_number(scene, tmp_pat
 def test_two_photos_are_too_few(scene):
     with pytest.raises(InputError, match="at least 3"):
         sfm(scene[0][:2])
-
-
-def test_an_unknown_kind_of_matching_is_refused_before_any_work(scene):
-    with pytest.raises(InputError, match="auto, exhaustive or sequential"):
-        sfm(scene[0][:3], params=SfmParams(matching="all"))
 
 
 def test_frames_of_a_pinhole_keep_their_bytes_and_others_are_straightened(scene):

@@ -70,6 +70,14 @@ def test_what_the_run_says_is_on_the_page():
         assert text in page.text, text
 
 
+def test_metrics_read_as_words_and_counts_as_whole_numbers():
+    metrics = {"split": {"hungarian_miou": 0.5, "over_segmentation": 0.25, "num_truth": 13.0, "some_new_figure": 1.0}}
+    text = Page(report_html({"metrics": metrics}, pictures={})).text
+    for words in ("mIoU, one-to-one 0.500", "Instances split up 0.250", "True instances 13 ", "Some new figure 1.000"):
+        assert words in text, words
+    assert "_" not in text
+
+
 def test_of_a_scenes_place_only_its_name_is_shown():
     html = report_html({**RUN, "scene": "/home/someone/captures/kitchen"}, pictures={})
     assert "<h1>kitchen</h1>" in html and "someone" not in html

@@ -10,12 +10,13 @@ import pytest
 from ball_and_box import VIEWS, SmallScene
 
 from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.gaussians.initialise import concatenate, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.splat import merge as module
 from ss_flow.tasks.splat.merge import MergeParams, assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
-from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
+from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain
 from ss_flow.tasks.splat.refine import iou
 from ss_flow.tasks.splat.resolve import REFINED
 
@@ -93,13 +94,20 @@ def test_touching_instances_collide_and_are_planned_as_a_pair(built):
     assert plan((built.ball, built.box), params=PlanParams(), round=0).pairs.tolist() == [[1, 0]]
 
 
-def test_a_weak_instance_and_one_without_masks_stay_as_their_points(built):
+def test_a_weak_instance_and_one_without_masks_or_points_give_no_gaussians(built):
     few = built.scene.instance(2)
-    points = reconstruct(*built.views, replace(few, weak=True), params=TRAIN)
-    np.testing.assert_array_equal(points.means, few.points[thin(few.points, 900)])
-    assert same(reconstruct(*built.views, built.scene.instance(2, views=()), params=TRAIN), points)
     empty = replace(few, points=few.points[:0], colors=few.colors[:0], point_confidence=few.point_confidence[:0])
-    assert len(reconstruct(*built.views, empty, params=TRAIN)) == 0
+    for instance in (replace(few, weak=True), built.scene.instance(2, views=()), empty):
+        assert len(reconstruct(*built.views, instance, params=TRAIN)) == 0
+
+
+def test_a_merge_leaves_what_is_far_from_the_smaller_group_as_it_was(built):
+    far = replace(built.box, means=built.box.means + np.float32(50), instance_id=np.full(len(built.box), 3, np.int32))
+    merged = merge_pair(
+        *built.views, concatenate([built.box, far]), built.ball, built.scene.maps, params=MERGE, w_mask=0.05
+    )
+    assert same(select(merged, merged.instance_id == 3), far)
+    assert not same(select(merged, merged.instance_id == 1), built.box)
 
 
 def test_retraining_happens_only_where_refinement_changed_a_mask(built):

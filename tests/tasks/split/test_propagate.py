@@ -7,7 +7,6 @@ from box_scene import mask_set, permuted, row_of_points, true_masks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import PointCloud
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.observation import ClusterParams
@@ -215,9 +214,3 @@ def test_views_without_masks_label_nothing(boxes):
     assert not result.label.any()
     assert result.num_labels == 0
     assert len(result.match_mask) == 0
-
-
-@pytest.mark.parametrize("wrong", [{"passes": 0}, {"lambda_init": 1.0}])
-def test_parameters_out_of_range_are_bad_input(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        PropagateParams(**wrong)

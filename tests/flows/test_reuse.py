@@ -1,0 +1,235 @@
+"""Nothing is computed twice, and everything that a change touches is computed again."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_runs import SHORT, bytes_of, run_tiny, ss_flow, start_tiny, write_room
+
+from ss_flow import closure
+from ss_flow.flows.cli.query import read_run
+
+BEFORE_PROPAGATE = {
+    "capture.ingest",
+    "capture.cameras",
+    "capture.sensor_depth",
+    "capture.ready_masks",
+    "capture.ground_truth",
+    "split.dense",
+    "split.visibility",
+}
+HEAVY = ("torch", "cv2", "open3d", "onnxruntime", "onnx", "scipy", "pycolmap", "zarr", "matplotlib", "networkx")
+
+
+def test_a_second_run_computes_nothing_and_leaves_every_file_as_it_is(warm):
+    before = bytes_of(warm.out)
+    again = run_tiny(warm.scene, warm.store, out=warm.out)
+    assert again.code == 0
+    assert again.computed() == {}
+    assert again.results() == warm.called.results()
+    after = bytes_of(warm.out)
+    assert {name for name in before | after if before.get(name) != after.get(name)} == {"run.json"}
+
+
+def test_a_run_of_hits_loads_no_heavy_library(warm):
+    code = (
+        "import sys; from ss_flow.flows.cli.main import main; code = main(sys.argv[1:]);"
+        f"print(code, [m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
+    )
+    options = ["--out", str(warm.out), "--cache", str(warm.store), "--preset", "fast", "--json", *SHORT]
+    done = subprocess.run([sys.executable, "-c", code, "run", str(warm.scene), *options], capture_output=True, text=True)
+    assert done.stderr.strip().splitlines()[-1] == "0 []"
+
+
+def test_an_output_folder_that_was_deleted_is_written_again_from_the_store(warm):
+    before = bytes_of(warm.out)
+    shutil.rmtree(warm.out)
+    again = run_tiny(warm.scene, warm.store, out=warm.out)
+    assert again.computed() == {}
+    after = bytes_of(warm.out)
+    assert set(after) == set(before)
+    assert {n for n in before if before[n] != after[n]} <= {"run.json", "report.html"}
+
+
+def test_a_changed_threshold_of_propagation_computes_it_and_nothing_before_it(warm):
+    again = run_tiny(warm.scene, warm.store, "--set", "split.tau_label=0.95", out=warm.out)
+    assert again.computed()["split.propagate"] == 1
+    assert not BEFORE_PROPAGATE & set(again.computed())
+    assert not [step for step in again.computed() if step.startswith("capture.")]
+
+
+def test_a_change_that_gives_an_equal_result_stops_there(warm):
+    again = run_tiny(warm.scene, warm.store, "--set", "propagate.min_new_points=11", out=warm.out)
+    assert again.computed() == {"split.propagate": 1}
+    assert again.results() == warm.called.results()
+
+
+def test_why_names_the_parameter_and_the_chain_from_it(warm):
+    again = run_tiny(warm.scene, warm.store, "--set", "visibility.tau_depth=0.05", out=warm.out)
+    assert again.computed()["split.visibility"] == 5
+    told = ss_flow("why", "propagate", "--cache", warm.store).out
+    assert told.startswith("split.propagate: input visibility changed (5 of 5 items)")
+    assert "split.visibility: parameter tau_depth 0.02 -> 0.05" in told
+    reused = ss_flow("why", "dense", "--cache", warm.store).out
+    assert reused.strip() == "split.dense: reused; nothing that it depends on changed"
+
+
+def test_the_search_threshold_changes_nothing_in_a_run_and_only_the_answer_of_a_search(warm):
+    again = run_tiny(warm.scene, warm.store, "--set", "semantics.tau_corr=0.5", out=warm.out)
+    assert again.computed() == {}
+    assert read_run(warm.out)["params"]["semantics.query.tau_corr"] == 0.5
+    actions = len(list((warm.store / "actions").rglob("*.json")))
+    for _ in range(2):
+        assert ss_flow("query", warm.out, "red", "--json").code == 0
+    assert len(list((warm.store / "actions").rglob("*.json"))) == actions + 1
+
+
+def test_a_changed_photo_is_segmented_again_and_no_other(tmp_path):
+    scene, store = write_room(tmp_path / "room", masks=None), tmp_path / "store"
+    first = run_tiny(scene, store, "--until", "segment")
+    assert first.computed()["split.segment_rgbd"] == 5
+    photo = scene / "color/0002.jpg"
+    repainted(photo)
+    again = run_tiny(scene, store, "--until", "segment")
+    assert again.code == 0, again.err
+    segmented = [n for n in again.document()["nodes"] if n["step"] == "split.segment_rgbd"]
+    assert [n["item"] for n in segmented if not n["hit"]] == ["0002"]
+    told = ss_flow("why", "segment_rgbd", "--cache", store).out
+    assert told.startswith("split.segment_rgbd[0002]: input frame changed")
+    assert "capture.ingest: parameter photos.2" in told
+
+
+def repainted(photo: Path) -> None:
+    import cv2
+
+    image = cv2.imread(str(photo))
+    image[:20, :20] = 255 - image[:20, :20]
+    photo.write_bytes(cv2.imencode(".jpg", image)[1].tobytes())
+
+
+def test_a_photo_that_was_only_touched_or_moved_computes_nothing(warm, tmp_path):
+    scene = shutil.copytree(warm.scene, tmp_path / "elsewhere")
+    for photo in (scene / "color").iterdir():
+        os.utime(photo, (1, 1))
+    assert run_tiny(scene, warm.store, out=tmp_path / "b").computed() == {}
+
+
+@pytest.fixture
+def edited(monkeypatch):
+    """Have the closure read a module with an edit, as if it had been saved between two runs."""
+    read = Path.read_text
+
+    def edit(module: str, old: str, new: str) -> None:
+        def read_edited(path: Path, *args, **kwargs):
+            text = read(path, *args, **kwargs)
+            if not path.as_posix().endswith(module):
+                return text
+            assert old in text, f"{module} no longer holds {old!r}"
+            return text.replace(old, new)
+
+        monkeypatch.setattr(Path, "read_text", read_edited)
+        closure.forget()
+
+    yield edit
+    monkeypatch.undo()
+    closure.forget()
+
+
+def test_an_edited_comment_or_docstring_of_a_task_computes_nothing(warm, edited):
+    edited("tasks/split/propagate.py", '"""How masks of single views', '"""In other words: how masks')
+    assert run_tiny(warm.scene, warm.store, out=warm.out).computed() == {}
+    edited("tasks/split/propagate.py", "\nfrom dataclasses", "\n# A remark.\nfrom dataclasses")
+    assert run_tiny(warm.scene, warm.store, out=warm.out).computed() == {}
+
+
+def test_an_edited_helper_computes_its_task_again_and_stops_where_the_result_is_the_same(warm, edited):
+    edited("tasks/split/voting.py", "class Votes:\n", "class Votes:\n    edited = True\n\n")
+    again = run_tiny(warm.scene, warm.store, out=warm.out)
+    assert again.computed() == {"split.propagate": 1}
+    told = ss_flow("why", "propagate", "--cache", warm.store).out
+    assert told.strip() == "split.propagate: code of tasks.split.voting.Votes changed"
+
+
+def test_a_task_that_is_retuned_but_not_rewritten_keeps_its_results(warm, edited):
+    edited("tasks/splat/reconstruct.py", "memory_mb=1500", "memory_mb=1600")
+    assert run_tiny(warm.scene, warm.store, out=warm.out).computed() == {}
+
+
+@pytest.mark.parametrize("how", [("--jobs", "1"), ("--jobs", "2"), ("--jobs", "2", "--executor", "processes")], ids=str)
+def test_the_results_do_not_depend_on_how_many_tasks_run_at_once_or_where(tiny, tmp_path, how):
+    other = run_tiny(tiny.scene, tmp_path / "store", *how, out=tmp_path / "out")
+    assert other.code == 0, other.err
+    assert other.results() == tiny.called.results()
+
+
+def test_a_killed_run_goes_on_from_what_it_had_finished(tiny, tmp_path):
+    store, out = tmp_path / "store", tmp_path / "out"
+    process = start_tiny(tiny.scene, store, "--jobs", "1", out=out)
+    log = wait_for(lambda: next(store.glob("roots/runs/*/events.jsonl"), None))
+    wait_for(lambda: '"started", "label": "splat.reconstruct' in log.read_text())
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    finished = set(re.findall(r'"event": "finished", "label": "([^"]+)"', log.read_text()))
+    assert {"capture.ingest", "split.propagate"} <= finished
+    assert not out.exists()
+    state = ss_flow("status", "--cache", store).out
+    assert "running, or killed" in state
+    again = run_tiny(tiny.scene, store, out=out)
+    assert again.code == 0, again.err
+    made_again = {f"{n['step']}[{n['item']}]" if n["item"] else n["step"] for n in again.document()["nodes"] if not n["hit"]}
+    assert made_again and not made_again & finished
+    assert again.results() == tiny.called.results()
+
+
+def wait_for(condition, seconds: float = 90.0):
+    """What a condition gives, once it gives something."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if found := condition():
+            return found
+        time.sleep(0.02)
+    raise TimeoutError("the run did not get that far")
+
+
+def test_a_scene_whose_object_is_gone_from_the_store_is_computed_again(warm):
+    scene = warm.called.results()["scene"]
+    shutil.rmtree(warm.store / "objects" / scene[:2] / scene)
+    again = run_tiny(warm.scene, warm.store, out=warm.out)
+    assert again.computed() == {"splat.global_pass": 1}
+    assert again.results()["scene"] == scene
+
+
+def test_verify_finds_a_change_that_size_and_time_hide(tmp_path):
+    scene, store = write_room(tmp_path / "room"), tmp_path / "store"
+    depth = scene / "depth/0001.png"
+    values = read_depth(depth)
+    write_depth_uncompressed(depth, values)
+    before = depth.stat()
+    assert run_tiny(scene, store, "--until", "depth").code == 0
+    values[0, 0] += 1
+    write_depth_uncompressed(depth, values)
+    os.utime(depth, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert depth.stat().st_size == before.st_size
+    assert run_tiny(scene, store, "--until", "depth").computed() == {}
+    assert run_tiny(scene, store, "--until", "depth", "--verify").computed() == {"capture.sensor_depth": 1}
+
+
+def read_depth(file: Path) -> np.ndarray:
+    import cv2
+
+    return cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+
+
+def write_depth_uncompressed(file: Path, values: np.ndarray) -> None:
+    import cv2
+
+    file.write_bytes(cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 0])[1].tobytes())

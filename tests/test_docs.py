@@ -1,0 +1,98 @@
+"""The documents say what is there."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from ss_flow.flows import settings
+from ss_flow.flows.params import Params
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+
+
+@pytest.fixture(scope="module")
+def maker():
+    spec = importlib.util.spec_from_file_location("make_parameters", ROOT / "docs" / "make_parameters.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def anchors(page: Path) -> set[str]:
+    """The names under which GitHub files the headings of a page."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_the_table_of_parameters_is_current(maker):
+    page = maker.PAGE.read_text(encoding="utf-8")
+    assert maker.with_table(page) == page, "run `python docs/make_parameters.py`"
+
+
+def test_every_parameter_is_in_the_table_with_an_explanation(maker):
+    rows = re.findall(r"^\| `([\w.]+)` \| (`[^|]*`) \| [^|]*\| (.+) \|$", maker.table(), re.MULTILINE)
+    assert [name for name, _, _ in rows] == list(settings.flat(Params()))
+    assert [name for name, _, said in rows if len(said) < 10] == []
+
+
+def test_a_page_without_the_marks_is_refused(maker):
+    with pytest.raises(ValueError, match=r"parameters\.md lacks"):
+        maker.with_table("# Parameters\n")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_relative_link_leads_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if re.match(r"[a-z]+:", target):
+            continue
+        place, _, anchor = target.partition("#")
+        found = (page.parent / place).resolve() if place else page
+        assert found.exists(), f"{page.name} links to {target}"
+        assert not anchor or anchor in anchors(found), f"{page.name} links to {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_source_file_and_parameter_that_a_page_names_exists(page):
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:tasks|flows|tests|docs|ss_flow|cache)/[\w./]*)`", text):
+        assert (ROOT / name).exists(), f"{page.name} names {name}"
+    for name in re.findall(r"(?:--set |`)((?:capture|split|splat|semantics|evaluate)(?:\.\w+)+)=", text):
+        settings.find(Params(), name)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_functions_in_the_tables_of_a_page_stand_in_the_files_beside_them(page):
+    for names, file in re.findall(r"((?:`\w+`(?: and )?)+) in `([\w/]+\.py)`", page.read_text(encoding="utf-8")):
+        source = (ROOT / file).read_text(encoding="utf-8")
+        for name in re.findall(r"`(\w+)`", names):
+            assert re.search(rf"^(?:def|class) {name}\b", source, re.MULTILINE), f"{name} is not in {file}"
+
+
+def test_the_readme_has_two_command_lines_to_install_run_and_test():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    block = text.partition("<!-- commands -->")[2].partition("<!-- end -->")[0]
+    lines = [line for line in block.splitlines() if line.strip() and not line.startswith("```")]
+    assert len(lines) == 2
+    assert lines[0].endswith("&& .venv/bin/ss-flow demo") and lines[1].endswith("&& .venv/bin/pytest")
+
+
+def test_the_example_of_a_flow_runs_and_reuses_as_the_page_says(tmp_path, monkeypatch, capsys):
+    text = (ROOT / "docs" / "engine.md").read_text(encoding="utf-8")
+    source = re.search(r"```python\n(.*?)```", text, re.DOTALL).group(1)
+    (tmp_path / "ss_flow_growth.py").write_text(source, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    main = importlib.import_module("ss_flow_growth").main
+    main()
+    assert capsys.readouterr().out.splitlines()[-1] == "[0. 2. 6.]"
+    main(3.0)
+    printed = capsys.readouterr().out.splitlines()
+    promised = re.search(r"```\n(hit growth.*?)```", text, re.DOTALL).group(1).splitlines()
+    assert sorted(line.strip() for line in printed) == sorted(promised)
