@@ -91,4 +91,4 @@ def _feed_array(hasher: Any, array: np.ndarray) -> None:
         array = np.where(np.isnan(array), np.array(np.nan, array.dtype), array)
     _tagged(hasher, b"a", array.dtype.str.encode())
     _feed(hasher, list(array.shape))
-    hasher.update(memoryview(array).cast("B") if array.size else b"")
+    hasher.update(array.reshape(-1).view(np.uint8).data if array.size else b"")

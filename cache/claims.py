@@ -2,7 +2,7 @@
 
 Notes
 -----
-*Concurrent claimants.* The claim is a file created exclusively; one of them wins, the others wait for the action record.
+*Concurrent claimants.* A claim is a file created exclusively: one of them wins, the others wait for the action record.
 
 *Crash.* A holder touches its claims every few seconds. A claim that was not touched for `EXPIRY_SECONDS`, or whose
 process on this host is gone, is stale and may be taken over. Two processes that take over the same stale claim at the

@@ -46,7 +46,7 @@ class FileDigests:
         return content
 
     def once(self, check: Callable[[T], None], subject: T, contents: Sequence[str]) -> None:
-        """Run a check of files' contents, unless it passed for the same contents before. What it raises passes through."""
+        """Check files' contents, unless that passed for the same ones before. What `check` raises passes through."""
         name = f"checked {' '.join(contents)}"
         if name not in self._known or self._verify:
             check(subject)

@@ -11,8 +11,8 @@ Notes
 *Crash.* An object or an action appears by one rename of something complete and fsynced; what a killed process leaves is
 in tmp/, and is never read. The action comes after all of its objects.
 
-*Concurrent writers.* Two processes that write the same object write the same bytes; the loser of the rename discards its
-copy. Readers never lock.
+*Concurrent writers.* Two processes that write the same object write the same bytes; the loser of the rename discards
+its copy. Readers never lock.
 
 *Full disk.* The write fails with OSError before anything is visible; the store stays as it was.
 """

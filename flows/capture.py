@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.errors import InputError
+from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import each
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture import depth as depth_steps
@@ -17,8 +18,6 @@ from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.sfm import registered, sfm
 from ss_flow.tasks.models.catalogue import Model
-
-from ss_flow.flows.params import CaptureParams
 
 Reference = Callable[[Path], FileRef]
 

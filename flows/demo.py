@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
-from ss_flow.closure import code_closure
 from ss_flow.cache.canonical import digest
+from ss_flow.closure import code_closure
 from ss_flow.errors import InputError
 from ss_flow.flows.generated import RoomParams, generate, write_scene
 from ss_flow.tasks.deliver.output import replacing

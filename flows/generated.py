@@ -117,7 +117,7 @@ def write_scene(
     room: Room,
     folder: Path,
     masks: Literal["truth", "degraded"] | None = None,
-    degradation: DegradeParams = DegradeParams(),  # noqa: B008 - frozen
+    degradation: DegradeParams = DegradeParams(),
     seed: int = 0,
 ) -> None:
     """Write a room as a capture in the ScanNet export layout, the way a user's own would lie on disk.

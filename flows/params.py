@@ -12,11 +12,11 @@ from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.ranges import Count, NonNegative, Positive
 from ss_flow.tasks.semantics.describe import DescribeParams
+from ss_flow.tasks.semantics.query import QueryParams
 from ss_flow.tasks.splat.merge import MergeParams
 from ss_flow.tasks.splat.plan import PlanParams
 from ss_flow.tasks.splat.reconstruct import ReconstructParams
 from ss_flow.tasks.splat.refine import RefineParams
-from ss_flow.tasks.semantics.query import QueryParams
 from ss_flow.tasks.split.dense import DenseParams
 from ss_flow.tasks.split.propagate import PropagateParams
 from ss_flow.tasks.split.reproject import ReprojectParams

@@ -7,7 +7,7 @@ from typing import Any
 
 from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import Params, SplitParams
-from ss_flow.graph import Node, each, expand, gather, labelled
+from ss_flow.graph import each, expand, gather, labelled
 from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.evaluate.novel_view import novel_view
 from ss_flow.tasks.models.catalogue import Model
@@ -52,7 +52,7 @@ class Split:
     """tuple[Embedding, ...], one a view; () without a segmenter."""
 
 
-def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Node]:
+def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Any]:
     """The whole DAG. Returns its results by step; `--until` takes these names."""
     halved = split(capture, networks, params.split)
     masks_split = resolve(capture.cameras, halved.instances)
@@ -173,13 +173,13 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
     return {"reconstruct": first, "refine": better, "masks": masks, "merge": merged, "scene": scene}
 
 
-def merge_rounds(views: Any, groups: Any, masks: Any, params: Params, number: int) -> Any:
+def merge_rounds(views: tuple[Any, Any, Any], groups: Any, masks: Any, params: Params, number: int) -> Any:
     """Merge the pairs that collide, disjoint pairs side by side, until none is left (spec P4)."""
 
     def build(planned: MergePlan) -> Any:
         if not len(planned.pairs):
             return groups
-        merged = []
+        merged: list[Any] = []
         for a, b in planned.pairs.tolist():
             with labelled(f"{number}.{a}+{b}"):
                 merged.append(

@@ -13,7 +13,7 @@ from ss_flow.cache.claims import Claims
 from ss_flow.cache.store import Store
 from ss_flow.events import JsonLines, Reporter, Reporters
 from ss_flow.executors import open_executor
-from ss_flow.graph import Flow, Node
+from ss_flow.graph import Flow
 from ss_flow.keys import Value
 from ss_flow.runs import previous_keys, start_run
 from ss_flow.scheduler import Failure, Scheduler
@@ -47,7 +47,7 @@ def usable_cores() -> int:
 
 
 def run_flow(
-    build: Callable[[], Mapping[str, Node]],
+    build: Callable[[], Mapping[str, Any]],
     store: Store,
     *,
     scene: str,
@@ -64,7 +64,8 @@ def run_flow(
     build: called in a flow; returns its outputs by name. until: run only what this output needs. jobs: how many cores
     to use, 0 = all. scene: what the run is about; runs of the same scene are compared by `why`. recorded: whether the
     run is kept among the store's runs; a question about a result need not be.
-    Raises KeyError when `until` names no output, KeyboardInterrupt when interrupted: running tasks are then told to stop.
+    Raises KeyError when `until` names no output, and KeyboardInterrupt when interrupted; running tasks are then told to
+    stop.
     """
     jobs = jobs or usable_cores()
     flow = Flow(scene)

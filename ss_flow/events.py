@@ -1,7 +1,7 @@
 """What happens while a flow runs: events, and who listens to them.
 
-The scheduler speaks to one `Reporter`; the silent one at the root of the hierarchy makes listening optional. A task says
-how far it is with `progress`, without knowing who listens.
+The scheduler speaks to one `Reporter`; the silent one at the root of the hierarchy makes listening optional. A task
+says how far it is with `progress`, without knowing who listens.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class Reporter:
     """Hears what the scheduler does; this one is silent."""
 
     def event(self, kind: str, **details: Any) -> None:
-        """Something happened: "hit", "started", "finished", "failed", "skipped", "waiting", "run started" or "run ended"."""
+        """Something happened to a node (hit, started, finished, failed, skipped, waiting, would run), or to
+        the whole (run started, run ended)."""
 
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
         """A running node is so far; called from any thread."""

@@ -6,7 +6,6 @@ from typing import Any
 
 from ss_flow.keys import Components
 
-
 SHOWN_CHARACTERS = 60
 
 

@@ -151,7 +151,7 @@ def sources_of(node: Node) -> list[Node]:
     return []
 
 
-def gather(nodes: Sequence[Node]) -> Any:
+def gather(nodes: Sequence[Any]) -> Any:
     """A list of the artifacts of several nodes.
 
     Raises TypeError when one of them is not a node.

@@ -1,4 +1,4 @@
-"""Keys: the digest of everything that a computation's result depends on, kept in parts so that a change can be named."""
+"""Keys: the digest of all that a computation's result depends on, kept in parts so that a change can be named."""
 
 from __future__ import annotations
 

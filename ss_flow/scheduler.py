@@ -16,6 +16,7 @@ from typing import Any
 
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.store import Action, Store
+from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.execute import Invocation
 from ss_flow.executors import Executor
@@ -161,7 +162,9 @@ class Scheduler:
                     self._tell("skipped", node, because=failed.label)
                 self._settle(node, failed)
             case Item():
-                self._settle(node, values[0][node.index])
+                value = values[0]
+                assert isinstance(value, tuple), f"{node.label} is one of a list, but its source is a single artifact"
+                self._settle(node, value[node.index])
             case Stored():
                 self._settle(node, node.value)
             case Expand():
@@ -318,7 +321,8 @@ class Scheduler:
         failure = Failure(job.nodes[0].label, error)
         self._failures.append(failure)
         for node in job.nodes:
-            self._tell("failed", node, key=key, error=f"{type(error).__name__}: {error}")
+            told = f"{type(error).__name__}: {error}"
+            self._tell("failed", node, key=key, error=told, bad_input=isinstance(error, InputError))
             self._settle(node, failure)
 
     def _tell(self, kind: str, node: Node, **details: Any) -> None:

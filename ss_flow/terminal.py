@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TaskID as RowId
 
 from ss_flow.events import Reporter
-
 
 WORTH_SECONDS = 1.0
 """Shorter steps leave no line behind."""
@@ -29,6 +29,7 @@ class Terminal(Reporter):
             TextColumn("[dim]{task.fields[note]}"),
             console=console,
             transient=True,
+            disable=not console.is_terminal,
         )
         self._all = self._display.add_task("[bold]all steps", total=None, note="")
         self._rows: dict[str, RowId] = {}
@@ -36,7 +37,7 @@ class Terminal(Reporter):
         self._display.start()
 
     def event(self, kind: str, **details: Any) -> None:
-        label = details.get("label", "")
+        label = escape(details.get("label", ""))
         if kind == "started":
             self._rows[label] = self._display.add_task(label, total=None, note="")
         elif kind in ("finished", "failed") and label in self._rows:
@@ -46,12 +47,12 @@ class Terminal(Reporter):
             self._display.update(self._all, completed=self._done, total=max(self._done, details.get("known", 0)))
         if kind == "finished" and details["seconds"] >= WORTH_SECONDS:
             self._console.print(f"[green]done[/]  {label:<34} {details['seconds']:8.1f} s", highlight=False)
-        elif kind == "failed":
-            self._console.print(f"[red]failed[/] {label}: {details['error']}", highlight=False)
+        elif kind == "failed" and not details["bad_input"]:  # whoever asked for the run tells of bad input, once
+            self._console.print(f"[red]failed[/] {label}: {escape(details['error'])}", highlight=False)
 
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
-        if label in self._rows:
-            self._display.update(self._rows[label], completed=done, total=total, note=note)
+        if (label := escape(label)) in self._rows:
+            self._display.update(self._rows[label], completed=done, total=total, note=escape(note))
 
     def close(self) -> None:
         self._display.stop()

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.cache.store import Store
@@ -54,7 +55,9 @@ class Status:
             print(json.dumps(document, indent=1))
             return 0
         out = console(json=False)
-        out.print(f"{run.scene}: {state}, started {time.strftime('%F %T', time.localtime(run.header['started']))}")
+        out.print(
+            f"{escape(run.scene)}: {state}, started {time.strftime('%F %T', time.localtime(run.header['started']))}"
+        )
         table = Table("step", "reused", "computed", "running", "failed", "seconds", box=None)
         for step, row in steps.items():
             counts = (row["hit"], row["finished"], row["running"], row["failed"] + row["skipped"])
@@ -98,9 +101,10 @@ class Why:
         reasons = list(dict.fromkeys(n["why"] for n in computed))
         for reason in reasons[:5]:
             these = [n for n in computed if n["why"] == reason]
-            out.print(f"{these[0]['label'] if len(these) == 1 else these[0]['step']}: {reason}{_times(these)}")
+            what = these[0]["label"] if len(these) == 1 else these[0]["step"]
+            out.print(escape(f"{what}: {reason}{_times(these)}"))
             for cause in _causes(these[0], nodes):
-                out.print(f"  because {cause}")
+                out.print(escape(f"  because {cause}"))
         return 0
 
 
@@ -181,7 +185,11 @@ class CacheList:
         for row in rows:
             first = row["outputs"][0][:12] if row["outputs"] else ""
             table.add_row(
-                row["label"], first, str(len(row["outputs"])), f"{row['bytes'] / 1000:.0f}", f"{row['seconds']:.1f}"
+                escape(row["label"]),
+                first,
+                str(len(row["outputs"])),
+                f"{row['bytes'] / 1000:.0f}",
+                f"{row['seconds']:.1f}",
             )
         console(json=False).print(table)
         return 0
@@ -211,14 +219,14 @@ class CacheShow:
         for value in values[:1] if len(values) > 8 else values:
             out.print(f"[bold]{type(value).__name__}[/]")
             for item in dataclasses.fields(value):
-                out.print(f"  {item.name}: {_described(getattr(value, item.name))}")
+                out.print(f"  {item.name}: {escape(_described(getattr(value, item.name)))}")
         if len(values) > 8:
             out.print(f"... and {len(values) - 1} more")
         if self.png:
             from ss_flow.flows.cli.drawing import draw_results
 
             draw_results(store, latest_run(store, self.scene), values, self.view, self.png)
-            out.print(f"drawn to {self.png}")
+            out.print(escape(f"drawn to {self.png}"))
         return 0
 
     def _digests(self, store: Store) -> list[str]:

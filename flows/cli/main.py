@@ -74,7 +74,7 @@ def main(arguments: list[str]) -> int:
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
         command: Any = tyro.cli(
-            Command,  # type: ignore[arg-type]
+            Command,
             prog="ss-flow",
             description="From a capture to instance-labelled 3D Gaussians; nothing is computed twice.",
             args=arguments,

@@ -10,14 +10,15 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.engine import Report, run_flow
 from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows import settings
-from ss_flow.flows.cli.context import StoreOptions, choose_model, console, file_digests
 from ss_flow.flows.capture import Capture, capture
+from ss_flow.flows.cli.context import StoreOptions, choose_model, console, file_digests
 from ss_flow.flows.deliver import STATUS_EXIT, deliver, run_document
 from ss_flow.flows.params import Params
 from ss_flow.flows.split_splat import Networks, split_splat
@@ -177,7 +178,7 @@ def _tell_plan(report: Report, out: Console, *, json_wanted: bool) -> int:
         print(json.dumps({"would_run": [{k: n[k] for k in ("label", "why")} for n in would]}))
         return 0
     for node in would:
-        out.print(f"would run {node['label']}: {node['why']}")
+        out.print(escape(f"would run {node['label']}: {node['why']}"))
     for label in dict.fromkeys(n["step"] for n in follow):
         out.print(f"would follow {label}")
     hits = sum(n["event"] == "hit" for n in report.nodes)
@@ -187,7 +188,7 @@ def _tell_plan(report: Report, out: Console, *, json_wanted: bool) -> int:
 
 def _tell(document: dict[str, Any], out_folder: Path | None, out: Console) -> None:
     for failure in document["failures"]:
-        out.print(f"[red]failed[/] {failure['label']}: {failure['error']}")
+        out.print(f"[red]failed[/] {escape(failure['label'])}: {escape(failure['error'])}")
     if document["metrics"]:
         table = Table("measured against the ground truth", "mIoU", "mAcc(25)", "mAcc(50)", "PQ", box=None)
         for stage in ("split", "splat"):
@@ -200,6 +201,5 @@ def _tell(document: dict[str, Any], out_folder: Path | None, out: Console) -> No
             out.print(f"views that were kept back: PSNR {views['psnr']:.2f} dB, SSIM {views['ssim']:.3f}")
     hits = sum(node["hit"] for node in document["nodes"])
     made = len(document["nodes"]) - hits
-    out.print(
-        f"{document['status']}: {made} results computed, {hits} reused" + (f"; see {out_folder}" if out_folder else "")
-    )
+    place = f"; see {out_folder}" if out_folder else ""
+    out.print(escape(f"{document['status']}: {made} results computed, {hits} reused{place}"))

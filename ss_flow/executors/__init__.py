@@ -6,7 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Protocol
 
-from ss_flow.cache.store import Action
+from ss_flow.cache.store import Action, Store
 from ss_flow.execute import Invocation
 
 OnProgress = Callable[[str, int, int, str], None]
@@ -29,15 +29,13 @@ class Executor(Protocol):
         ...
 
 
-def open_executor(name: str, workers: int, store: object, on_progress: OnProgress) -> Executor:
+def open_executor(name: str, workers: int, store: Store, on_progress: OnProgress) -> Executor:
     """The executor of that name. Raises InputError for an unknown one."""
-    from ss_flow.cache.store import Store
     from ss_flow.errors import InputError
     from ss_flow.executors.processes import Processes
     from ss_flow.executors.threads import Threads
 
-    assert isinstance(store, Store)
-    kinds = {"threads": Threads, "processes": Processes}
+    kinds: dict[str, Callable[[int, Store, OnProgress], Executor]] = {"threads": Threads, "processes": Processes}
     if name not in kinds:
         raise InputError(f"executor {name!r} is unknown; choose one of: {', '.join(kinds)}.")
     return kinds[name](workers, store, on_progress)

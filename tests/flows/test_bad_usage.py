@@ -90,7 +90,7 @@ def cut(photo: Path, scene: Path) -> Path:
 def reshaped(depth: Path, scene: Path) -> Path:
     from ss_flow.tasks.geometry.images import encode_png
 
-    depth.write_bytes(encode_png(np.ones((30, 31), np.uint16)).tobytes())
+    depth.write_bytes(encode_png(np.full((30, 31), 1500, np.uint16)).tobytes())
     return scene
 
 

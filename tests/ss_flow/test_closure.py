@@ -91,14 +91,23 @@ def test_every_form_of_import_is_followed(package, step):
 
 
 def test_what_only_a_type_checker_sees_does_not_count(package):
-    step = "from __future__ import annotations\nfrom typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from probe.maths import twice\n\ndef run(x: twice):\n    return x\n"
+    step = """
+        from __future__ import annotations
+        from typing import TYPE_CHECKING
+        if TYPE_CHECKING:
+            from probe.maths import twice
+
+        def run(x: twice):
+            return x
+    """
     assert set(package(step=step, maths=MATHS)) == {"probe.step.run"}
 
 
 def test_the_task_decorator_does_not_count_but_other_decorators_do(package):
     plain = package(step="from ss_flow.task import task, Resources\n\n@task()\ndef run(x: int) -> int:\n    return x\n")
     more = package(
-        step="from ss_flow.task import task, Resources\n\n@task(resources=Resources(cores=2))\ndef run(x: int) -> int:\n    return x\n"
+        step="from ss_flow.task import task, Resources\n\n"
+        "@task(resources=Resources(cores=2))\ndef run(x: int) -> int:\n    return x\n"
     )
     cached = package(step="import functools\n\n@functools.cache\ndef run(x: int) -> int:\n    return x\n")
     assert plain == more != cached

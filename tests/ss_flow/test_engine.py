@@ -44,7 +44,8 @@ def test_a_second_run_computes_nothing(store):
 
 def test_a_changed_parameter_recomputes_only_what_depends_on_it(store):
     run(store, toy.flow)
-    assert set(ran(run(store, lambda: toy.flow(limit=5.0)))) == {*(f"ss_flow_toy.clip[n{i}]" for i in range(3)), "ss_flow_toy.total"}
+    expected = {*(f"ss_flow_toy.clip[n{i}]" for i in range(3)), "ss_flow_toy.total"}
+    assert set(ran(run(store, lambda: toy.flow(limit=5.0)))) == expected
 
 
 def test_a_recomputation_with_an_equal_result_stops_there(store):
@@ -151,9 +152,7 @@ def test_two_runs_at_once_compute_every_key_once(tmp_path):
 
     reports = []
     stores = [Store(tmp_path / "store") for _ in range(2)]
-    threads = [
-        threading.Thread(target=lambda s=s: reports.append(run(s, toy.flow, reporter=Count()))) for s in stores
-    ]
+    threads = [threading.Thread(target=lambda s=s: reports.append(run(s, toy.flow, reporter=Count()))) for s in stores]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -200,7 +199,7 @@ def test_why_names_the_first_changed_part_and_runs_are_kept_in_order(store):
     assert why["ss_flow_toy.clip[n2]"] == "parameter limit 100.0 -> 5.0"
     assert why["ss_flow_toy.total"] == "input xs changed (1 of 3 items)"
     latest = next(latest_runs(store.root / "roots" / "runs", "toy"))
-    assert [e["event"] for e in latest.events()][0] == "run started"
+    assert next(latest.events())["event"] == "run started"
     assert len(previous_keys(store.root / "roots" / "runs", "toy")) == 8
 
 

@@ -22,12 +22,12 @@ SHORT = [
     f"--set={assignment}"
     for assignment in (
         "reconstruct.iterations_per_view=2",
-        "reconstruct.min_iterations=4",
-        "reconstruct.max_iterations=10",
+        "reconstruct.min_iterations=10",
+        "reconstruct.max_iterations=20",
         "merge.iterations_per_view=2",
         "merge.min_iterations=4",
         "merge.max_iterations=8",
-        "merge.global_iterations=10",
+        "merge.global_iterations=20",
         "split.dense.max_points=8000",
     )
 ]

@@ -16,7 +16,7 @@ from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.splat import merge as module
 from ss_flow.tasks.splat.merge import MergeParams, assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
-from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain
+from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
 from ss_flow.tasks.splat.refine import iou
 from ss_flow.tasks.splat.resolve import REFINED
 

@@ -1,0 +1,94 @@
+"""Looking at a run: status, why, graph, the store's content, pictures of results."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+from tiny_runs import ss_flow
+
+
+def test_status_counts_what_each_step_did(tiny):
+    words = ss_flow("status", "--cache", tiny.store)
+    assert words.code == 0
+    assert words.out.startswith(f"{tiny.scene}: done, started ")
+    document = json.loads(ss_flow("status", tiny.scene, "--json", "--cache", tiny.store).out)
+    assert document["scene"] == str(tiny.scene) and document["state"] == "done"
+    visible = document["steps"]["split.visibility"]
+    assert (visible["finished"], visible["hit"], visible["running"], visible["failed"]) == (5, 0, 0, 0)
+
+
+def test_why_says_that_nothing_was_known_on_the_first_run(tiny):
+    assert ss_flow("why", "propagate", "--cache", tiny.store).out == "split.propagate: never computed for this scene\n"
+    told = ss_flow("why", "split.visibility", "--cache", tiny.store).out
+    assert told == "split.visibility: never computed for this scene (5 of them)\n"
+    one = ss_flow("why", "visibility[0002]", "--cache", tiny.store).out
+    assert one == "split.visibility[0002]: never computed for this scene\n"
+
+
+def test_the_graph_is_mermaid_with_a_box_a_step_and_what_feeds_it(tiny):
+    lines = ss_flow("graph", "--cache", tiny.store).out.splitlines()
+    assert lines[0] == "flowchart TD"
+    boxes = dict(match.groups() for line in lines if (match := re.fullmatch(r'  ([\w.]+)\["(.+)"\]', line)))
+    arrows = {match.groups() for line in lines if (match := re.fullmatch(r"  ([\w.]+) -->\|(\w+)\| ([\w.]+)", line))}
+    assert len(boxes) + len(arrows) + 1 == len(lines)
+    assert boxes["split.visibility"] == "split.visibility x 5"
+    assert {a for a, _, _ in arrows} | {b for _, _, b in arrows} <= set(boxes)
+    assert ("capture.ready_masks", "masks", "split.propagate") in arrows
+    assert ("split.propagate", "labels", "split.reproject") in arrows
+
+
+def test_cache_ls_has_a_line_a_result_and_says_how_large_each_is(tiny):
+    rows = json.loads(ss_flow("cache", "ls", "--json", "--cache", tiny.store).out)
+    by_label = {row["label"]: row for row in rows}
+    assert len(by_label["capture.ingest"]["outputs"]) == 5
+    assert by_label["split.visibility[0003]"]["bytes"] > 1000
+    words = ss_flow("cache", "ls", "--cache", tiny.store).out
+    assert "split.visibility[0003]" in words
+    assert by_label["split.propagate"]["outputs"][0][:12] in words
+
+
+def test_cache_show_describes_a_result_by_step_or_by_digest(tiny):
+    shown = ss_flow("cache", "show", "propagate", "--cache", tiny.store).out
+    assert shown.startswith("PointLabels\n  label: int32 [")
+    assert "num_labels: 5" in shown
+    (digest,) = {n for n in [tiny.called.results()["propagate"]]}
+    assert ss_flow("cache", "show", digest[:10], "--cache", tiny.store).out == shown
+
+
+def test_cache_show_describes_the_items_of_a_list(tiny):
+    shown = ss_flow("cache", "show", "ingest", "--cache", tiny.store).out
+    assert shown.count("Frame\n") == 5
+    assert all(f"name: {k:04d}" in shown for k in range(5))
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "ingest",
+        "cameras",
+        "sensor_depth",
+        "ready_masks",
+        "dense",
+        "visibility[0001]",
+        "propagate",
+        "reproject",
+        "reconstruct[1]",
+        "global_pass",
+        "describe[1]",
+        "ground_truth",
+        "evaluate_masks",
+        "plan",
+        "name",
+    ],
+)
+def test_cache_show_draws_every_kind_of_result(what, tiny, tmp_path):
+    picture = tmp_path / "pictures/it.png"
+    shown = ss_flow("cache", "show", what, "--png", picture, "--view", "1", "--cache", tiny.store)
+    assert shown.code == 0, shown.err
+    image = cv2.imread(str(picture))
+    assert min(image.shape[:2]) >= 50
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 1

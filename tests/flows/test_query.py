@@ -1,0 +1,62 @@
+"""Searching a result by words."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from tiny_runs import ss_flow
+
+
+def colours(tiny) -> dict[str, int]:
+    """The colour words of the small things, whose objects are in the table's order the last ones."""
+    names = json.loads((tiny.scene / "instances.json").read_text())
+    return {name.split()[0]: int(instance_id) for instance_id, name in names.items()}
+
+
+def test_a_search_ranks_all_instances_and_the_best_has_the_colour(tiny):
+    answer = ss_flow("query", tiny.out, "something white", "--json", "--cache", tiny.store)
+    assert answer.code == 0, answer.err
+    document = answer.document()
+    rows = document["instances"]
+    assert document["encoder"] == "colour words"
+    ids = [e["id"] for e in json.loads((tiny.out / "instances.json").read_text())["instances"]]
+    assert sorted(row["id"] for row in rows if row["id"]) == ids
+    assert [row["score"] for row in rows] == sorted((row["score"] for row in rows), reverse=True)
+    assert rows[0]["delta"] == 0
+
+
+def test_the_object_of_a_colour_is_found(tiny):
+    import cv2
+    import numpy as np
+
+    found = 0
+    for colour, truth_id in colours(tiny).items():
+        answer = ss_flow("query", tiny.out, colour, "--json", "--cache", tiny.store)
+        if answer.code != 0:
+            continue
+        matched = {row["id"] for row in answer.document()["instances"] if row["matched"]}
+        truth = np.stack([cv2.imread(str(p), -1) for p in sorted((tiny.scene / "instance").iterdir())])
+        ours = np.stack([cv2.imread(str(p), -1) for p in sorted((tiny.out / "masks").iterdir())])
+        own, count = np.unique(ours[(truth == truth_id) & (ours > 0)], return_counts=True)
+        found += len(own) > 0 and int(own[count.argmax()]) in matched
+    assert found >= 2
+
+
+def test_a_search_works_on_the_store_that_the_run_names(tiny):
+    assert ss_flow("query", tiny.out, "red", "--json").code == 0
+
+
+@pytest.mark.parametrize("tau", ["0.0001", "1.9"])
+def test_words_for_people_name_the_instances(tiny, tau):
+    answer = ss_flow("query", tiny.out, "white", "--tau-corr", tau, "--cache", tiny.store)
+    assert answer.code == 0
+    assert "score" in answer.out
+
+
+def test_what_nothing_matches_is_said(tiny):
+    present = colours(tiny)
+    absent = next(c for c in ("purple", "pink", "orange", "green", "blue", "yellow", "red") if c not in present)
+    answer = ss_flow("query", tiny.out, absent, "--cache", tiny.store)
+    assert answer.code == 0
+    assert f"nothing in the scene matches '{absent}' (colour words); the nearest are:" in answer.out

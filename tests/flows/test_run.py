@@ -1,0 +1,256 @@
+"""What a run gives, and how it ends when something fails."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_runs import run_tiny, ss_flow, write_room
+
+from ss_flow.flows.generated import RoomParams
+from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.deliver.ply import read_columns
+from ss_flow.tasks.splat import reconstruct as reconstruct_module
+
+STANDARD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+LABELS = ["instance_id", "instance_conf", "part_id"]
+VIEWS = [f"{k:04d}" for k in range(5)]
+
+
+def test_a_run_writes_what_the_readme_lists_and_nothing_else(tiny):
+    assert sorted(path.name for path in tiny.out.iterdir()) == [
+        "cloud_labeled.ply",
+        "instances",
+        "instances.json",
+        "masks",
+        "masks_split",
+        "report.html",
+        "run.json",
+        "scene.ply",
+        "scene_labeled.ply",
+    ]
+    assert not list(tiny.out.parent.glob(".out.*"))
+
+
+def test_the_scene_is_a_standard_splat_and_the_labelled_one_has_the_same_rows(tiny):
+    plain, labelled = (read_columns(tiny.out / name) for name in ("scene.ply", "scene_labeled.ply"))
+    names = list(plain.dtype.names)
+    assert names[: len(STANDARD)] == STANDARD
+    assert list(labelled.dtype.names) == [*names, *LABELS]
+    np.testing.assert_array_equal(labelled[names], plain)
+
+
+def test_every_instance_has_a_file_an_entry_and_its_rows_of_the_scene(tiny):
+    document = json.loads((tiny.out / "instances.json").read_text())
+    ids = [entry["id"] for entry in document["instances"]]
+    files = {int(path.stem): path for path in (tiny.out / "instances").iterdir()}
+    scene = read_columns(tiny.out / "scene_labeled.ply")
+    assert sorted(files) == ids == sorted(set(scene["instance_id"].tolist()) - {0})
+    assert len(ids) == 5  # table, shelf, sofa and two things
+    for instance_id, path in files.items():
+        rows = read_columns(path)
+        assert set(rows["instance_id"].tolist()) == {instance_id}
+        np.testing.assert_array_equal(rows["x"], scene["x"][scene["instance_id"] == instance_id])
+
+
+@pytest.mark.parametrize("stage", ["masks_split", "masks"])
+def test_the_masks_are_id_images_named_and_sized_like_the_photos(stage, tiny):
+    assert sorted(path.stem for path in (tiny.out / stage).iterdir()) == VIEWS
+    known = set(read_columns(tiny.out / "scene_labeled.ply")["instance_id"].tolist()) | {0}
+    for view in VIEWS:
+        ids = cv2.imread(str(tiny.out / stage / f"{view}.png"), cv2.IMREAD_UNCHANGED)
+        assert (ids.dtype, ids.shape) == (np.uint16, (72, 96))
+        assert set(np.unique(ids).tolist()) <= known
+
+
+def test_with_true_masks_every_object_keeps_its_pixels(tiny):
+    for view in VIEWS:
+        truth = cv2.imread(str(tiny.scene / "instance" / f"{view}.png"), cv2.IMREAD_UNCHANGED)
+        ids = cv2.imread(str(tiny.out / "masks_split" / f"{view}.png"), cv2.IMREAD_UNCHANGED)
+        for number in np.unique(truth[truth > 0]):
+            own, count = np.unique(ids[truth == number], return_counts=True)
+            assert own[count.argmax()] > 0
+            assert count.max() > 0.9 * count.sum()
+
+
+def test_the_labelled_cloud_has_labels_of_the_scene(tiny):
+    cloud = read_columns(tiny.out / "cloud_labeled.ply")
+    assert {"x", "y", "z", "red", "green", "blue", "instance_id"} <= set(cloud.dtype.names)
+    assert set(cloud["instance_id"].tolist()) - {0}
+
+
+def test_run_json_holds_what_was_asked_what_was_done_and_what_was_measured(tiny):
+    document = json.loads((tiny.out / "run.json").read_text())
+    assert document["status"] == "ok" and document["failures"] == []
+    assert Path(document["scene"]) == tiny.scene
+    assert document["params"]["split.propagate.tau_label"] == 0.7
+    assert document["params"]["splat.reconstruct.max_iterations"] == 20
+    assert document["models"] == {
+        "segmenter": "ready-made masks",
+        "encoder": "colour words (no network)",
+        "monodepth": None,
+    }
+    assert set(document["metrics"]) == {"split", "splat"}
+    assert document["metrics"]["split"]["miou"] > 0.9
+    nodes = document["nodes"]
+    assert {"step", "item", "key", "outputs", "hit", "seconds", "peak_rss_mb"} <= nodes[0].keys()
+    assert sorted(n["item"] for n in nodes if n["step"] == "split.visibility") == VIEWS
+    assert all(n["peak_rss_mb"] > 0 and n["seconds"] >= 0 for n in nodes)
+
+
+def test_with_json_stdout_holds_one_document_and_it_is_run_json(tiny):
+    on_disk = json.loads((tiny.out / "run.json").read_text())
+    printed = tiny.called.document()
+    assert {k: v for k, v in on_disk.items() if k != "delivered"} == {k: v for k, v in printed.items() if k != "delivered"}
+
+
+def test_the_report_names_the_scene_and_stands_alone(tiny):
+    html = (tiny.out / "report.html").read_text()
+    assert "room" in html
+    assert "data:image/" in html
+    assert "src=\"http" not in html and "href=\"http" not in html
+
+
+def test_photos_that_are_scaled_down_on_the_way_in_give_masks_of_their_own_size(tiny, tmp_path):
+    called = run_tiny(tiny.scene, tmp_path / "store", "--set", "ingest.max_side=48", out=tmp_path / "out")
+    assert called.code == 0, called.err
+    ids = cv2.imread(str(tmp_path / "out/masks/0000.png"), cv2.IMREAD_UNCHANGED)
+    assert ids.shape == (72, 96)
+    assert len(np.unique(ids)) > 2
+
+
+def test_views_kept_back_are_measured(tmp_path):
+    room = write_room(tmp_path / "room", params=RoomParams(objects=1, views=4, width=64, height=48, held_out=2))
+    called = run_tiny(room, tmp_path / "store", out=tmp_path / "out")
+    assert called.code == 0, called.err
+    measured = called.document()["metrics"]["novel_view"]
+    assert 5 < measured["psnr"] < 60
+
+
+def test_a_new_result_takes_the_place_of_the_old_one_whole(warm):
+    (warm.out / "instances/0099.ply").write_text("of an older run")
+    called = run_tiny(warm.scene, warm.store, "--set", "merge.global_iterations=5", out=warm.out)
+    assert called.code == 0
+    assert not (warm.out / "instances/0099.ply").exists()
+    assert not list(warm.out.parent.glob(".out.*"))
+
+
+def test_words_for_people_tell_what_was_measured_and_made(warm):
+    told = ss_flow("run", warm.scene, "--out", warm.out, "--cache", warm.store, "--preset", "fast", "--until", "masks_split")
+    assert told.code == 0
+    assert "results computed" in told.out and "reused" in told.out
+    assert told.err == ""
+
+
+def test_until_stops_there_and_writes_no_output(tiny, tmp_path):
+    called = run_tiny(tiny.scene, tmp_path / "store", "--until", "dense", out=tmp_path / "out")
+    assert called.code == 0
+    steps = {n["step"] for n in called.document()["nodes"]}
+    assert steps == {"capture.ingest", "capture.cameras", "capture.sensor_depth", "split.dense"}
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_tells_what_would_run_and_runs_nothing(warm, tmp_path):
+    actions = sorted((warm.store / "actions").rglob("*.json"))
+    runs = sorted((warm.store / "roots/runs").iterdir())
+    told = run_tiny(warm.scene, warm.store, "--dry-run", "--set", "tau_label=0.95", out=tmp_path / "new")
+    assert told.code == 0
+    assert told.document() == {"would_run": [{"label": "split.propagate", "why": "parameter tau_label 0.7 -> 0.95"}]}
+    words = ss_flow("run", warm.scene, "--cache", warm.store, "--preset", "fast", "--dry-run", "--out", tmp_path / "new")
+    assert "would run split.dense: parameter max_points" in words.out
+    assert "would follow split.propagate" in words.out
+    assert sorted((warm.store / "actions").rglob("*.json")) == actions
+    assert sorted((warm.store / "roots/runs").iterdir()) == runs
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """Have the training of some instances fail."""
+    real = reconstruct_module._from_points
+
+    def fail(which) -> None:
+        def begin(instance, params) -> Gaussians:
+            if which(instance.instance_id):
+                raise ArithmeticError(f"instance [{instance.instance_id}] went wrong")
+            return real(instance, params)
+
+        monkeypatch.setattr(reconstruct_module, "_from_points", begin)
+
+    return fail
+
+
+def test_when_one_instance_fails_the_others_are_delivered_and_the_run_is_degraded(tiny, failing, tmp_path):
+    failing(lambda instance_id: instance_id == 2)
+    called = run_tiny(tiny.scene, tmp_path / "store", out=tmp_path / "out")
+    assert called.code == 3, called.err
+    document = called.document()
+    assert document["status"] == "degraded"
+    assert document["failures"] == [
+        {"label": "splat.reconstruct[2]", "error": "ArithmeticError: instance [2] went wrong"}
+    ]
+    entries = json.loads((tmp_path / "out/instances.json").read_text())["instances"]
+    assert 2 not in [entry["id"] for entry in entries] and len(entries) == 4
+    assert not (tmp_path / "out/instances/0002.ply").exists()
+    assert 2 not in read_columns(tmp_path / "out/scene_labeled.ply")["instance_id"]
+    assert "degraded" in (tmp_path / "out/report.html").read_text()
+    words = ss_flow("status", "--cache", tmp_path / "store").out
+    assert "done, 1 failed" in words
+    failing(lambda instance_id: False)
+    mended = run_tiny(tiny.scene, tmp_path / "store", out=tmp_path / "out")
+    assert (mended.code, mended.document()["status"]) == (0, "ok")
+    assert mended.results() == tiny.called.results()
+
+
+def test_when_all_instances_fail_the_run_fails_and_the_earlier_result_stays(warm, failing):
+    failing(lambda instance_id: True)
+    before = {path.name: path.read_bytes() for path in warm.out.iterdir() if path.is_file()}
+    called = run_tiny(warm.scene, warm.store, "--set", "reconstruct.densify=false", out=warm.out)
+    assert called.code == 1
+    assert called.document()["status"] == "failed"
+    assert len(called.document()["failures"]) == 6
+    assert "Traceback" not in called.err
+    assert {path.name: path.read_bytes() for path in warm.out.iterdir() if path.is_file()} == before
+
+
+def test_photos_whose_names_look_like_markup_are_told_as_they_are(room, tmp_path):
+    scene = shutil.copytree(room, tmp_path / "[bold]room")
+    called = ss_flow("run", scene, "--cache", tmp_path / "store", "--out", tmp_path / "[red]out", "--until", "cameras")
+    assert called.code == 0
+    told = ss_flow("status", "--cache", tmp_path / "store").out
+    assert str(scene) in told
+    refused = ss_flow("run", tmp_path / "[bold]nowhere", "--cache", tmp_path / "store")
+    assert "[bold]nowhere does not exist" in refused.err
+
+
+def test_the_demo_builds_a_room_and_measures_the_result(tmp_path):
+    arguments = ["--objects", "1", "--views", "3", "--masks", "truth", "--until", "masks_split", "--json"]
+    first = ss_flow("demo", "--out", tmp_path / "demo", "--cache", tmp_path / "store", *arguments)
+    assert first.code == 0, first.err
+    assert sorted(path.name for path in (tmp_path / "demo/scene/color").iterdir())[0] == "0000.jpg"
+    stamp = (tmp_path / "demo/scene/recipe.json").stat().st_mtime_ns
+    again = ss_flow("demo", "--out", tmp_path / "demo", "--cache", tmp_path / "store", *arguments)
+    assert again.computed() == {}
+    assert (tmp_path / "demo/scene/recipe.json").stat().st_mtime_ns == stamp
+    other = ss_flow("demo", "--out", tmp_path / "demo", "--cache", tmp_path / "store", "--seed", "1", *arguments)
+    assert other.code == 0 and other.computed()["capture.ingest"] == 1
+
+
+def test_the_demo_leaves_a_scene_folder_of_something_else_alone(tmp_path):
+    (tmp_path / "demo/scene").mkdir(parents=True)
+    (tmp_path / "demo/scene/holiday.jpg").write_text("mine")
+    called = ss_flow("demo", "--out", tmp_path / "demo", "--cache", tmp_path / "store")
+    assert called.code == 2
+    assert "holds something else than a demo scene" in called.err
+    assert (tmp_path / "demo/scene/holiday.jpg").read_text() == "mine"
+
+
+def test_the_demo_refuses_an_output_below_a_file_before_it_builds_anything(tmp_path):
+    (tmp_path / "f").write_text("x")
+    called = ss_flow("demo", "--out", tmp_path / "f", "--cache", tmp_path / "store")
+    assert called.code == 2
+    assert "f is not a writable folder" in called.err
