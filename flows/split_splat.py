@@ -55,7 +55,8 @@ class Split:
 def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Any]:
     """The whole DAG. Returns its results by step; `--until` takes these names."""
     halved = split(capture, networks, params.split)
-    masks_split = resolve(capture.cameras, halved.instances)
+    with labelled("split"):
+        masks_split = resolve(capture.cameras, halved.instances)
     results: dict[str, Any] = {
         "ingest": capture.frames,
         "cameras": capture.cameras,
@@ -67,12 +68,16 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         "masks_split": masks_split,
     }
     if capture.truth is not None:
-        results["metrics_split"] = evaluate_masks(masks_split, capture.truth, zero_is_void=params.evaluate.zero_is_void)
+        with labelled("split"):
+            results["metrics_split"] = evaluate_masks(
+                masks_split, capture.truth, zero_is_void=params.evaluate.zero_is_void
+            )
     results |= splat(capture, halved, networks, params)
     if capture.truth is not None:
-        results["metrics_splat"] = evaluate_masks(
-            results["masks"], capture.truth, zero_is_void=params.evaluate.zero_is_void
-        )
+        with labelled("splat"):
+            results["metrics_splat"] = evaluate_masks(
+                results["masks"], capture.truth, zero_is_void=params.evaluate.zero_is_void
+            )
     if held_out is not None:
         results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])
     results["describe"] = each(
@@ -166,7 +171,8 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
         return retrain(*views, exclusive(instance, masks), gaussians, params=settings.reconstruct, **tau)
 
     first, better = each(halved.instances, build=build, outputs=2, on_error="skip")
-    masks = resolve(capture.cameras, better)
+    with labelled("splat"):
+        masks = resolve(capture.cameras, better)
     groups = each(better, first, build=again, on_error="skip")
     merged = merge_rounds(views, groups, masks, params, 0)
     scene = global_pass(*views, assemble(merged), masks, params=settings.merge)

@@ -107,6 +107,8 @@ class Scheduler:
             self._submit()
             if self._running or self._claimed_elsewhere:
                 self._collect()
+            elif not self._ready and not all(target in self._values for target in targets):
+                raise RuntimeError("the flow waits for itself: a node depends on what it expands to")
         return Outcome({target: self._values[target] for target in targets}, self._failures)
 
     def producer(self, node: Node) -> str:

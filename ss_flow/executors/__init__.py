@@ -7,7 +7,10 @@ from concurrent.futures import Future
 from typing import Protocol
 
 from ss_flow.cache.store import Action, Store
+from ss_flow.errors import InputError
 from ss_flow.execute import Invocation
+
+NAMES = ("threads", "processes")
 
 OnProgress = Callable[[str, int, int, str], None]
 """Called with a node's label, how much is done, of how much, and a note."""
@@ -30,12 +33,9 @@ class Executor(Protocol):
 
 
 def open_executor(name: str, workers: int, store: Store, on_progress: OnProgress) -> Executor:
-    """The executor of that name. Raises InputError for an unknown one."""
-    from ss_flow.errors import InputError
-    from ss_flow.executors.processes import Processes
-    from ss_flow.executors.threads import Threads
+    """The executor "threads" or "processes". Raises InputError for another name."""
+    from ss_flow.executors.local import LocalPool
 
-    kinds: dict[str, Callable[[int, Store, OnProgress], Executor]] = {"threads": Threads, "processes": Processes}
-    if name not in kinds:
-        raise InputError(f"executor {name!r} is unknown; choose one of: {', '.join(kinds)}.")
-    return kinds[name](workers, store, on_progress)
+    if name not in NAMES:
+        raise InputError(f"executor {name!r} is unknown; choose one of: {', '.join(NAMES)}.")
+    return LocalPool(workers, store, on_progress, processes=name == "processes")

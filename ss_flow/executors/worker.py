@@ -46,8 +46,12 @@ class Worker:
             self._process.join(5)
             raise WorkerDied(f"the process of {invocation.label} {_ending(self._process.exitcode)}") from None
 
+    def kill(self) -> None:
+        """End the process, whatever it does; a call that waits for it raises WorkerDied. From any thread."""
+        self._process.terminate()
+
     def stop(self) -> None:
-        """End the process, whatever it does."""
+        """End the process, and release what it held."""
         self._connection.close()
         self._process.terminate()
         self._process.join(5)

@@ -80,7 +80,9 @@ def test_what_is_not_a_dataclass_of_arrays_is_refused(tmp_path):
 
 
 def test_gaussians_of_no_rows_keep_their_shapes(tmp_path):
-    empty = {n: np.zeros((0, *s), np.float32) for n, s in (("means", (3,)), ("quaternions", (4,)), ("log_scales", (3,)))}
+    empty = {
+        n: np.zeros((0, *s), np.float32) for n, s in (("means", (3,)), ("quaternions", (4,)), ("log_scales", (3,)))
+    }
     ids = {n: np.zeros(0, np.int32) for n in ("instance_id", "part_id")}
     rest = {n: np.zeros(0, np.float32) for n in ("opacity_logits", "instance_conf")}
     codec.write(Gaussians(**empty, **ids, **rest, sh=np.zeros((0, 16, 3), np.float32)), tmp_path / "object")

@@ -46,7 +46,9 @@ def test_a_run_of_hits_loads_no_heavy_library(warm):
         f"print(code, [m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
     )
     options = ["--out", str(warm.out), "--cache", str(warm.store), "--preset", "fast", "--json", *SHORT]
-    done = subprocess.run([sys.executable, "-c", code, "run", str(warm.scene), *options], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, "run", str(warm.scene), *options], capture_output=True, text=True
+    )
     assert done.stderr.strip().splitlines()[-1] == "0 []"
 
 
@@ -185,7 +187,9 @@ def test_a_killed_run_goes_on_from_what_it_had_finished(tiny, tmp_path):
     assert "running, or killed" in state
     again = run_tiny(tiny.scene, store, out=out)
     assert again.code == 0, again.err
-    made_again = {f"{n['step']}[{n['item']}]" if n["item"] else n["step"] for n in again.document()["nodes"] if not n["hit"]}
+    made_again = {
+        f"{n['step']}[{n['item']}]" if n["item"] else n["step"] for n in again.document()["nodes"] if not n["hit"]
+    }
     assert made_again and not made_again & finished
     assert again.results() == tiny.called.results()
 

@@ -51,7 +51,7 @@ def test_a_changed_parameter_recomputes_only_what_depends_on_it(store):
 def test_a_recomputation_with_an_equal_result_stops_there(store):
     run(store, toy.flow)
     report = run(store, lambda: toy.flow(limit=50.0))
-    assert ran(report) == [f"ss_flow_toy.clip[n{i}]" for i in range(3)]
+    assert sorted(ran(report)) == [f"ss_flow_toy.clip[n{i}]" for i in range(3)]
 
 
 def test_a_changed_item_recomputes_only_its_own_branch(store):

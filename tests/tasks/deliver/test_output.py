@@ -1,0 +1,102 @@
+"""The output folder: whole or not at all, and never in the place of something else."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import Frame, LabelMap
+from ss_flow.tasks.deliver.output import RUN_FILE, check_place, replacing, write_masks
+
+EMPTY = np.zeros(0, np.uint8)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_what_was_filled_appears_under_the_name_and_nothing_beside_it(tmp_path):
+    with replacing(tmp_path / "deep/out") as filling:
+        (filling / "a").write_text("1")
+        assert not (tmp_path / "deep/out").exists()
+    assert (tmp_path / "deep/out/a").read_text() == "1"
+    assert names(tmp_path / "deep") == ["out"]
+
+
+def test_the_new_content_replaces_the_old_as_a_whole(tmp_path):
+    for name in ("a", "b"):
+        with replacing(tmp_path / "out") as filling:
+            (filling / name).write_text(name)
+    assert names(tmp_path / "out") == ["b"]
+    assert names(tmp_path) == ["out"]
+
+
+def test_when_filling_fails_the_old_content_stays(tmp_path):
+    with replacing(tmp_path / "out") as filling:
+        (filling / "a").write_text("old")
+    with pytest.raises(OSError, match="full"), replacing(tmp_path / "out") as filling:
+        (filling / "a").write_text("half")
+        raise OSError("disk full")
+    assert (tmp_path / "out/a").read_text() == "old"
+    assert names(tmp_path) == ["out"]
+
+
+def test_what_a_killed_run_left_is_taken_away_and_the_neighbours_are_not(tmp_path):
+    (tmp_path / ".out.0123abcd.partial").mkdir()
+    (tmp_path / ".out2.0123abcd.partial").mkdir()
+    (tmp_path / "out.partial").mkdir()
+    with replacing(tmp_path / "out"):
+        pass
+    assert names(tmp_path) == [".out2.0123abcd.partial", "out", "out.partial"]
+
+
+def test_a_relative_name_is_taken_from_where_one_is(tmp_path, monkeypatch):
+    from pathlib import Path
+
+    monkeypatch.chdir(tmp_path)
+    with replacing(Path("out")) as filling:
+        (filling / "a").touch()
+    assert (tmp_path / "out/a").exists()
+
+
+@pytest.mark.parametrize("make", ["nothing", "empty", "earlier result", "deep"])
+def test_a_place_that_is_free_or_holds_an_earlier_result_is_accepted(make, tmp_path):
+    place = tmp_path / ("a/b/c/out" if make == "deep" else "out")
+    if make in ("empty", "earlier result"):
+        place.mkdir()
+    if make == "earlier result":
+        (place / RUN_FILE).write_text("{}")
+        (place / "scene.ply").write_text("x")
+    check_place(place)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [("file", "out is a file"), ("foreign", "something else"), ("below a file", "not a writable folder")],
+)
+def test_a_place_that_is_taken_is_refused(make, says, tmp_path):
+    place = tmp_path / "out"
+    if make == "foreign":
+        place.mkdir()
+        (place / "thesis.tex").write_text("x")
+    else:
+        place.write_text("x")
+    with pytest.raises(InputError, match=says):
+        check_place(place / "deeper" if make == "below a file" else place)
+
+
+def test_masks_are_written_at_the_size_of_the_photo_without_blending_ids(tmp_path):
+    ids = np.array([[1, 500], [0, 65535]], np.uint16)
+    frame = Frame("view", 2, 2, EMPTY, EMPTY, 8, 6)
+    write_masks(tmp_path / "masks", [frame], [LabelMap("view", ids)])
+    read = cv2.imread(str(tmp_path / "masks/view.png"), cv2.IMREAD_UNCHANGED)
+    assert read.dtype == np.uint16
+    np.testing.assert_array_equal(read, np.kron(ids, np.ones((3, 4), np.uint16)))
+
+
+def test_frames_and_maps_that_do_not_pair_up_are_a_fault(tmp_path):
+    frame = Frame("view", 2, 2, EMPTY, EMPTY, 2, 2)
+    with pytest.raises(ValueError, match="shorter"):
+        write_masks(tmp_path / "masks", [frame], [])
