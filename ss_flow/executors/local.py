@@ -1,4 +1,4 @@
-"""Calls on this machine: in threads of this process, whose native code releases the GIL, or in processes of their own."""
+"""Calls on this machine: in threads of this process (native code releases the GIL), or in processes of their own."""
 
 from __future__ import annotations
 

@@ -37,14 +37,24 @@ class Target:
     """[h, w] 1 where unknown."""
     known: Float32
     """[h, w] 1 / number of inside pixels of known depth there, 0 elsewhere."""
-    masks: Float32
-    """[L, h, w] one-hot."""
+    present: Int32
+    """[P] the labels that the view shows. All other labels share one channel after theirs, which should stay empty: a
+    sum of absolute values that are nowhere negative is the absolute value of their sum, so the loss is the same."""
+    channel: Int32
+    """[h, w] which of the channels each pixel belongs to, negative where to none."""
     labelled: Float32
-    """[L, h, w] 1 / (L * number of pixels that are not ignored) there, 0 elsewhere."""
+    """[h, w] 1 / (L * number of pixels that are not ignored) there, 0 elsewhere."""
+    channel_of_label: Int32
+    """[L + 1] the channel of each label; the last entry, which the label -1 finds, is -1. Empty without mask loss."""
 
     @property
     def num_labels(self) -> int:
-        return len(self.masks)
+        """Number of mask channels."""
+        return len(self.present) + 1 if len(self.channel_of_label) else 0
+
+    def masks(self) -> Float32:
+        """The mask of each channel: [P + 1, h, w] one-hot."""
+        return (self.channel == np.arange(self.num_labels)[:, None, None]).astype(np.float32)
 
     @property
     def pixels(self) -> int:
@@ -71,15 +81,17 @@ class Target:
             raise ValueError(f"image must be {[*size, 3]} float32, not {list(image.shape)} {image.dtype}")
         inside, free = np.asarray(inside, bool), np.asarray(free, bool)
         known = inside & (depth > 0) & np.isfinite(depth)
-        channels = num_labels if ids is not None else 0
-        masks = np.zeros((channels, *size), np.float32)
-        labelled = np.zeros((channels, *size), np.float32)
-        if ids is not None and channels:
-            if ids.max(initial=-1) >= channels:
-                raise ValueError(f"ids must be below the {channels} label ids, but one is {int(ids.max())}")
-            for channel in range(channels):
-                masks[channel] = ids == channel
-            labelled[:] = _mean(ids != -1) / channels
+        present = channel_of_label = np.zeros(0, np.int32)
+        channel, labelled = np.full(size, -1, np.int32), np.zeros(size, np.float32)
+        if ids is not None and num_labels:
+            if ids.max(initial=-1) >= num_labels:
+                raise ValueError(f"ids must be below the {num_labels} label ids, but one is {int(ids.max())}")
+            present = np.unique(ids[ids >= 0]).astype(np.int32)
+            channel_of_label = np.full(num_labels + 1, len(present), np.int32)
+            channel_of_label[present] = np.arange(len(present))
+            channel_of_label[-1] = -1
+            channel = np.where(ids >= 0, channel_of_label[np.maximum(ids, 0)], -1).astype(np.int32)
+            labelled = _mean(ids != -1) / np.float32(num_labels)
         return cls(
             camera,
             np.ascontiguousarray(image),
@@ -87,8 +99,10 @@ class Target:
             _mean(inside | free),
             np.where(known, depth, 1).astype(np.float32),
             _mean(known),
-            masks,
+            present,
+            channel,
             labelled,
+            channel_of_label,
         )
 
 
@@ -119,7 +133,8 @@ def gradients_of(
         towards_alpha -= towards
         towards_depth = towards / target.depth
     if target.num_labels:
-        loss, towards_masks = weighted_l1(rendered.masks, target.masks, target.labelled)
+        weight = np.broadcast_to(target.labelled, rendered.masks.shape)
+        loss, towards_masks = weighted_l1(rendered.masks, target.masks(), weight)
         towards_masks *= np.float32(weights.mask)
         total += weights.mask * loss
     return total, (color.gradient, towards_alpha, towards_depth, towards_masks)

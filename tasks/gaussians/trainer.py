@@ -157,7 +157,7 @@ def train(
             _background(params.background, generator),
             target.num_labels, degree, NEAR_PLANE, params.antialias, winners=False,
         )  # fmt: skip
-        labels = channels[parameters.origin] if target.num_labels else None
+        labels = target.channel_of_label[channels[parameters.origin]] if target.num_labels else None
         rendered = NativePass(parameters.for_rendering(degree), labels, target.camera, settings)
         weights = Weights(
             params.ssim_weight,

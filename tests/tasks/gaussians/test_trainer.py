@@ -11,6 +11,7 @@ import pytest
 from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.objective import Target
 from ss_flow.tasks.gaussians.trainer import TrainingDiverged, TrainParams, TrainView, auto_iterations, train
 from ss_flow.tasks.geometry.cameras import Camera
 
@@ -192,3 +193,17 @@ def test_opaque_rendering_ignores_the_opacities():
     centre = SIZE // 2
     assert render(faint, camera).alpha[centre, centre] < 0.5
     assert render(faint, camera, opaque=True).alpha[centre, centre] > 0.95
+
+
+def test_labels_that_a_view_does_not_show_share_a_channel_and_the_mask_loss_stays_the_same():
+    generator = np.random.default_rng(5)
+    weights = generator.random((4, 6, 8)).astype(np.float32)
+    ids = generator.integers(-2, 2, (6, 8)).astype(np.int32)
+    camera = Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4))
+    nothing = np.zeros((6, 8), bool)
+    target = Target.of(camera, np.zeros((6, 8, 3), np.float32), nothing, nothing, np.zeros((6, 8)), ids, 4)
+    assert target.channel_of_label.tolist() == [0, 1, 2, 2, -1]
+    shared = np.stack([weights[0], weights[1], weights[2] + weights[3]])
+    one_hot = ids == np.arange(4)[:, None, None]
+    expected = (np.abs(weights - one_hot) * (ids != -1)).sum() / (4 * (ids != -1).sum())
+    assert (np.abs(shared - target.masks()) * target.labelled).sum() == pytest.approx(expected, rel=1e-5)
