@@ -19,7 +19,7 @@ from ss_flow.flows.params import Params
 PAGE = Path(__file__).with_name("parameters.md")
 BEGIN, END = "<!-- table of parameters: written by make_parameters.py -->", "<!-- end of the table -->"
 HEAD = ("| parameter | default | presets | what it is |", "|---|---|---|---|")
-PRESETS = ("paper", "reference", "fast")
+PRESETS = ("paper", "reference", "fast", "thorough")
 HEADINGS = {
     "capture": "Capture: photos, poses, depth",
     "split": "Split: masks to view-consistent instances",

@@ -38,7 +38,8 @@ class RunOptions:
     """How to run, whatever the scene."""
 
     preset: str = "default"
-    """default, paper (the paper's values), reference (those of its authors' code) or fast (for a quick look)."""
+    """default, paper (the paper's values), reference (those of its authors' code), fast (for a quick look) or thorough
+    (for a machine with time)."""
     assignments: Assignments = ()
     """Set a parameter, as in --set split.tau_label=0.8."""
     until: str | None = None

@@ -26,13 +26,13 @@ from ss_flow.tasks.splat.views import IGNORED, NONE_OF_MINE, CropParams, SceneVi
 class MergeParams:
     """How merged Gaussians are refined together, without densification."""
 
-    iterations_per_view: Count = 10
+    iterations_per_view: Count = 6
     """Training steps of a pair for each view that sees it, within the two limits below."""
-    min_iterations: Count = 100
+    min_iterations: Count = 60
     """Fewest steps of a pair."""
-    max_iterations: Count = 300
+    max_iterations: Count = 150
     """Most steps of a pair."""
-    global_iterations: Natural = 1000
+    global_iterations: Natural = 500
     """Steps of the last pass over the whole scene; 0 leaves it out."""
     global_mask_weight: NonNegative = 0.25
     """w_mask of the last pass."""

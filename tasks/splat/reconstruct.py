@@ -23,13 +23,13 @@ from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask
 class ReconstructParams:
     """How an instance is trained."""
 
-    iterations_per_view: Count = 20
+    iterations_per_view: Count = 12
     """Training steps for each view of the instance, within the two limits below."""
     min_iterations: Count = 300
     """Fewest steps."""
-    max_iterations: Count = 1000
+    max_iterations: Count = 600
     """Most steps."""
-    retrain_share: NonNegative = 0.5
+    retrain_share: NonNegative = 0.3
     """Steps of training after refinement, as a share of the first training's."""
     warm_start: bool = True
     """Whether training after refinement goes on from the Gaussians of the first, or starts over."""
