@@ -111,7 +111,8 @@ def run_scene(scene_path: Path, masks: Path | None, out: Path, params: Params, o
     if options.jobs < 0:
         raise InputError(f"--jobs {options.jobs} is out of range; it must be 0 (one a core) or more.")
     scene = open_scene(scene_path, masks).every(params.capture.stride)
-    whole = options.until is None and not options.dry_run
+    until = options.until.rpartition(".")[2] if options.until else None  # "split.propagate" is "propagate"
+    whole = until is None and not options.dry_run
     if whole:
         check_place(out)
     store = options.store.open_store()
@@ -131,7 +132,7 @@ def run_scene(scene_path: Path, masks: Path | None, out: Path, params: Params, o
         if held_out.is_dir():
             extra = capture(open_scene(held_out), reference, params.capture, networks.monodepth)
         results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
-        if options.until is not None and options.until not in results:
+        if until is not None and until not in results:
             raise InputError(f"--until {options.until!r} names no step; there are {', '.join(results)}.")
         return results
 
@@ -142,7 +143,7 @@ def run_scene(scene_path: Path, masks: Path | None, out: Path, params: Params, o
             store,
             scene=str(scene.root.resolve()),
             header={"preset": options.preset, "params": settings.flat(params)},
-            until=options.until,
+            until=until,
             jobs=options.jobs,
             executor=options.executor,
             reporter=_display(out_console),
