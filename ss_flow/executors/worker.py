@@ -16,6 +16,9 @@ from ss_flow.events import Listener
 from ss_flow.execute import Invocation, execute
 
 
+GRACE_SECONDS = 3.0
+
+
 class WorkerDied(RuntimeError):
     """The process of a worker ended in the middle of a call (a library aborted, or memory ran out)."""
 
@@ -43,7 +46,7 @@ class Worker:
                 else:
                     return content
         except (EOFError, BrokenPipeError, ConnectionResetError):
-            self._process.join(5)
+            self._process.join(GRACE_SECONDS)
             raise WorkerDied(f"the process of {invocation.label} {_ending(self._process.exitcode)}") from None
 
     def kill(self) -> None:
@@ -51,10 +54,11 @@ class Worker:
         self._process.terminate()
 
     def stop(self) -> None:
-        """End the process, and release what it held."""
+        """End the process, and release what it held: it leaves by itself when idle, and is ended when it does not."""
         self._connection.close()
+        self._process.join(GRACE_SECONDS)
         self._process.terminate()
-        self._process.join(5)
+        self._process.join(GRACE_SECONDS)
 
 
 def _serve(connection: Connection, root: Path) -> None:
