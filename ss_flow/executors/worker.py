@@ -15,7 +15,6 @@ from ss_flow.cache.store import Action, Store
 from ss_flow.events import Listener
 from ss_flow.execute import Invocation, execute
 
-
 GRACE_SECONDS = 3.0
 
 

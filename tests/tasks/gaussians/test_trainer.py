@@ -10,8 +10,8 @@ import pytest
 
 from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
-from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.objective import Target
+from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainingDiverged, TrainParams, TrainView, auto_iterations, train
 from ss_flow.tasks.geometry.cameras import Camera
 
