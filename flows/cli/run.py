@@ -69,13 +69,13 @@ class Run:
     """The folder to write; by default ss-flow-out/NAME of the scene."""
     masks: Path | None = None
     """A folder of ready-made instance masks (uint16 PNG files named like the photos), in the place of a segmenter."""
-    options: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
+    execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
     """How to run."""
 
     def run(self) -> int:
-        params = settings.preset(Params(), self.options.preset)
+        params = settings.preset(Params(), self.execution.preset)
         out = self.out or Path("ss-flow-out") / self.scene.resolve().stem
-        return run_scene(self.scene, self.masks, out, params, self.options)
+        return run_scene(self.scene, self.masks, out, params, self.execution)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Demo:
     """How many photos are taken of it."""
     seed: int = 0
     """Another seed is another room."""
-    options: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions(preset="fast")
+    execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions(preset="fast")
     """How to run."""
 
     def run(self) -> int:
@@ -100,9 +100,9 @@ class Demo:
 
         check_place(self.out / "result")
         scene = demo_scene(self.out, self.masks, self.objects, self.views, self.seed)
-        params = settings.preset(Params(), self.options.preset)
+        params = settings.preset(Params(), self.execution.preset)
         params = dataclasses.replace(params, evaluate=dataclasses.replace(params.evaluate, zero_is_void=False))
-        return run_scene(scene, None, self.out / "result", params, self.options)
+        return run_scene(scene, None, self.out / "result", params, self.execution)
 
 
 def run_scene(scene_path: Path, masks: Path | None, out: Path, params: Params, options: RunOptions) -> int:

@@ -45,7 +45,7 @@ class SweepParams:
     best: Count = 3
     """Out of those, so many that match a pixel best decide."""
     window: Count = 9
-    """Side of the window that is compared, in pixels, odd."""
+    """Side of the window that is compared, in pixels; an even number counts as the odd one above it."""
     small_step: NonNegative = 0.04
     """Price of a step by one plane between neighbouring pixels (costs lie in 0..1)."""
     large_step: NonNegative = 0.3
@@ -91,7 +91,7 @@ def sweep(
         return DepthMap(frames[view].name, np.zeros_like(reference.gray), "mvs")
     others = [_view(frames[k], all_cameras[k], params.max_side) for k in sources]
     planes = inverse_depth_planes(near, far, params.planes)
-    cost = matching_cost(reference, others, planes, params.window, params.best)
+    cost = matching_cost(reference, others, planes, params.window | 1, params.best)
     smooth = smooth_cost(cost, reference.gray, params.small_step, params.large_step)
     depth, _ = cheapest_depth(smooth, planes)
     best = smooth.argmin(axis=2)

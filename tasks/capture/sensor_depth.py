@@ -70,6 +70,11 @@ def registered_depth(
     color = None if lens is None else lens.scaled(frame.source_width, frame.source_height) if not lens.width else lens
     if depth_lens is not None and color is not None and not _same_camera(depth_lens, color, w, h):
         sized = depth_lens if depth_lens.width else Lens(w, h, *_focal_and_center(depth_lens))
+        if not (abs(sized.cx / w - 0.5) < 0.25 and abs(sized.cy / h - 0.5) < 0.25):
+            raise InputError(
+                f"{where} is {w}x{h} pixels, but its lens has its centre at ({sized.cx:g}, {sized.cy:g}), far from the "
+                "middle; the intrinsics are for depth of another size."
+            )
         values = cv2.remap(values, depth_to_color_map(sized, color), None, cv2.INTER_NEAREST)
     elif abs(w * frame.source_height / (h * frame.source_width) - 1) > 0.02:
         raise InputError(

@@ -138,7 +138,7 @@ def default_folders() -> tuple[Path, ...]:
 
 def cache_folder() -> Path:
     """Where `fetch` puts models."""
-    return Path.home() / ".cache" / "ss-flow" / "models"
+    return Path(os.environ.get("XDG_CACHE_HOME", "") or "~/.cache").expanduser() / "ss-flow" / "models"
 
 
 def blake3_of(path: Path) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from capture_folders import ref, refs
 
+from ss_flow.errors import InputError
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.ingest import IngestParams, cameras, frames
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map
@@ -159,6 +160,14 @@ def test_registering_moves_pixels_only_where_the_cameras_differ(tmp_path):
     moved = read_depth(scene, views)[0].depth
     np.testing.assert_allclose(moved[:, :14] * 1000, ramp[:, 2:], rtol=1e-6)
     assert not moved[:, 14:].any()
+
+
+def test_the_depth_lens_of_another_size_is_refused(tmp_path):
+    made.scannet(tmp_path)
+    made.write(tmp_path / "depth" / "2.png", np.full((24, 32), 1000, np.uint16))
+    scene = open_scene(tmp_path)
+    with pytest.raises(InputError, match="far from the middle"):
+        read_depth(scene, ingested(scene))
 
 
 def test_float_depth_is_in_world_units_and_what_is_not_finite_is_unknown(tmp_path):
