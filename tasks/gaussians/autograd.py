@@ -43,7 +43,9 @@ class _Rasterize(torch.autograd.Function):
         done = NativePass(parameters, channels, camera, settings)  # type: ignore[arg-type]
         ctx.done, ctx.centers = done, centers
         ctx.set_materialize_grads(False)
-        images = (done.rgb, done.alpha, done.depth, done.masks, done.top, done.radii, done.strongest)
+        none = np.full(done.alpha.shape, -1, np.int32), np.zeros(len(parameters[0]), np.float32)
+        top, strongest = none if done.top is None else (done.top, done.strongest)
+        images = (done.rgb, done.alpha, done.depth, done.masks, top, done.radii, strongest)
         outputs = tuple(torch.from_numpy(a) for a in images)
         ctx.mark_non_differentiable(*outputs[4:])
         return outputs

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_INT32, _INT64, _DOUBLE, _FLOAT, _POINTER = (
+_INT, _INT32, _INT64, _DOUBLE, _FLOAT, _POINTER = (
+    ctypes.c_int,
     ctypes.c_int32,
     ctypes.c_int64,
     ctypes.c_double,
@@ -25,7 +26,7 @@ class Scene(ctypes.Structure):
 
     _fields_ = (
         ("count", _INT64),
-        *((name, _POINTER) for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "labels")),
+        *((name, _POINTER) for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "labels", "ids")),
         *((name, _INT32) for name in ("sh_coefficients", "sh_degree", "num_labels", "width", "height", "antialias")),
         *((name, _DOUBLE) for name in ("fx", "fy", "cx", "cy")),
         ("world_to_camera", _DOUBLE * 12),
@@ -37,7 +38,9 @@ class Scene(ctypes.Structure):
 class Images(ctypes.Structure):
     """`Images` of native/scene.h."""
 
-    _fields_ = tuple((name, _POINTER) for name in ("rgb", "alpha", "depth", "masks", "top", "radii", "strongest"))
+    _fields_ = tuple(
+        (name, _POINTER) for name in ("rgb", "alpha", "depth", "masks", "mismatch", "top", "radii", "strongest")
+    )
 
 
 class Gradients(ctypes.Structure):
@@ -80,20 +83,25 @@ def library(name: str | None = None) -> Any:
     """The native library, opened; name: an instruction set, by default the processor's widest."""
     lib = ctypes.CDLL(str(Path(__file__).parent / f"_rasterizer_{name or instruction_set()}.so"))
     by_reference = ctypes.POINTER
-    lib.ss_rasterize.argtypes = [by_reference(Scene), by_reference(Images)]
-    lib.ss_rasterize.restype = _POINTER
+    lib.ss_workspace.argtypes = []
+    lib.ss_workspace.restype = _POINTER
+    lib.ss_workspace_free.argtypes = [_POINTER]
+    lib.ss_workspace_free.restype = None
+    lib.ss_entries.argtypes = [_POINTER]
+    lib.ss_entries.restype = _INT64
+    lib.ss_rasterize.argtypes = [_POINTER, by_reference(Scene), by_reference(Images), _INT]
+    lib.ss_rasterize.restype = _INT
     lib.ss_rasterize_backward.argtypes = [
         _POINTER,
         by_reference(Scene),
         by_reference(Images),
         by_reference(Images),
         by_reference(Gradients),
+        _INT,
     ]
-    lib.ss_rasterize_backward.restype = ctypes.c_int
-    lib.ss_rasterize_release.argtypes = [_POINTER]
-    lib.ss_rasterize_release.restype = None
+    lib.ss_rasterize_backward.restype = _INT
     lib.ss_photometric.argtypes = [_INT32, _INT32, _INT32, _POINTER, _POINTER, _POINTER, _FLOAT, _POINTER, _POINTER]
-    lib.ss_photometric.restype = ctypes.c_int
+    lib.ss_photometric.restype = _INT
     lib.ss_weighted_l1.argtypes = [_INT64, _POINTER, _POINTER, _POINTER, _POINTER]
     lib.ss_weighted_l1.restype = _DOUBLE
     lib.ss_adam.argtypes = [_INT64, _POINTER, _POINTER, _POINTER, _POINTER, _DOUBLE, _INT64, _DOUBLE]

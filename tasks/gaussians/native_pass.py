@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Int32
 from ss_flow.tasks.gaussians.library import Gradients, Images, Scene, address, library
 from ss_flow.tasks.geometry.cameras import Camera
+
+PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,32 @@ class Settings:
     """Whether to find each pixel's top contributor and each Gaussian's largest weight."""
 
 
+class Workspace:
+    """The native memory of a rendering, reused by the next one; for one thread at a time.
+
+    A pass can run backward only until another pass renders in its workspace.
+    """
+
+    def __init__(self) -> None:
+        self.handle = library().ss_workspace()
+        if self.handle is None:
+            raise MemoryError("not enough memory for a rendering")
+        self.turn = 0
+        """How many passes have rendered in it."""
+
+    def __del__(self) -> None:
+        if getattr(self, "handle", None) is not None:
+            library().ss_workspace_free(self.handle)
+
+
 class NativePass:
     """A forward pass and what its backward pass needs; give the arrays C-contiguous, float32 and int32.
 
-    Images after construction: rgb [H, W, 3], alpha [H, W], depth [H, W], masks [L, H, W], top [H, W] int32;
-    for the Gaussians: radii [N] pixels, strongest [N] largest weight (zeros without `winners`).
+    labels: [N], < 0 = none. With `ids` ([H, W]: the label that each pixel should show), `mismatch` [H, W] is the sum of
+    the weights of other labels less those of the pixel's own; without, `masks` [L, H, W] are the sums of each label's
+    weights. Further images: rgb [H, W, 3], alpha [H, W], depth [H, W], top [H, W] int32; for the Gaussians: radii [N]
+    pixels, strongest [N] largest weight; `top` and `strongest` are None without `winners`. The number of threads changes
+    no byte.
     """
 
     def __init__(
@@ -39,15 +61,19 @@ class NativePass:
         labels: Int32 | None,
         camera: Camera,
         settings: Settings,
+        *,
+        ids: Int32 | None = None,
+        workspace: Workspace | None = None,
+        threads: int = 1,
     ) -> None:
-        means, quaternions, log_scales, opacity_logits, sh = parameters
-        h, w, n = camera.height, camera.width, len(means)
-        self._kept: Any = None
-        self._inputs = (*parameters, labels)  # the scene below holds only their addresses
+        h, w, n = camera.height, camera.width, len(parameters[0])
+        self._inputs = (*parameters, labels, ids)  # the scene below holds only their addresses
+        self._threads = threads
+        self._workspace = Workspace() if workspace is None else workspace
         self._scene = Scene(
             n,
-            *(address(a) for a in (means, quaternions, log_scales, opacity_logits, sh, labels)),
-            sh.shape[1],
+            *(address(a) for a in self._inputs),
+            parameters[4].shape[1],
             settings.sh_degree,
             settings.num_labels,
             w,
@@ -64,37 +90,61 @@ class NativePass:
         self.rgb = np.empty((h, w, 3), np.float32)
         self.alpha = np.empty((h, w), np.float32)
         self.depth = np.empty((h, w), np.float32)
-        self.masks = np.zeros((settings.num_labels, h, w), np.float32)
-        self.top = np.full((h, w), -1, np.int32)
+        self.masks = np.zeros((0 if labels is None or ids is not None else settings.num_labels, h, w), np.float32)
+        self.mismatch = np.empty((h, w), np.float32) if ids is not None else None
+        self.top = np.full((h, w), -1, np.int32) if settings.winners else None
         self.radii = np.empty(n, np.float32)
-        self.strongest = np.zeros(n, np.float32)
-        top, strongest = (self.top, self.strongest) if settings.winners else (None, None)
-        images = (self.rgb, self.alpha, self.depth, self.masks, top, self.radii, strongest)
+        self.strongest = np.empty(n, np.float32) if settings.winners else None
+        masks = self.masks if len(self.masks) else None
+        images = (self.rgb, self.alpha, self.depth, masks, self.mismatch, self.top, self.radii, self.strongest)
         self._images = Images(*(address(a) for a in images))
-        self._kept = library().ss_rasterize(ctypes.byref(self._scene), ctypes.byref(self._images))
-        if self._kept is None:
+        failed = library().ss_rasterize(
+            self._workspace.handle, ctypes.byref(self._scene), ctypes.byref(self._images), threads
+        )
+        self._workspace.turn += 1
+        self._turn = self._workspace.turn
+        if failed:
             raise MemoryError(f"not enough memory to render {n} Gaussians at {w}x{h}")
 
-    def __del__(self) -> None:
-        if self._kept is not None:
-            library().ss_rasterize_release(self._kept)
+    @property
+    def entries(self) -> int:
+        """How many (Gaussian, 4x4-pixel block) pairs were blended: what the time of a rendering grows with."""
+        self._check_workspace()
+        return int(library().ss_entries(self._workspace.handle))
+
+    def _check_workspace(self) -> None:
+        if self._workspace.turn != self._turn:
+            raise RuntimeError("the workspace of this rendering holds another one by now")
 
     def backward(
-        self, rgb: Float32 | None, alpha: Float32 | None, depth: Float32 | None, masks: Float32 | None
+        self,
+        rgb: Float32 | None,
+        alpha: Float32 | None,
+        depth: Float32 | None,
+        labelled: Float32 | None,
+        *,
+        out: dict[str, Float32] | None = None,
     ) -> dict[str, Float32]:
-        """Gradients of the parameters, of the background and of the projected means (`centers` [N, 2], pixels)."""
-        given = Images(*(address(a) for a in (rgb, alpha, depth, masks)), None, None, None)
-        names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-        out = {name: np.zeros_like(a) for name, a in zip(names, self._inputs[:5], strict=True)}
-        out["centers"] = np.zeros((len(self.radii), 2), np.float32)
-        out["background"] = np.zeros(3, np.float32)
-        gradients = Gradients(*(address(a) for a in out.values()))
+        """Gradients of the parameters, of the background and of the projected means (`centers` [N, 2], pixels).
+
+        labelled: the gradient towards `mismatch` or `masks`. out: arrays to fill, as an earlier pass over as many
+        Gaussians gave them. Raises RuntimeError when another pass has used the workspace.
+        """
+        self._check_workspace()
+        masks, mismatch = (labelled, None) if self.mismatch is None else (None, labelled)
+        given = Images(*(address(a) for a in (rgb, alpha, depth, masks, mismatch)), None, None, None)
+        if out is None:
+            out = {name: np.empty_like(a) for name, a in zip(PARAMETERS, self._inputs[:5], strict=True)}
+            out["centers"] = np.empty((len(self.radii), 2), np.float32)
+            out["background"] = np.empty(3, np.float32)
+        gradients = Gradients(*(address(out[name]) for name in (*PARAMETERS, "centers", "background")))
         failed = library().ss_rasterize_backward(
-            self._kept,
+            self._workspace.handle,
             ctypes.byref(self._scene),
             ctypes.byref(self._images),
             ctypes.byref(given),
             ctypes.byref(gradients),
+            self._threads,
         )
         if failed:
             raise MemoryError("not enough memory for the gradients of a rendering")

@@ -1,132 +1,224 @@
-// Which Gaussians reach which 4x4-pixel block, front to back.
+// Which Gaussians reach which 4x4-pixel block, front to back. The image is cut into bands of eight rows of blocks, each
+// with its own copy of the splats that reach it: bands share nothing, so any number of threads gives the same bytes.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <vector>
 
+#include "parallel.h"
 #include "projection.h"
 
 namespace binning {
 
-constexpr float kLog2E = 1.4426950408889634f;
+using lanes::splat;
+using lanes::V16;
+using parallel::Buffer;
 
-// What the blending reads: alpha = 2^(log2_opacity + dx (A dx + B dy) + C dy^2), d = pixel - mean.
+constexpr int kBandRows = 8;
+constexpr int64_t kChunk = 1024;  // Gaussians that are projected in one piece
+constexpr int kAhead = 8;         // so many entries ahead, splats are fetched into the cache
+
+// What the blending reads: alpha = 2^(log2_opacity + dx (A dx + B dy) + C dy^2), d = pixel - mean; and the ellipse
+// where alpha reaches 1/255: half its width and height, the correlation of x and y, and sqrt(1 - correlation^2).
 struct alignas(64) Splat {
     float u, v, A, B, C, log2_opacity;
     float color[3], z;
     int32_t label, row;
+    float half_width, half_height, correlation, chord;
+};
+static_assert(sizeof(Splat) == 64, "sixteen splats are written as a transposed square");
+
+// Sums over the pixels for one splat in one band: moments 1, x, y, xx, xy, yy of dL/d(log alpha); dL/d(color); dL/dz.
+struct alignas(64) Sums {
+    float value[16];
+};
+
+struct Span {
+    int32_t splat, block, length;
+};
+
+struct Band {
+    int top, rows;                 // of blocks
+    int64_t count;                 // of splats
+    Buffer<uint64_t> order, other; // depth and candidate
+    Buffer<Splat> splats;          // by depth, ties by row
+    Buffer<Span> spans;
+    Buffer<int64_t> first;         // [blocks + 1] into entries
+    Buffer<int32_t> entries;       // splats of each block, front to back
+    Buffer<int32_t> used;          // [blocks] entries up to the one that made the block opaque
+    Buffer<Sums> sums;
+    Buffer<float> strongest;
 };
 
 struct Frame {
     int blocks_x, blocks_y;
-    std::vector<Splat> splats;          // in order of depth, ties by row
-    std::vector<int64_t> first;         // [blocks + 1] into entries
-    std::vector<int32_t> entries;       // ranks of splats
+    int64_t chunks;
+    Buffer<Splat> candidates;      // chunk c writes from c * kChunk
+    Buffer<int32_t> chunk_count;
+    Buffer<int64_t> place_first;   // of each candidate, into places
+    Buffer<int32_t> places;        // its splat in each of its bands
+    int num_bands;
+    std::vector<Band> bands;       // never fewer than before, so that their memory stays
 };
 
-// Sorts (key, row) pairs by key, stable: three passes of 11 bits.
-inline void radix_sort(std::vector<uint64_t>& items) {
-    std::vector<uint64_t> other(items.size());
-    for (int shift = 32; shift < 64; shift += 11) {
-        size_t counts[2049] = {};
-        for (uint64_t x : items) ++counts[((x >> shift) & 2047) + 1];
-        for (int k = 0; k < 2048; ++k) counts[k + 1] += counts[k];
-        for (uint64_t x : items) other[counts[(x >> shift) & 2047]++] = x;
-        items.swap(other);
-    }
+struct Range {
+    int first, last;
+};
+inline Range block_rows(const Frame& frame, const Splat& p) {
+    return {(int)std::fmax(std::ceil((p.v - p.half_height - 3.501f) / 4), 0.0f),
+            (int)std::fmin(std::floor((p.v + p.half_height - 0.499f) / 4), frame.blocks_y - 1.0f)};
+}
+inline Range bands_of(const Frame& frame, const Splat& p) {
+    const Range rows = block_rows(frame, p);
+    return {rows.first / kBandRows, rows.last / kBandRows};
 }
 
-// The columns of one ellipse {d' K d <= reach} that lie between two heights, relative to its centre.
-struct Ellipse {
-    float k00, k01, k11, det, reach, half_width, half_height, dy_rightmost;
+inline V16 as_floats(const int32_t (&lane)[16]) {
+    float bits[16];
+    std::memcpy(bits, lane, sizeof bits);
+    return lanes::load(bits);
+}
 
-    Ellipse(const projection::Footprint& f, float reach_) : k00(f.k00), k01(f.k01), k11(f.k11), reach(reach_) {
-        half_width = std::sqrt(reach * f.c00);
-        half_height = std::sqrt(reach * f.c11);
-        dy_rightmost = half_width * (f.c01 / f.c00);
-        det = k11 / f.c00;  // k00 k11 - k01^2, without its cancellation
-    }
-    bool columns(float low, float high, float& left, float& right) const {
-        low = std::fmax(low, -half_height), high = std::fmin(high, half_height);
-        if (low > high) return false;
-        const float at_right = std::fmin(std::fmax(dy_rightmost, low), high);
-        const float at_left = std::fmin(std::fmax(-dy_rightmost, low), high);
-        right = edge(at_right, 1), left = edge(at_left, -1);
-        return true;
-    }
-
-  private:
-    // k00 x^2 + 2 k01 x dy + k11 dy^2 = reach, solved for x.
-    float edge(float dy, float side) const {
-        const float root = std::fmax(k00 * reach - det * dy * dy, 0.0f);
-        return (-k01 * dy + side * std::sqrt(root)) / k00;
-    }
-};
-
-inline void bin(const Scene& s, float* radii, Frame& frame) {
-    const projection::View view = projection::view_of(s);
-    frame.blocks_x = (s.width + 3) / 4, frame.blocks_y = (s.height + 3) / 4;
-    const int64_t blocks = (int64_t)frame.blocks_x * frame.blocks_y;
-
-    struct Candidate {
-        projection::Footprint f;
-        Ellipse ellipse;
-        int64_t row;
-    };
-    std::vector<Candidate> candidates;
-    std::vector<uint64_t> order;
-    candidates.reserve(s.count), order.reserve(s.count);
-    std::memset(radii, 0, s.count * sizeof(float));
-    projection::Footprint f;
-    for (int64_t i = 0; i < s.count; ++i) {
-        if (!projection::project(s, view, i, f)) continue;
+// Projects the rows of a chunk; what can be seen becomes candidates.
+inline void project_chunk(const Scene& s, const projection::View& view, int64_t chunk, float* radii, Frame& frame) {
+    Splat* to = frame.candidates.data() + chunk * kChunk;
+    const int64_t end = std::min(s.count, (chunk + 1) * kChunk);
+    for (int64_t begin = chunk * kChunk; begin < end; begin += 16) {
+        Rows rows;
+        rows.count = (int)std::min<int64_t>(16, end - begin);
+        for (int k = 0; k < 16; ++k) rows.at[k] = begin + std::min(k, rows.count - 1);
+        const projection::Footprint f = projection::project(s, view, rows);
         // alpha >= 1 / 255 as far as q <= 2 ln(255 o); a hair more, since alpha is computed with rounding.
-        const float reach = 2 * (f.log2_opacity / kLog2E + 5.5412635f) * 1.0001f + 1e-4f;
-        const Ellipse e(f, reach);
-        if (f.u + e.half_width < 0.5f || f.u - e.half_width > s.width - 0.5f || f.v + e.half_height < 0.5f ||
-            f.v - e.half_height > s.height - 0.5f)
-            continue;
-        uint32_t key;
-        std::memcpy(&key, &f.z, sizeof key);
-        order.push_back((uint64_t)key << 32 | candidates.size());
-        candidates.push_back({f, e, i});
-        radii[i] = std::fmax(e.half_width, e.half_height);
+        const float scale = 2 / projection::kLog2E;
+        const V16 reach = (f.log2_opacity - projection::kLog2MinAlpha) * (scale * 1.0001f) + 1e-4f;
+        const V16 half_width = lanes::square_root(reach * f.c00), half_height = lanes::square_root(reach * f.c11);
+        const V16 seen = f.visible * lanes::less(splat(0.5f), f.u + half_width) *
+                         lanes::less(f.u - half_width, splat(s.width - 0.5f)) *
+                         lanes::less(splat(0.5f), f.v + half_height) *
+                         lanes::less(f.v - half_height, splat(s.height - 0.5f));
+        alignas(64) float is_seen[16], radius[16];
+        lanes::store(is_seen, seen);
+        lanes::store(radius, lanes::maximum(half_width, half_height));
+        bool any = false;
+        for (int k = 0; k < rows.count; ++k) {
+            radii[begin + k] = is_seen[k] > 0 ? radius[k] : 0;
+            any |= is_seen[k] > 0;
+        }
+        if (!any) continue;
+        V16 color[3];
+        harmonics::evaluate(s, view.center, rows, f.mean, color);
+        int32_t label[16], row[16];
+        for (int k = 0; k < 16; ++k) row[k] = (int32_t)rows.at[k], label[k] = s.labels ? s.labels[rows.at[k]] : -1;
+        const float half = -0.5f * projection::kLog2E;
+        const V16 correlation = f.c01 / lanes::square_root(f.c00 * f.c11);
+        V16 fields[16] = {f.u, f.v, half * f.k00, 2 * half * f.k01, half * f.k11, f.log2_opacity,
+                          color[0], color[1], color[2], f.z, as_floats(label), as_floats(row),
+                          half_width, half_height, correlation, f.chord};
+        lanes::transpose(fields);
+        for (int k = 0; k < rows.count; ++k)
+            if (is_seen[k] > 0) lanes::store(reinterpret_cast<float*>(to++), fields[k]);
     }
-    radix_sort(order);
+    frame.chunk_count[chunk] = (int32_t)(to - (frame.candidates.data() + chunk * kChunk));
+}
 
-    struct Span {
-        int32_t splat;
-        int32_t length;
-        int64_t block;
-    };
-    std::vector<Span> spans;
-    spans.reserve(4 * order.size());
-    frame.splats.resize(order.size());
-    frame.first.assign(blocks + 2, 0);
-    int64_t* change = frame.first.data() + 1;
-    for (size_t rank = 0; rank < order.size(); ++rank) {
-        const Candidate& c = candidates[order[rank] & 0xffffffffu];
-        Splat& p = frame.splats[rank];
-        p.u = c.f.u, p.v = c.f.v, p.z = c.f.z, p.row = (int32_t)c.row;
-        p.A = -0.5f * kLog2E * c.f.k00, p.B = -kLog2E * c.f.k01, p.C = -0.5f * kLog2E * c.f.k11;
-        p.log2_opacity = c.f.log2_opacity, p.label = s.labels ? s.labels[c.row] : -1;
-        harmonics::evaluate(s, view.center, c.row, p.color);
-        const float top = p.v - c.ellipse.half_height, bottom = p.v + c.ellipse.half_height;
-        const int y0 = (int)std::fmax(std::ceil((top - 3.501f) / 4), 0.0f);
-        const int y1 = (int)std::fmin(std::floor((bottom - 0.499f) / 4), frame.blocks_y - 1.0f);
-        for (int y = y0; y <= y1; ++y) {
-            float left, right;
-            if (!c.ellipse.columns(4 * y + 0.5f - p.v, 4 * y + 3.5f - p.v, left, right)) continue;
-            const float slack = 1e-3f + 1e-5f * (right - left);
-            left += p.u - slack, right += p.u + slack;
-            const int x0 = (int)std::fmin(std::fmax(std::ceil((left - 3.5f) / 4), 0.0f), 1e9f);
-            const int x1 = (int)std::fmax(std::fmin(std::floor((right - 0.5f) / 4), frame.blocks_x - 1.0f), -1.0f);
-            if (x0 > x1) continue;
-            const int64_t block = (int64_t)y * frame.blocks_x + x0;
-            spans.push_back({(int32_t)rank, x1 - x0 + 1, block});
-            ++change[block], --change[block + x1 - x0 + 1];
+template <class F>
+void each_candidate(const Frame& frame, F visit) {
+    for (int64_t chunk = 0; chunk < frame.chunks; ++chunk)
+        for (int64_t k = chunk * kChunk; k < chunk * kChunk + frame.chunk_count[chunk]; ++k) visit(k);
+}
+
+// Tells each band which candidates reach it.
+inline void distribute(Frame& frame) {
+    int64_t places = 0;
+    for (int b = 0; b < frame.num_bands; ++b) frame.bands[b].count = 0;
+    each_candidate(frame, [&](int64_t k) {
+        const Range range = bands_of(frame, frame.candidates[k]);
+        frame.place_first[k] = places;
+        places += std::max(range.last - range.first + 1, 0);
+        for (int b = range.first; b <= range.last; ++b) ++frame.bands[b].count;
+    });
+    frame.places.room(places);
+    for (int b = 0; b < frame.num_bands; ++b) {
+        frame.bands[b].order.room(frame.bands[b].count);
+        frame.bands[b].count = 0;
+    }
+    each_candidate(frame, [&](int64_t k) {
+        const Splat& p = frame.candidates[k];
+        const Range range = bands_of(frame, p);
+        uint32_t depth;  // positive, so its bits are in its order
+        std::memcpy(&depth, &p.z, sizeof depth);
+        for (int b = range.first; b <= range.last; ++b) {
+            Band& band = frame.bands[b];
+            band.order[band.count++] = (uint64_t)depth << 32 | (uint64_t)k;
+        }
+    });
+}
+
+// By depth, ties by row.
+inline void sort(Band& band) {
+    uint64_t *items = band.order.data(), *spare = band.other.room(band.count);
+    if (band.count < 1000) {
+        std::sort(items, items + band.count);
+        return;
+    }
+    for (int shift = 32; shift < 64; shift += 11) {  // three stable passes; the candidates are in order already
+        int64_t start[2049] = {};
+        for (int64_t k = 0; k < band.count; ++k) ++start[((items[k] >> shift) & 2047) + 1];
+        for (int k = 0; k < 2048; ++k) start[k + 1] += start[k];
+        for (int64_t k = 0; k < band.count; ++k) spare[start[(items[k] >> shift) & 2047]++] = items[k];
+        std::swap(items, spare);
+    }
+    std::memcpy(spare, items, band.count * sizeof *items);  // after an odd number of passes, the result is in `other`
+}
+
+alignas(64) constexpr float kBlockRow[16] = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};
+alignas(64) constexpr float kSide[16] = {-1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1, 1, 1, 1, 1};
+
+// The blocks that an ellipse meets in each of a band's eight rows: lanes 0..7 the first, 8..15 one past the last. At
+// the height t (in halves of its own) its sides are at correlation * t -+ chord * sqrt(1 - t^2).
+inline void columns(const Splat& p, int top, int blocks_x, int32_t (&out)[16]) {
+    const V16 side = lanes::load(kSide);
+    const float inverse = 1 / p.half_height;
+    const V16 low = (lanes::load(kBlockRow) * 4.0f + (4 * top + 0.5f - p.v)) * inverse, high = low + 3 * inverse;
+    V16 t = lanes::minimum(lanes::maximum(side * p.correlation, low), high);
+    t = lanes::clamp(t, -1, 1);
+    const V16 root = lanes::square_root(lanes::maximum(1.0f - t * t, splat(0)));
+    const float slack = 1e-3f + 2e-5f * p.half_width;
+    const V16 x = p.u + p.half_width * (t * p.correlation + side * root * p.chord) + side * slack;
+    // Left: the first block whose last pixel is not left of x. Right: one past the last whose first is not right of x.
+    const V16 block = lanes::clamp(x * 0.25f + (side * 0.375f + 0.5f), 0, (float)blocks_x);
+    const lanes::I16 whole = lanes::truncate_lanes(block);
+    std::memcpy(out, &whole, sizeof out);
+}
+
+// Lists each block's splats, front to back.
+inline void fill(Band& band, Frame& frame) {
+    sort(band);
+    band.splats.room(band.count);
+    const int64_t blocks = (int64_t)band.rows * frame.blocks_x;
+    int64_t* first = band.first.room(blocks + 2);
+    std::memset(first, 0, (blocks + 2) * sizeof *first);
+    int64_t* change = first + 1;
+    const int number = band.top / kBandRows;
+    Span* spans = band.spans.room(band.count * kBandRows);
+    int64_t num_spans = 0;
+    const auto candidate_at = [&](int64_t k) { return (int64_t)(band.order[k] & 0xffffffffu); };
+    for (int64_t k = 0; k < band.count; ++k) {
+        // The order of depth jumps about in memory.
+        if (k + 12 < band.count) __builtin_prefetch(&frame.candidates[candidate_at(k + 12)]);
+        const int64_t candidate = candidate_at(k);
+        const Splat& p = band.splats[k] = frame.candidates[candidate];
+        frame.places[frame.place_first[candidate] + number - bands_of(frame, p).first] = (int32_t)k;
+        int32_t block[16];
+        columns(p, band.top, frame.blocks_x, block);
+        const Range rows = block_rows(frame, p);
+        const int end = std::min(rows.last - band.top + 1, band.rows);
+        for (int r = std::max(rows.first - band.top, 0); r < end; ++r) {
+            const int32_t length = block[8 + r] - block[r], from = r * frame.blocks_x + block[r];
+            if (length <= 0) continue;
+            spans[num_spans++] = {(int32_t)k, from, length};
+            ++change[from], --change[from + length];
         }
     }
     // change holds differences: a running sum gives the counts, another the first entries.
@@ -136,11 +228,26 @@ inline void bin(const Scene& s, float* radii, Frame& frame) {
         change[b] = total;
         total += count;
     }
-    frame.entries.resize(total);
-    for (const Span& span : spans)
-        for (int64_t b = span.block; b < span.block + span.length; ++b) frame.entries[change[b]++] = span.splat;
-    frame.first.resize(blocks + 1);
-    frame.first[0] = 0;
+    int32_t* entries = band.entries.room(total + kAhead);
+    std::memset(entries + total, 0, kAhead * sizeof *entries);
+    for (int64_t k = 0; k < num_spans; ++k)
+        for (int32_t b = spans[k].block; b < spans[k].block + spans[k].length; ++b) entries[change[b]++] = spans[k].splat;
+    // Each change[b] has moved on to where the next block begins, which is what first[b + 1] should say.
+    first[0] = 0;
+}
+
+inline void prepare(const Scene& s, Frame& frame) {
+    frame.blocks_x = (s.width + 3) / 4, frame.blocks_y = (s.height + 3) / 4;
+    frame.chunks = (s.count + kChunk - 1) / kChunk;
+    frame.candidates.room(frame.chunks * kChunk);
+    frame.place_first.room(frame.chunks * kChunk);
+    frame.chunk_count.room(frame.chunks);
+    frame.num_bands = (frame.blocks_y + kBandRows - 1) / kBandRows;
+    if ((int)frame.bands.size() < frame.num_bands) frame.bands.resize(frame.num_bands);
+    for (int b = 0; b < frame.num_bands; ++b) {
+        frame.bands[b].top = b * kBandRows;
+        frame.bands[b].rows = std::min(kBandRows, frame.blocks_y - frame.bands[b].top);
+    }
 }
 
 }  // namespace binning

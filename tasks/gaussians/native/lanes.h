@@ -69,6 +69,10 @@ LANES_BINARY(-)
 LANES_BINARY(*)
 LANES_BINARY(/)
 #undef LANES_BINARY
+template <class H>
+INLINE Pair<H> operator-(const Pair<H>& a) {
+    return {-a.lo, -a.hi};
+}
 
 // a < b ? x : y in each lane.
 template <class F, class X>
@@ -103,12 +107,29 @@ INLINE I16 splat_int(int32_t x) { return BroadcastInt<I16>::of(x); }
 INLINE V16 minimum(const V16& a, const V16& b) { return where_less(b, a, b, a); }
 INLINE V16 maximum(const V16& a, const V16& b) { return where_less(a, b, b, a); }
 
-INLINE V16 load(const float* p) {
-    V16 v;
-    __builtin_memcpy(&v, p, sizeof v);
-    return v;
-}
-INLINE void store(float* p, const V16& v) { __builtin_memcpy(p, &v, sizeof v); }
+INLINE V16 clamp(const V16& x, float low, float high) { return minimum(maximum(x, splat(low)), splat(high)); }
+INLINE V16 absolute(const V16& x) { return where_less(x, splat(0), -x, x); }
+// 1 where a < b, 0 elsewhere and where either is not a number.
+INLINE V16 less(const V16& a, const V16& b) { return where_less(a, b, splat(1), splat(0)); }
+
+// Half by half: a copy of a whole Pair would go through general registers.
+template <class V>
+struct Memory {
+    INLINE V load(const float* p) {
+        V v;
+        __builtin_memcpy(&v, p, sizeof v);
+        return v;
+    }
+    INLINE void store(float* p, const V& v) { __builtin_memcpy(p, &v, sizeof v); }
+};
+template <class H>
+struct Memory<Pair<H>> {
+    static constexpr int half = sizeof(H) / sizeof(float);
+    INLINE Pair<H> load(const float* p) { return {Memory<H>::load(p), Memory<H>::load(p + half)}; }
+    INLINE void store(float* p, const Pair<H>& v) { Memory<H>::store(p, v.lo), Memory<H>::store(p + half, v.hi); }
+};
+INLINE V16 load(const float* p) { return Memory<V16>::load(p); }
+INLINE void store(float* p, const V16& v) { Memory<V16>::store(p, v); }
 
 template <class F>
 INLINE float largest(const F& v) {
@@ -121,7 +142,23 @@ INLINE float largest(const Pair<H>& v) {
     return largest(where_less(v.lo, v.hi, v.hi, v.lo));
 }
 
-// 2^x for -126 < x < 126; relative error below 3e-7. The sum with 1.5 * 2^23 rounds x and leaves its integer part in
+INLINE V16 square_root(const V16& x) {
+    alignas(64) float lane[16];
+    store(lane, x);
+    for (float& v : lane) v = __builtin_sqrtf(v);
+    return load(lane);
+}
+
+template <class F>
+INLINE typename IntOf<F>::type truncate_lanes(const F& x) {
+    return __builtin_convertvector(x, typename IntOf<F>::type);
+}
+template <class H>
+INLINE auto truncate_lanes(const Pair<H>& x) {
+    return Pair<decltype(truncate_lanes(x.lo))>{truncate_lanes(x.lo), truncate_lanes(x.hi)};
+}
+
+// 2^x for -126 < x < 126, without meaning elsewhere; relative error below 3e-7. The sum with 1.5 * 2^23 rounds x and leaves its integer part in
 // the low bits of the mantissa: any compiler option that lets (x + c) - c become x breaks it.
 template <class F>
 INLINE F exp2_lanes(const F& x) {
@@ -136,49 +173,83 @@ INLINE Pair<H> exp2_lanes(const Pair<H>& x) {
     return {exp2_lanes(x.lo), exp2_lanes(x.hi)};
 }
 
-#if defined(__AVX__)
-INLINE f8 fold(const V16& v) {
-    Pair<f8> halves;
-    __builtin_memcpy(&halves, &v, sizeof halves);
-    return halves.lo + halves.hi;
+// log2 of a positive, normal number; absolute error below 1e-6. With m between sqrt(1/2) and sqrt(2) it is
+// the exponent + 2 artanh((m - 1) / (m + 1)) / ln 2.
+template <class F>
+INLINE F log2_lanes(const F& x) {
+    typedef typename IntOf<F>::type I;
+    const I bits = (I)x, exponent = (bits - 0x3f3504f3) >> 23;
+    const F m = (F)(bits - (exponent << 23)), s = (m - 1.0f) / (m + 1.0f), q = s * s;
+    return __builtin_convertvector(exponent, F) +
+           s * (2.885390082f + q * (0.961796694f + q * (0.577078016f + q * (0.412198583f + q * 0.320598898f))));
 }
-INLINE f8 join4(const f8& a, const f8& b) {
-    return SHUFFLE(i8, a, b, 0, 1, 2, 3, 8, 9, 10, 11) + SHUFFLE(i8, a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+template <class H>
+INLINE Pair<H> log2_lanes(const Pair<H>& x) {
+    return {log2_lanes(x.lo), log2_lanes(x.hi)};
 }
-INLINE f8 join2(const f8& a, const f8& b) {
-    return SHUFFLE(i8, a, b, 0, 1, 8, 9, 4, 5, 12, 13) + SHUFFLE(i8, a, b, 2, 3, 10, 11, 6, 7, 14, 15);
+
+// Exchanges the lanes of a whose index has the bit `stride` with the lanes of b whose index lacks it.
+template <int stride>
+INLINE void exchange(f4& a, f4& b) {
+    const f4 x = a, y = b;
+    if (stride == 1) a = SHUFFLE(i4, x, y, 0, 4, 2, 6), b = SHUFFLE(i4, x, y, 1, 5, 3, 7);
+    if (stride == 2) a = SHUFFLE(i4, x, y, 0, 1, 4, 5), b = SHUFFLE(i4, x, y, 2, 3, 6, 7);
 }
-INLINE f8 join1(const f8& a, const f8& b) {
-    return SHUFFLE(i8, a, b, 0, 2, 8, 10, 4, 6, 12, 14) + SHUFFLE(i8, a, b, 1, 3, 9, 11, 5, 7, 13, 15);
+template <int stride>
+INLINE void exchange(f8& a, f8& b) {
+    const f8 x = a, y = b;
+    if (stride == 1) a = SHUFFLE(i8, x, y, 0, 8, 2, 10, 4, 12, 6, 14), b = SHUFFLE(i8, x, y, 1, 9, 3, 11, 5, 13, 7, 15);
+    if (stride == 2) a = SHUFFLE(i8, x, y, 0, 1, 8, 9, 4, 5, 12, 13), b = SHUFFLE(i8, x, y, 2, 3, 10, 11, 6, 7, 14, 15);
+    if (stride == 4) a = SHUFFLE(i8, x, y, 0, 1, 2, 3, 8, 9, 10, 11), b = SHUFFLE(i8, x, y, 4, 5, 6, 7, 12, 13, 14, 15);
 }
-// Adds the sums over the lanes of ten vectors to ten floats.
-INLINE void add_sums(const V16 (&v)[10], float* out) {
-    const f8 a = join4(fold(v[0]), fold(v[4])), b = join4(fold(v[1]), fold(v[5]));
-    const f8 c = join4(fold(v[2]), fold(v[6])), d = join4(fold(v[3]), fold(v[7]));
-    const f8 first = join1(join2(a, b), join2(c, d));
-    const f8 e = join4(fold(v[8]), fold(v[9])), zero = {};
-    const f8 last = join1(join2(e, zero), zero);
-    f8 sum;
-    __builtin_memcpy(&sum, out, sizeof sum);
-    sum += first;
-    __builtin_memcpy(out, &sum, sizeof sum);
-    out[8] += last[0];
-    out[9] += last[4];
-}
-#else
-INLINE f4 fold(const V16& v) { return (v.lo.lo + v.lo.hi) + (v.hi.lo + v.hi.hi); }
-INLINE f4 join2(const f4& a, const f4& b) { return SHUFFLE(i4, a, b, 0, 1, 4, 5) + SHUFFLE(i4, a, b, 2, 3, 6, 7); }
-INLINE f4 join1(const f4& a, const f4& b) { return SHUFFLE(i4, a, b, 0, 2, 4, 6) + SHUFFLE(i4, a, b, 1, 3, 5, 7); }
-// Adds the sums over the lanes of ten vectors to ten floats.
-INLINE void add_sums(const V16 (&v)[10], float* out) {
-    const f4 zero = {};
-    const f4 sums[3] = {
-        join1(join2(fold(v[0]), fold(v[1])), join2(fold(v[2]), fold(v[3]))),
-        join1(join2(fold(v[4]), fold(v[5])), join2(fold(v[6]), fold(v[7]))),
-        join1(join2(fold(v[8]), fold(v[9])), zero),
-    };
-    for (int k = 0; k < 10; ++k) out[k] += sums[k / 4][k % 4];
+#if defined(__AVX512F__)
+template <int stride>
+INLINE void exchange(f16& a, f16& b) {
+    const f16 x = a, y = b;
+    if (stride == 1) {
+        a = SHUFFLE(i16, x, y, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30);
+        b = SHUFFLE(i16, x, y, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
+    }
+    if (stride == 2) {
+        a = SHUFFLE(i16, x, y, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+        b = SHUFFLE(i16, x, y, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    }
+    if (stride == 4) {
+        a = SHUFFLE(i16, x, y, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27);
+        b = SHUFFLE(i16, x, y, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
+    }
+    if (stride == 8) {
+        a = SHUFFLE(i16, x, y, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+        b = SHUFFLE(i16, x, y, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+    }
 }
 #endif
+template <int stride, int count, class V>
+INLINE void exchange_all(V (&v)[count]) {
+    for (int k = 0; k < count; ++k)
+        if (!(k & stride)) exchange<stride>(v[k], v[k + stride]);
+}
+
+// A square of as many vectors as each has lanes: rows become columns.
+INLINE void transpose(f4 (&v)[4]) { exchange_all<2>(v), exchange_all<1>(v); }
+INLINE void transpose(f8 (&v)[8]) { exchange_all<4>(v), exchange_all<2>(v), exchange_all<1>(v); }
+#if defined(__AVX512F__)
+INLINE void transpose(f16 (&v)[16]) { exchange_all<8>(v), exchange_all<4>(v), exchange_all<2>(v), exchange_all<1>(v); }
+#endif
+// Quarter by quarter, so that each stays in registers.
+template <class H, int count>
+INLINE void transpose(Pair<H> (&v)[count]) {
+    H quarter[2][2][count / 2];
+    for (int k = 0; k < count / 2; ++k) {
+        quarter[0][0][k] = v[k].lo, quarter[1][0][k] = v[k].hi;
+        quarter[0][1][k] = v[k + count / 2].lo, quarter[1][1][k] = v[k + count / 2].hi;
+    }
+    for (auto& half : quarter)
+        for (auto& square : half) transpose(square);
+    for (int k = 0; k < count / 2; ++k) {
+        v[k] = {quarter[0][0][k], quarter[0][1][k]};
+        v[k + count / 2] = {quarter[1][0][k], quarter[1][1][k]};
+    }
+}
 
 }  // namespace lanes

@@ -1,15 +1,22 @@
-// One Gaussian: world to screen, and the gradient back.
+// Gaussians, sixteen at a time: world to screen, and the gradient back (EWA splatting, Zwicker et al. 2001).
 #pragma once
 
 #include <cmath>
 
 #include "harmonics.h"
-#include "scene.h"
 
 namespace projection {
 
-constexpr float kDilation = 0.3f;        // pixels^2 added to the screen covariance
-constexpr float kMinAlpha = 1.0f / 255;  // contributions below are skipped
+using lanes::less;
+using lanes::splat;
+using lanes::square_root;
+using lanes::V16;
+using lanes::where_less;
+
+constexpr float kLog2E = 1.4426950408889634f;
+constexpr float kDilation = 0.3f;         // pixels^2 added to the screen covariance
+constexpr float kMinAlpha = 1.0f / 255;   // contributions below are skipped
+constexpr float kLog2MinAlpha = -7.994353436858858f;
 constexpr float kMinCompensation = 2.5e-5f;
 
 struct View {
@@ -37,147 +44,154 @@ inline View view_of(const Scene& s) {
 
 // Everything between the parameters and the screen that the gradient needs again.
 struct Footprint {
-    float x, y, z, tx, ty;     // camera frame; tx = x / z and ty = y / z, clamped
-    bool free_x, free_y;       // not clamped
-    float rotation[3][3], scale[3], norm;
-    float V[3][3], T[2][3];    // V = R rotation diag(scale), T = J V
-    float J[2][3];
-    float u, v, c00, c01, c11; // screen mean and covariance
-    float k00, k01, k11;       // its inverse
-    float sharp;               // determinant of the covariance before the dilation
-    float compensation, opacity, log2_opacity;
+    V16 mean[3];                        // world
+    V16 x, y, z, inv_z, tx, ty;         // camera frame; tx = x / z and ty = y / z, clamped
+    V16 free_x, free_y;                 // 1 = not clamped
+    V16 unit[4], norm;                  // quaternion
+    V16 rotation[3][3], scale[3];
+    V16 V[3][3], T[2][3];               // V = R rotation diag(scale), T = J V
+    V16 j00, j02, j11, j12;             // the Jacobian J; j01 = j10 = 0
+    V16 u, v, c00, c01, c11;            // screen mean and covariance
+    V16 k00, k01, k11;                  // its inverse
+    V16 sharp;                          // determinant of the covariance before the dilation
+    V16 chord;                          // sqrt(1 - correlation^2)
+    V16 compensation, transparency;     // transparency = 1 - opacity
+    V16 log2_opacity;
+    V16 visible;                        // 0 = behind the near plane, too faint, or not finite on the screen
 };
 
-inline void rotation_of(const float* q, float (&m)[3][3], float& norm) {
-    norm = std::sqrt(std::fmax(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], 1e-24f));
-    const float w = q[0] / norm, x = q[1] / norm, y = q[2] / norm, z = q[3] / norm;
-    m[0][0] = 1 - 2 * (y * y + z * z), m[0][1] = 2 * (x * y - w * z), m[0][2] = 2 * (x * z + w * y);
-    m[1][0] = 2 * (x * y + w * z), m[1][1] = 1 - 2 * (x * x + z * z), m[1][2] = 2 * (y * z - w * x);
-    m[2][0] = 2 * (x * z - w * y), m[2][1] = 2 * (y * z + w * x), m[2][2] = 1 - 2 * (x * x + y * y);
+// w x y z of unit length -> rotation matrix.
+inline void rotation_of(const V16 (&q)[4], V16 (&m)[3][3]) {
+    const V16 &w = q[0], &x = q[1], &y = q[2], &z = q[3];
+    m[0][0] = 1.0f - 2.0f * (y * y + z * z), m[0][1] = 2.0f * (x * y - w * z), m[0][2] = 2.0f * (x * z + w * y);
+    m[1][0] = 2.0f * (x * y + w * z), m[1][1] = 1.0f - 2.0f * (x * x + z * z), m[1][2] = 2.0f * (y * z - w * x);
+    m[2][0] = 2.0f * (x * z - w * y), m[2][1] = 2.0f * (y * z + w * x), m[2][2] = 1.0f - 2.0f * (x * x + y * y);
 }
 
-// False where the Gaussian cannot show: behind the near plane, too faint, or not finite on the screen.
-inline bool project(const Scene& s, const View& view, int64_t i, Footprint& f) {
-    const float* m = s.means + 3 * i;
-    float local[3];
+inline V16 exponential(const V16& x) { return lanes::exp2_lanes(lanes::clamp(x * kLog2E, -125, 125)); }
+
+inline Footprint project(const Scene& s, const View& view, const Rows& rows) {
+    Footprint f;
+    for (int j = 0; j < 3; ++j) f.mean[j] = rows.column(s.means, 3, j);
+    V16 local[3];
     for (int r = 0; r < 3; ++r)
-        local[r] = view.R[r][0] * m[0] + view.R[r][1] * m[1] + view.R[r][2] * m[2] + view.t[r];
+        local[r] = view.R[r][0] * f.mean[0] + view.R[r][1] * f.mean[1] + view.R[r][2] * f.mean[2] + view.t[r];
     f.x = local[0], f.y = local[1], f.z = local[2];
-    if (!(f.z > view.near_plane)) return false;
-    const float inv_z = 1 / f.z;
-    f.tx = f.x * inv_z, f.ty = f.y * inv_z;
+    f.inv_z = 1.0f / f.z;
+    f.tx = f.x * f.inv_z, f.ty = f.y * f.inv_z;
     f.u = view.fx * f.tx + view.cx, f.v = view.fy * f.ty + view.cy;
-    f.free_x = std::fabs(f.tx) <= view.tan_x, f.free_y = std::fabs(f.ty) <= view.tan_y;
-    f.tx = std::fmin(std::fmax(f.tx, -view.tan_x), view.tan_x);
-    f.ty = std::fmin(std::fmax(f.ty, -view.tan_y), view.tan_y);
-    f.J[0][0] = view.fx * inv_z, f.J[0][1] = 0, f.J[0][2] = -view.fx * f.tx * inv_z;
-    f.J[1][0] = 0, f.J[1][1] = view.fy * inv_z, f.J[1][2] = -view.fy * f.ty * inv_z;
-    rotation_of(s.quaternions + 4 * i, f.rotation, f.norm);
-    for (int k = 0; k < 3; ++k) f.scale[k] = std::exp(s.log_scales[3 * i + k]);
+    f.free_x = 1.0f - less(splat(view.tan_x), lanes::absolute(f.tx));
+    f.free_y = 1.0f - less(splat(view.tan_y), lanes::absolute(f.ty));
+    f.tx = lanes::clamp(f.tx, -view.tan_x, view.tan_x), f.ty = lanes::clamp(f.ty, -view.tan_y, view.tan_y);
+    f.j00 = view.fx * f.inv_z, f.j02 = -f.j00 * f.tx;
+    f.j11 = view.fy * f.inv_z, f.j12 = -f.j11 * f.ty;
+
+    for (int k = 0; k < 4; ++k) f.unit[k] = rows.column(s.quaternions, 4, k);
+    const V16* q = f.unit;
+    f.norm = square_root(lanes::maximum(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3], splat(1e-24f)));
+    for (V16& k : f.unit) k = k / f.norm;
+    rotation_of(f.unit, f.rotation);
+    for (int k = 0; k < 3; ++k) f.scale[k] = exponential(rows.column(s.log_scales, 3, k));
     for (int r = 0; r < 3; ++r)
-        for (int k = 0; k < 3; ++k) {
-            float sum = 0;
-            for (int j = 0; j < 3; ++j) sum += view.R[r][j] * f.rotation[j][k];
-            f.V[r][k] = sum * f.scale[k];
-        }
-    for (int r = 0; r < 2; ++r)
-        for (int k = 0; k < 3; ++k) f.T[r][k] = f.J[r][r] * f.V[r][k] + f.J[r][2] * f.V[2][k];
-    float c00 = 0, c01 = 0, c11 = 0;
+        for (int k = 0; k < 3; ++k)
+            f.V[r][k] = (view.R[r][0] * f.rotation[0][k] + view.R[r][1] * f.rotation[1][k] +
+                         view.R[r][2] * f.rotation[2][k]) * f.scale[k];
     for (int k = 0; k < 3; ++k) {
-        c00 += f.T[0][k] * f.T[0][k];
-        c01 += f.T[0][k] * f.T[1][k];
-        c11 += f.T[1][k] * f.T[1][k];
+        f.T[0][k] = f.j00 * f.V[0][k] + f.j02 * f.V[2][k];
+        f.T[1][k] = f.j11 * f.V[1][k] + f.j12 * f.V[2][k];
     }
+    const V16(&T)[2][3] = f.T;
+    const V16 c00 = T[0][0] * T[0][0] + T[0][1] * T[0][1] + T[0][2] * T[0][2];
+    const V16 c11 = T[1][0] * T[1][0] + T[1][1] * T[1][1] + T[1][2] * T[1][2];
+    f.c01 = T[0][0] * T[1][0] + T[0][1] * T[1][1] + T[0][2] * T[1][2];
     // The determinant as a sum of squares (Cauchy-Binet): no cancellation, so thin needles keep their inverse.
-    const float m01 = f.T[0][0] * f.T[1][1] - f.T[0][1] * f.T[1][0];
-    const float m02 = f.T[0][0] * f.T[1][2] - f.T[0][2] * f.T[1][0];
-    const float m12 = f.T[0][1] * f.T[1][2] - f.T[0][2] * f.T[1][1];
+    const V16 m01 = T[0][0] * T[1][1] - T[0][1] * T[1][0], m02 = T[0][0] * T[1][2] - T[0][2] * T[1][0];
+    const V16 m12 = T[0][1] * T[1][2] - T[0][2] * T[1][1];
     f.sharp = m01 * m01 + m02 * m02 + m12 * m12;
-    const float det = f.sharp + kDilation * (c00 + c11) + kDilation * kDilation;
-    f.c00 = c00 + kDilation, f.c01 = c01, f.c11 = c11 + kDilation;
-    if (!(det < 1e30f) || !std::isfinite(f.u) || !std::isfinite(f.v)) return false;
+    const V16 det = f.sharp + kDilation * (c00 + c11) + kDilation * kDilation;
+    f.c00 = c00 + kDilation, f.c11 = c11 + kDilation;
     f.k00 = f.c11 / det, f.k01 = -f.c01 / det, f.k11 = f.c00 / det;
-    f.compensation = s.antialias ? std::sqrt(std::fmax(f.sharp / det, kMinCompensation)) : 1.0f;
-    f.opacity = 1 / (1 + std::exp(-s.opacity_logits[i]));
-    const float visible = f.opacity * f.compensation;
-    if (!(visible > kMinAlpha)) return false;
-    f.log2_opacity = std::log2(visible);
-    return true;
+    f.chord = square_root(det / (f.c00 * f.c11));
+    f.compensation = splat(1);
+    if (s.antialias) f.compensation = square_root(lanes::maximum(f.sharp / det, splat(kMinCompensation)));
+    const V16 odds = exponential(-rows.column(s.opacity_logits, 1, 0));
+    f.transparency = odds / (1.0f + odds);
+    const V16 opacity = f.compensation / (1.0f + odds);
+    f.log2_opacity = lanes::log2_lanes(lanes::maximum(opacity, splat(1e-30f)));
+    // Comparisons that a NaN fails.
+    f.visible = less(splat(view.near_plane), f.z) * less(det, splat(1e30f)) * less(splat(kMinAlpha), opacity) *
+                less(lanes::absolute(f.u), splat(1e30f)) * less(lanes::absolute(f.v), splat(1e30f));
+    return f;
 }
 
-// What the blending sends back for one Gaussian.
+// What the blending sends back.
 struct ScreenGradient {
-    float g, gx, gy, gxx, gxy, gyy;  // moments of dL/d(log alpha) about the screen mean
-    float color[3], z;
+    V16 g, gx, gy, gxx, gxy, gyy;  // moments of dL/d(log alpha) about the screen mean
+    V16 color[3], z;
 };
 
-inline void backproject(const Scene& s, const View& view, int64_t i, const Footprint& f, const ScreenGradient& in,
+inline void backproject(const Scene& s, const View& view, const Rows& rows, const ScreenGradient& in,
                         const Gradients& out) {
+    const Footprint f = project(s, view, rows);
     // alpha = o exp(-q / 2), q = k00 dx^2 + 2 k01 dx dy + k11 dy^2, dx = pixel - mean.
-    const float du = f.k00 * in.gx + f.k01 * in.gy, dv = f.k01 * in.gx + f.k11 * in.gy;
+    const V16 du = f.k00 * in.gx + f.k01 * in.gy, dv = f.k01 * in.gx + f.k11 * in.gy;
+    rows.put(out.centers, 2, 0, du), rows.put(out.centers, 2, 1, dv);
     // dL/dC = -K (dL/dK) K with dL/dK = -moments / 2.
-    const float a0 = f.k00 * in.gxx + f.k01 * in.gxy, a1 = f.k00 * in.gxy + f.k01 * in.gyy;
-    const float b0 = f.k01 * in.gxx + f.k11 * in.gxy, b1 = f.k01 * in.gxy + f.k11 * in.gyy;
-    float g00 = 0.5f * (a0 * f.k00 + a1 * f.k01), g01 = 0.5f * (a0 * f.k01 + a1 * f.k11);
-    float g11 = 0.5f * (b0 * f.k01 + b1 * f.k11);
-    if (s.antialias && f.compensation * f.compensation > kMinCompensation) {
-        // d log compensation / dC = (C0^-1 - C^-1) / 2, C0 the covariance before the dilation.
-        const float c00 = f.c00 - kDilation, c11 = f.c11 - kDilation, w = 0.5f * in.g;
-        g00 += w * (c11 / f.sharp - f.k00), g11 += w * (c00 / f.sharp - f.k11);
-        g01 += w * (-f.c01 / f.sharp - f.k01);
+    const V16 a0 = f.k00 * in.gxx + f.k01 * in.gxy, a1 = f.k00 * in.gxy + f.k01 * in.gyy;
+    const V16 b0 = f.k01 * in.gxx + f.k11 * in.gxy, b1 = f.k01 * in.gxy + f.k11 * in.gyy;
+    V16 g00 = 0.5f * (a0 * f.k00 + a1 * f.k01), g01 = 0.5f * (a0 * f.k01 + a1 * f.k11);
+    V16 g11 = 0.5f * (b0 * f.k01 + b1 * f.k11);
+    if (s.antialias) {
+        // d log compensation / dC = (C0^-1 - C^-1) / 2, C0 the covariance before the dilation; nothing where it is cut.
+        const V16 cut = splat(kMinCompensation), squared = f.compensation * f.compensation;
+        const V16 w = where_less(cut, squared, 0.5f * in.g, splat(0));
+        const V16 inverse = 1.0f / where_less(cut, squared, f.sharp, splat(1));
+        g00 = g00 + w * ((f.c11 - kDilation) * inverse - f.k00), g11 = g11 + w * ((f.c00 - kDilation) * inverse - f.k11);
+        g01 = g01 + w * (-f.c01 * inverse - f.k01);
     }
-    float dT[2][3], dJ[2][3] = {}, dV[3][3];
+    V16 dV[3][3], dj00 = splat(0), dj02 = splat(0), dj11 = splat(0), dj12 = splat(0);
     for (int k = 0; k < 3; ++k) {
-        dT[0][k] = 2 * (g00 * f.T[0][k] + g01 * f.T[1][k]);
-        dT[1][k] = 2 * (g01 * f.T[0][k] + g11 * f.T[1][k]);
-        dV[0][k] = f.J[0][0] * dT[0][k];
-        dV[1][k] = f.J[1][1] * dT[1][k];
-        dV[2][k] = f.J[0][2] * dT[0][k] + f.J[1][2] * dT[1][k];
-        dJ[0][0] += dT[0][k] * f.V[0][k], dJ[0][2] += dT[0][k] * f.V[2][k];
-        dJ[1][1] += dT[1][k] * f.V[1][k], dJ[1][2] += dT[1][k] * f.V[2][k];
+        const V16 dT0 = 2.0f * (g00 * f.T[0][k] + g01 * f.T[1][k]), dT1 = 2.0f * (g01 * f.T[0][k] + g11 * f.T[1][k]);
+        dV[0][k] = f.j00 * dT0, dV[1][k] = f.j11 * dT1, dV[2][k] = f.j02 * dT0 + f.j12 * dT1;
+        dj00 = dj00 + dT0 * f.V[0][k], dj02 = dj02 + dT0 * f.V[2][k];
+        dj11 = dj11 + dT1 * f.V[1][k], dj12 = dj12 + dT1 * f.V[2][k];
     }
-    const float inv_z = 1 / f.z;
-    const float dtx = -view.fx * inv_z * dJ[0][2] * (f.free_x ? 1.0f : 0.0f);
-    const float dty = -view.fy * inv_z * dJ[1][2] * (f.free_y ? 1.0f : 0.0f);
-    float local[3];
-    local[0] = (du * view.fx + dtx) * inv_z;
-    local[1] = (dv * view.fy + dty) * inv_z;
-    // tx stands for x / z: through z once as the ratio, once as the factor 1 / z of the Jacobian.
-    const float ratio_x = f.x * inv_z, ratio_y = f.y * inv_z;
-    local[2] = in.z - (du * view.fx * ratio_x + dv * view.fy * ratio_y + dtx * ratio_x + dty * ratio_y) * inv_z -
-               (dJ[0][0] * f.J[0][0] + dJ[0][2] * f.J[0][2] + dJ[1][1] * f.J[1][1] + dJ[1][2] * f.J[1][2]) * inv_z;
-    float world[3];
+    const V16 dtx = -f.j00 * dj02 * f.free_x, dty = -f.j11 * dj12 * f.free_y;
+    const V16 along_x = du * view.fx + dtx, along_y = dv * view.fy + dty;
+    const V16 local[3] = {
+        along_x * f.inv_z, along_y * f.inv_z,
+        // z counts in the ratios x / z and y / z, and in the factor 1 / z of the Jacobian.
+        in.z - (along_x * f.x + along_y * f.y) * f.inv_z * f.inv_z -
+            (dj00 * f.j00 + dj02 * f.j02 + dj11 * f.j11 + dj12 * f.j12) * f.inv_z};
+    V16 world[3];
     for (int j = 0; j < 3; ++j)
         world[j] = view.R[0][j] * local[0] + view.R[1][j] * local[1] + view.R[2][j] * local[2];
 
-    float dM[3][3];  // towards the rotation matrix
+    V16 dM[3][3];  // towards the rotation matrix
     for (int k = 0; k < 3; ++k) {
-        float along = 0;
+        V16 along = splat(0);
         for (int j = 0; j < 3; ++j) {
-            const float d = view.R[0][j] * dV[0][k] + view.R[1][j] * dV[1][k] + view.R[2][j] * dV[2][k];
-            along += d * f.rotation[j][k];
+            const V16 d = view.R[0][j] * dV[0][k] + view.R[1][j] * dV[1][k] + view.R[2][j] * dV[2][k];
+            along = along + d * f.rotation[j][k];
             dM[j][k] = d * f.scale[k];
         }
-        out.log_scales[3 * i + k] = along * f.scale[k];
+        rows.put(out.log_scales, 3, k, along * f.scale[k]);
     }
-    const float* raw = s.quaternions + 4 * i;
-    const float w = raw[0] / f.norm, x = raw[1] / f.norm, y = raw[2] / f.norm, z = raw[3] / f.norm;
-    float q[4];
-    q[0] = 2 * (x * (dM[2][1] - dM[1][2]) + y * (dM[0][2] - dM[2][0]) + z * (dM[1][0] - dM[0][1]));
-    q[1] = 2 * (w * (dM[2][1] - dM[1][2]) + y * (dM[0][1] + dM[1][0]) + z * (dM[0][2] + dM[2][0]) -
-                2 * x * (dM[1][1] + dM[2][2]));
-    q[2] = 2 * (w * (dM[0][2] - dM[2][0]) + x * (dM[0][1] + dM[1][0]) + z * (dM[1][2] + dM[2][1]) -
-                2 * y * (dM[0][0] + dM[2][2]));
-    q[3] = 2 * (w * (dM[1][0] - dM[0][1]) + x * (dM[0][2] + dM[2][0]) + y * (dM[1][2] + dM[2][1]) -
-                2 * z * (dM[0][0] + dM[1][1]));
-    const float radial = q[0] * w + q[1] * x + q[2] * y + q[3] * z;
-    const float unit[4] = {w, x, y, z};
-    for (int k = 0; k < 4; ++k) out.quaternions[4 * i + k] = (q[k] - radial * unit[k]) / f.norm;
+    const V16 &w = f.unit[0], &x = f.unit[1], &y = f.unit[2], &z = f.unit[3];
+    const V16 q[4] = {
+        2.0f * (x * (dM[2][1] - dM[1][2]) + y * (dM[0][2] - dM[2][0]) + z * (dM[1][0] - dM[0][1])),
+        2.0f * (w * (dM[2][1] - dM[1][2]) + y * (dM[0][1] + dM[1][0]) + z * (dM[0][2] + dM[2][0]) -
+                2.0f * x * (dM[1][1] + dM[2][2])),
+        2.0f * (w * (dM[0][2] - dM[2][0]) + x * (dM[0][1] + dM[1][0]) + z * (dM[1][2] + dM[2][1]) -
+                2.0f * y * (dM[0][0] + dM[2][2])),
+        2.0f * (w * (dM[1][0] - dM[0][1]) + x * (dM[0][2] + dM[2][0]) + y * (dM[1][2] + dM[2][1]) -
+                2.0f * z * (dM[0][0] + dM[1][1]))};
+    const V16 radial = q[0] * w + q[1] * x + q[2] * y + q[3] * z;
+    for (int k = 0; k < 4; ++k) rows.put(out.quaternions, 4, k, (q[k] - radial * f.unit[k]) / f.norm);
 
-    out.opacity_logits[i] = in.g * (1 - f.opacity);
-    harmonics::backward(s, view.center, i, in.color, out.sh, world);
-    for (int j = 0; j < 3; ++j) out.means[3 * i + j] = world[j];
-    out.centers[2 * i] = du, out.centers[2 * i + 1] = dv;
+    rows.put(out.opacity_logits, 1, 0, in.g * f.transparency);
+    harmonics::backward(s, view.center, rows, f.mean, in.color, out.sh, world);
+    for (int j = 0; j < 3; ++j) rows.put(out.means, 3, j, world[j]);
 }
 
 }  // namespace projection

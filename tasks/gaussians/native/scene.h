@@ -12,7 +12,8 @@ struct Scene {
     const float* log_scales;      // [N, 3]
     const float* opacity_logits;  // [N]
     const float* sh;              // [N, sh_coefficients, 3]
-    const int32_t* labels;        // [N] channel of the label masks, < 0 = none; null without masks
+    const int32_t* labels;        // [N] the label of each Gaussian, < 0 = none; null without labels
+    const int32_t* ids;           // [H, W] the label that each pixel should show; null without `mismatch`
     int32_t sh_coefficients;      // stored
     int32_t sh_degree;            // used, 0..3
     int32_t num_labels;
@@ -29,8 +30,9 @@ struct Images {
     float* rgb;        // [H, W, 3] over the background
     float* alpha;      // [H, W]
     float* depth;      // [H, W] sum of weight * z
-    float* masks;      // [L, H, W]
-    int32_t* top;      // [H, W] row of the largest weight, -1 = none; null when not wanted
+    float* masks;      // [num_labels, H, W] sum of the weights of each label; null when not wanted
+    float* mismatch;   // [H, W] sum of the weights of labels other than the pixel's, less those of its own; likewise
+    int32_t* top;      // [H, W] row of the largest weight, -1 = none; likewise
     float* radii;      // [N] pixels, 0 = not in view
     float* strongest;  // [N] largest weight over the image; null when not wanted
 };
