@@ -13,7 +13,17 @@ from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
 NATIVE = Path("tasks/gaussians/native")
-COMMON = ["-std=c++17", "-O3", "-fPIC", "-shared", "-pthread", "-Wno-psabi", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=default"]
+COMMON = [
+    "-std=c++17",
+    "-O3",
+    "-fPIC",
+    "-shared",
+    "-pthread",
+    "-Wno-psabi",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fvisibility=default",
+]
 X86 = {
     "baseline": [],
     "avx2": ["-mavx2", "-mfma"],

@@ -4,6 +4,7 @@
     actions/aa/<key>.json   key -> output digests, the key's components, seconds, memory, host, warnings
     claims/<key>            who is computing what, now
     roots/runs/             a manifest and an event log for every run
+    checkpoints/            what long tasks keep of half-done work, by key
     tmp/                    what is being written
 
 Notes

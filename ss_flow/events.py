@@ -1,39 +1,14 @@
 """What happens while a flow runs: events, and who listens to them.
 
-The scheduler speaks to one `Reporter`; the silent one at the root of the hierarchy makes listening optional. A task
-says how far it is with `progress`, without knowing who listens.
+The scheduler speaks to one `Reporter`; the silent one at the root of the hierarchy makes listening optional.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 from typing import IO, Any
-
-Listener = Callable[[int, int, str], None]
-
-_listener: ContextVar[Listener | None] = ContextVar("progress_listener", default=None)
-
-
-def progress(done: int, total: int, note: str = "") -> None:
-    """Say how far a long task is; free of cost where nobody listens. A cancelled task ends here."""
-    listen = _listener.get()
-    if listen is not None:
-        listen(done, total, note)
-
-
-@contextmanager
-def listening(listener: Listener) -> Iterator[None]:
-    """Within this, `progress` calls `listener`."""
-    token = _listener.set(listener)
-    try:
-        yield
-    finally:
-        _listener.reset(token)
 
 
 class Reporter:

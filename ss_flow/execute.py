@@ -18,8 +18,8 @@ from typing import Any
 import psutil
 
 from ss_flow.cache.store import Action, Store
-from ss_flow.events import Listener, listening
 from ss_flow.keys import Components, Value
+from ss_flow.running import Listener, Surroundings, remove_checkpoint, running
 from ss_flow.task import Resources, Task
 
 SAMPLE_SECONDS = 0.2
@@ -52,8 +52,10 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
         name: store.get(value) if isinstance(value, str) else tuple(store.get(item) for item in value)
         for name, value in invocation.inputs.items()
     }
+    checkpoint = store.root / "checkpoints" / f"{invocation.key}.npz"
     started = time.monotonic()
-    with listening(listener), _peak_memory() as peak_mb, warnings.catch_warnings(record=True) as caught:
+    surroundings = Surroundings(listener, max(1, invocation.resources.cores), checkpoint)
+    with running(surroundings), _peak_memory() as peak_mb, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         result = task.function(**arguments, **invocation.parameters)
     seconds = time.monotonic() - started
@@ -69,6 +71,7 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
         warnings=tuple(dict.fromkeys(str(w.message) for w in caught if w.category is UserWarning)),
     )
     store.record(action)
+    remove_checkpoint(checkpoint)
     return action
 
 

@@ -11,7 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ss_flow.cache.claims import Claims
@@ -238,6 +238,7 @@ class Scheduler:
             job = self._jobs[key]
             if not self._fits(job.invocation.resources):
                 continue
+            job.invocation = self._with_spare_cores(job.invocation)
             if not self._claims.take(key):
                 if key not in self._claimed_elsewhere:
                     self._claimed_elsewhere.add(key)
@@ -260,6 +261,15 @@ class Scheduler:
             sum(getattr(r, kind) for r in held) + getattr(wanted, kind) <= getattr(self._capacity, kind)
             for kind in ("cores", "memory_mb", "gpus")
         )
+
+    def _with_spare_cores(self, invocation: Invocation) -> Invocation:
+        """The last job that waits gets the cores that nobody wants."""
+        wanted = invocation.resources
+        if wanted.most_cores <= wanted.cores or len(self._queued) > 1:
+            return invocation
+        held = sum(self._jobs[key].invocation.resources.cores for key in self._running.values())
+        granted = max(wanted.cores, min(wanted.most_cores, self._capacity.cores - held))
+        return replace(invocation, resources=replace(wanted, cores=granted))
 
     def _ranks(self) -> dict[Node, int]:
         """The longest known path from each unsettled node to a target, in nodes."""

@@ -23,6 +23,8 @@ class Resources:
     """What a task needs while it runs; the scheduler never hands out more than the machine has."""
 
     cores: int = 1
+    most_cores: int = 1
+    """Cores that it can make use of; it gets more than `cores` where nothing else waits for them."""
     memory_mb: int = 0
     gpus: int = 0
 

@@ -7,10 +7,10 @@ import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from ss_flow.cache.store import Action, Store
-from ss_flow.events import Listener
 from ss_flow.execute import Cancelled, Invocation, execute
 from ss_flow.executors import OnProgress
 from ss_flow.executors.worker import Worker
+from ss_flow.running import Listener
 
 
 class LocalPool:

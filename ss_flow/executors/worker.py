@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.cache.store import Action, Store
-from ss_flow.events import Listener
 from ss_flow.execute import Invocation, execute
+from ss_flow.running import Listener
 
 GRACE_SECONDS = 3.0
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
 from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame, UInt8
 from ss_flow.tasks.capture.ingest import IngestParams, frame_of

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map, undistortion_map

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, Frame
 from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map

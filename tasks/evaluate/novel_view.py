@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, Gaussians, Metrics, UInt8
 from ss_flow.tasks.geometry.cameras import camera_of

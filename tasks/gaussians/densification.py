@@ -1,19 +1,79 @@
-"""Adaptive control of the number of Gaussians (Kerbl et al. 2023, Sec. 5), on rows of NumPy arrays."""
+"""The number of Gaussians under control: clone, split and prune (Kerbl et al. 2023, Sec. 5).
+
+`mcmc.py` holds the other strategy. A strategy sees every step and may rearrange the rows of `Parameters`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64
+from ss_flow.tasks.gaussians.optimizer import Parameters
 
 CLONE_SHARE = 0.01
 """Gaussians larger than this share of the extent are split, smaller ones cloned."""
+LARGE_SHARE = 0.1
+"""Gaussians larger than this share of the extent are dropped, once opacities have been reset."""
 SPLIT_SHRINK = 1.6
 """What the two halves of a split Gaussian are smaller by."""
 REFERENCE_ROWS = 512
 """The image height at which 3DGS's gradient threshold, in units of half an image, is taken."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one step tells a strategy."""
+
+    gradients: Mapping[str, Float32]
+    """By parameter, and "centers" [N, 2] towards the projected means."""
+    radii: Float32
+    """[N] pixels, 0 = not in view."""
+    pixels: int
+    """In the mean that the loss is."""
+    means_rate: float
+    """Learning rate of the means, world units."""
+
+
+class Strategy(Protocol):
+    """Something that decides how many Gaussians there are, and where."""
+
+    last_step: int
+    """After this one it does nothing."""
+
+    def regularise(self, parameters: Parameters, gradients: Mapping[str, Float32]) -> None:
+        """Add to the gradients, in place, before they are applied."""
+
+    def after(self, step: int, parameters: Parameters, seen: Seen, generator: np.random.Generator) -> None:
+        """Act after a step (the first is 1)."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What it remembers, to go on from later."""
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what `state` gave."""
+
+
+class Fixed:
+    """No strategy: the Gaussians stay as many as they are."""
+
+    last_step = 0
+
+    def regularise(self, parameters: Parameters, gradients: Mapping[str, Float32]) -> None:
+        pass
+
+    def after(self, step: int, parameters: Parameters, seen: Seen, generator: np.random.Generator) -> None:
+        pass
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        return {}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        pass
 
 
 @dataclass(frozen=True)
@@ -41,17 +101,60 @@ class GradientRecord:
     """The mean gradient of each Gaussian's screen position over the views that showed it."""
 
     def __init__(self, count: int) -> None:
-        self._sum, self._seen = np.zeros(count, np.float64), np.zeros(count, np.int64)
+        self.sum, self.seen = np.zeros(count, np.float64), np.zeros(count, np.int64)
 
     def add(self, centers: Float32, radii: Float32, pixels: int) -> None:
         """centers: [N, 2] gradient of a loss that is a mean over `pixels`. radii: [N], 0 where not in view."""
         norm = np.hypot(centers[:, 0], centers[:, 1]) * (pixels / (2 * REFERENCE_ROWS))
         seen = radii > 0
-        self._sum[seen] += norm[seen]
-        self._seen[seen] += 1
+        self.sum[seen] += norm[seen]
+        self.seen[seen] += 1
 
     def mean(self) -> Float64:
-        return self._sum / np.maximum(self._seen, 1)
+        return self.sum / np.maximum(self.seen, 1)
+
+
+class AdaptiveControl:
+    """Clones and splits where the picture is still wrong, drops what is faint or far too large."""
+
+    def __init__(
+        self, count: int, schedule: Schedule, *, threshold: float, extent: float, most: int, prune_opacity: float
+    ) -> None:
+        self.last_step = schedule.stop
+        self._schedule = schedule
+        self._threshold, self._extent, self._most, self._prune_opacity = threshold, extent, most, prune_opacity
+        self._record = GradientRecord(count)
+
+    def regularise(self, parameters: Parameters, gradients: Mapping[str, Float32]) -> None:
+        pass
+
+    def after(self, step: int, parameters: Parameters, seen: Seen, generator: np.random.Generator) -> None:
+        if step > self.last_step:
+            return
+        self._record.add(seen.gradients["centers"], seen.radii, seen.pixels)
+        if self._schedule.densifies(step):
+            rows = densify(
+                parameters.values,
+                self._record.mean(),
+                threshold=self._threshold,
+                extent=self._extent,
+                most=self._most,
+                generator=generator,
+            )
+            parameters.rearrange(*rows)
+            keep = parameters.opacities() >= self._prune_opacity
+            if step > self._schedule.reset_every:
+                keep &= np.exp(parameters.values["log_scales"]).max(axis=1) <= LARGE_SHARE * self._extent
+            parameters.keep(keep)
+            self._record = GradientRecord(len(parameters))
+        if self._schedule.resets(step):
+            parameters.limit_opacity(0.01)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        return {"record.sum": self._record.sum, "record.seen": self._record.seen}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        self._record.sum, self._record.seen = state["record.sum"], state["record.seen"]
 
 
 def densify(
@@ -62,7 +165,7 @@ def densify(
     extent: float,
     most: int,
     generator: np.random.Generator,
-) -> tuple[dict[str, Float32], np.ndarray, Bool]:
+) -> tuple[dict[str, Float32], NDArray[np.integer], Bool]:
     """Clone small and split large Gaussians whose screen gradient is above the threshold.
 
     Returns the new parameters, the row each came from, and which rows are new (their optimiser state starts at 0).

@@ -20,6 +20,13 @@ _INT, _INT32, _INT64, _DOUBLE, _FLOAT, _POINTER = (
     ctypes.c_void_p,
 )
 
+NATIVE_SOURCES = (
+    "native/binning.h", "native/blending.h", "native/harmonics.h", "native/lanes.h", "native/losses.cpp",
+    "native/parallel.h", "native/projection.h", "native/rasterizer.cpp", "native/rows.h", "native/scene.h",
+    "native/workspace.h",
+)  # fmt: skip
+"""What the results depend on besides this module: its digests count in the keys of the tasks that use it."""
+
 
 class Scene(ctypes.Structure):
     """`Scene` of native/scene.h."""
@@ -100,13 +107,31 @@ def library(name: str | None = None) -> Any:
         _INT,
     ]
     lib.ss_rasterize_backward.restype = _INT
-    lib.ss_photometric.argtypes = [_INT32, _INT32, _INT32, _POINTER, _POINTER, _POINTER, _FLOAT, _POINTER, _POINTER]
+    lib.ss_photometric.argtypes = [_POINTER, *[_INT] * 3, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER, _INT]
     lib.ss_photometric.restype = _INT
-    lib.ss_weighted_l1.argtypes = [_INT64, _POINTER, _POINTER, _POINTER, _POINTER]
-    lib.ss_weighted_l1.restype = _DOUBLE
-    lib.ss_adam.argtypes = [_INT64, _POINTER, _POINTER, _POINTER, _POINTER, _DOUBLE, _INT64, _DOUBLE]
+    lib.ss_surface_loss.argtypes = [_INT64, *[_POINTER] * 9, _FLOAT, _FLOAT, *[_POINTER] * 3]
+    lib.ss_surface_loss.restype = None
+    lib.ss_adam.argtypes = [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE]
     lib.ss_adam.restype = None
     return lib
+
+
+class Workspace:
+    """The native memory of a rendering and of the losses, reused by the next ones; for one thread at a time.
+
+    A pass can run backward only until another pass renders in its workspace.
+    """
+
+    def __init__(self) -> None:
+        self.handle = library().ss_workspace()
+        if self.handle is None:
+            raise MemoryError("not enough memory for a rendering")
+        self.turn = 0
+        """How many passes have rendered in it."""
+
+    def __del__(self) -> None:
+        if getattr(self, "handle", None) is not None:
+            library().ss_workspace_free(self.handle)
 
 
 def address(array: NDArray[np.float32] | NDArray[np.int32] | None) -> int | None:

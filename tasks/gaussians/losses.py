@@ -1,4 +1,4 @@
-"""Losses of training, fused in the native library on the CPU; pixels of weight 0 count for nothing."""
+"""Losses of training, fused in the native library; pixels of weight 0 count for nothing."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Float32
-from ss_flow.tasks.gaussians.library import address, library
+from ss_flow.tasks.artifacts import Float32, Int32
+from ss_flow.tasks.gaussians.library import Workspace, address, library
 
 
 class Photometric(NamedTuple):
@@ -20,7 +20,15 @@ class Photometric(NamedTuple):
     """[H, W, C]."""
 
 
-def photometric(image: Float32, target: Float32, weight: Float32, ssim_weight: float = 0.2) -> Photometric:
+def photometric(
+    image: Float32,
+    target: Float32,
+    weight: Float32,
+    ssim_weight: float = 0.2,
+    *,
+    workspace: Workspace | None = None,
+    threads: int = 1,
+) -> Photometric:
     """The colour loss of 3D Gaussian Splatting (Kerbl et al. 2023, Eq. 7) over the pixels of weight > 0.
 
     image, target: [H, W, C] float32, 0..1. weight: [H, W] float32. SSIM: an 11 x 11 Gaussian window with sigma 1.5,
@@ -31,20 +39,55 @@ def photometric(image: Float32, target: Float32, weight: Float32, ssim_weight: f
         raise ValueError(f"image {image.shape}, target {target.shape} and weight {weight.shape} do not fit")
     image, target, weight = (np.ascontiguousarray(a, np.float32) for a in (image, target, weight))
     gradient, out = np.empty_like(image), np.empty(3, np.float64)
+    workspace = Workspace() if workspace is None else workspace
     failed = library().ss_photometric(
-        width, height, channels, address(image), address(target), address(weight), ssim_weight, address(gradient),
-        out.ctypes.data,
+        workspace.handle, width, height, channels, address(image), address(target), address(weight), ssim_weight,
+        address(gradient), out.ctypes.data, threads,
     )  # fmt: skip
     if failed:
         raise MemoryError("not enough memory for the colour loss")
     return Photometric(float(out[0]), float(out[1]), float(out[2]), gradient)
 
 
-def weighted_l1(value: Float32, target: Float32, weight: Float32) -> tuple[float, Float32]:
-    """The sum of weight * |value - target| and its gradient towards the value; three arrays of one shape."""
-    if not value.shape == target.shape == weight.shape:
-        raise ValueError(f"value {value.shape}, target {target.shape} and weight {weight.shape} do not fit")
-    value, target, weight = (np.ascontiguousarray(a, np.float32) for a in (value, target, weight))
-    gradient = np.empty_like(value)
-    loss = library().ss_weighted_l1(value.size, address(value), address(target), address(weight), address(gradient))
-    return float(loss), gradient
+class Surface(NamedTuple):
+    """The losses of alpha, depth and labels, each before its weight, and their weighted gradients."""
+
+    alpha: float
+    depth: float
+    labels: float
+    towards_alpha: Float32
+    """[H, W]."""
+    towards_depth: Float32
+    """[H, W]."""
+
+
+def surface(
+    alpha: Float32,
+    depth: Float32,
+    mismatch: Float32 | None,
+    *,
+    inside: Float32,
+    judged: Float32,
+    target_depth: Float32,
+    known: Float32,
+    labelled: Float32 | None,
+    ids: Int32 | None,
+    alpha_weight: float,
+    depth_weight: float,
+) -> Surface:
+    """Three mean absolute errors over the pixels, C-contiguous [H, W] arrays throughout.
+
+    Alpha: sum of judged * |alpha - inside|. Depth: sum of known * |depth / target_depth - alpha|, a relative error,
+    so that the scale of the world does not matter. Labels, without `mismatch` 0: sum of labelled * (mismatch + 1 where
+    ids >= 0); its gradient towards `mismatch` is `labelled`. That is the absolute error of all label masks against
+    their one-hot targets, since no mask falls below 0 or exceeds 1 (spec A25).
+    """
+    towards_alpha, towards_depth, out = np.empty_like(alpha), np.empty_like(depth), np.empty(3, np.float64)
+    images = (alpha, depth, mismatch, inside, judged, target_depth, known, labelled, ids)
+    if any(a is not None and a.shape != alpha.shape for a in images):
+        raise ValueError(f"the images must all be {list(alpha.shape)}")
+    library().ss_surface_loss(
+        alpha.size, *(address(a) for a in images), alpha_weight, depth_weight, address(towards_alpha),
+        address(towards_depth), out.ctypes.data,
+    )  # fmt: skip
+    return Surface(float(out[0]), float(out[1]), float(out[2]), towards_alpha, towards_depth)

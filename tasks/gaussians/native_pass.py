@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Int32
-from ss_flow.tasks.gaussians.library import Gradients, Images, Scene, address, library
+from ss_flow.tasks.gaussians.library import Gradients, Images, Scene, Workspace, address, library
 from ss_flow.tasks.geometry.cameras import Camera
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
@@ -27,32 +27,14 @@ class Settings:
     """Whether to find each pixel's top contributor and each Gaussian's largest weight."""
 
 
-class Workspace:
-    """The native memory of a rendering, reused by the next one; for one thread at a time.
-
-    A pass can run backward only until another pass renders in its workspace.
-    """
-
-    def __init__(self) -> None:
-        self.handle = library().ss_workspace()
-        if self.handle is None:
-            raise MemoryError("not enough memory for a rendering")
-        self.turn = 0
-        """How many passes have rendered in it."""
-
-    def __del__(self) -> None:
-        if getattr(self, "handle", None) is not None:
-            library().ss_workspace_free(self.handle)
-
-
 class NativePass:
     """A forward pass and what its backward pass needs; give the arrays C-contiguous, float32 and int32.
 
     labels: [N], < 0 = none. With `ids` ([H, W]: the label that each pixel should show), `mismatch` [H, W] is the sum of
     the weights of other labels less those of the pixel's own; without, `masks` [L, H, W] are the sums of each label's
     weights. Further images: rgb [H, W, 3], alpha [H, W], depth [H, W], top [H, W] int32; for the Gaussians: radii [N]
-    pixels, strongest [N] largest weight; `top` and `strongest` are None without `winners`. The number of threads changes
-    no byte.
+    pixels, strongest [N] largest weight; `top` and `strongest` are None without `winners`. The number of threads
+    changes no byte.
     """
 
     def __init__(

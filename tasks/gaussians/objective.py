@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Int32
-from ss_flow.tasks.gaussians.losses import photometric, weighted_l1
+from ss_flow.tasks.gaussians.library import Workspace
+from ss_flow.tasks.gaussians.losses import photometric, surface
 from ss_flow.tasks.gaussians.native_pass import NativePass
 from ss_flow.tasks.geometry.cameras import Camera
 
@@ -37,24 +38,10 @@ class Target:
     """[h, w] 1 where unknown."""
     known: Float32
     """[h, w] 1 / number of inside pixels of known depth there, 0 elsewhere."""
-    present: Int32
-    """[P] the labels that the view shows. All other labels share one channel after theirs, which should stay empty: a
-    sum of absolute values that are nowhere negative is the absolute value of their sum, so the loss is the same."""
-    channel: Int32
-    """[h, w] which of the channels each pixel belongs to, negative where to none."""
-    labelled: Float32
-    """[h, w] 1 / (L * number of pixels that are not ignored) there, 0 elsewhere."""
-    channel_of_label: Int32
-    """[L + 1] the channel of each label; the last entry, which the label -1 finds, is -1. Empty without mask loss."""
-
-    @property
-    def num_labels(self) -> int:
-        """Number of mask channels."""
-        return len(self.present) + 1 if len(self.channel_of_label) else 0
-
-    def masks(self) -> Float32:
-        """The mask of each channel: [P + 1, h, w] one-hot."""
-        return (self.channel == np.arange(self.num_labels)[:, None, None]).astype(np.float32)
+    ids: Int32 | None
+    """[h, w] the label that each pixel should show, negative where none; None without mask loss."""
+    labelled: Float32 | None
+    """[h, w] 1 / (number of labels * number of pixels that are not ignored) there, 0 elsewhere."""
 
     @property
     def pixels(self) -> int:
@@ -81,17 +68,14 @@ class Target:
             raise ValueError(f"image must be {[*size, 3]} float32, not {list(image.shape)} {image.dtype}")
         inside, free = np.asarray(inside, bool), np.asarray(free, bool)
         known = inside & (depth > 0) & np.isfinite(depth)
-        present = channel_of_label = np.zeros(0, np.int32)
-        channel, labelled = np.full(size, -1, np.int32), np.zeros(size, np.float32)
-        if ids is not None and num_labels:
+        labelled = None
+        if ids is None or not num_labels:
+            ids = None
+        else:
             if ids.max(initial=-1) >= num_labels:
                 raise ValueError(f"ids must be below the {num_labels} label ids, but one is {int(ids.max())}")
-            present = np.unique(ids[ids >= 0]).astype(np.int32)
-            channel_of_label = np.full(num_labels + 1, len(present), np.int32)
-            channel_of_label[present] = np.arange(len(present))
-            channel_of_label[-1] = -1
-            channel = np.where(ids >= 0, channel_of_label[np.maximum(ids, 0)], -1).astype(np.int32)
             labelled = _mean(ids != -1) / np.float32(num_labels)
+            ids = np.ascontiguousarray(ids, np.int32)
         return cls(
             camera,
             np.ascontiguousarray(image),
@@ -99,10 +83,8 @@ class Target:
             _mean(inside | free),
             np.where(known, depth, 1).astype(np.float32),
             _mean(known),
-            present,
-            channel,
+            ids,
             labelled,
-            channel_of_label,
         )
 
 
@@ -112,29 +94,29 @@ def _mean(where: Bool) -> Float32:
 
 
 def gradients_of(
-    rendered: NativePass, target: Target, weights: Weights
-) -> tuple[float, tuple[Float32, Float32, Float32 | None, Float32 | None]]:
-    """The loss, and its gradients towards rgb, alpha, depth and label masks (None = zero).
+    rendered: NativePass, target: Target, weights: Weights, workspace: Workspace, threads: int
+) -> tuple[float, tuple[Float32, Float32, Float32, Float32 | None]]:
+    """The loss, and its gradients towards rgb, alpha, depth and mismatch (None = zero).
 
-    Colour: L1 and SSIM inside. Alpha: 1 inside, 0 where free. Depth, inside where known: |sum of weight * (z / depth
-    - 1)|, a relative error, so that the scale of the world does not matter. Masks: absolute difference between each
-    rendered label and its one-hot target, a mean over pixels and labels (spec A25).
+    Colour: L1 and SSIM inside. Alpha: 1 inside, 0 where free. Depth: inside, where known. Masks: each rendered label
+    against its one-hot target, a mean over pixels and labels (spec A25).
     """
-    color = photometric(rendered.rgb, target.image, target.inside, weights.ssim)
-    loss, towards_alpha = weighted_l1(rendered.alpha, target.inside, target.judged)
-    total = color.loss + weights.alpha * loss
-    towards_alpha *= np.float32(weights.alpha)
-    towards_depth = towards_masks = None
-    if weights.depth > 0:
-        relative = rendered.depth / target.depth - rendered.alpha
-        loss, towards = weighted_l1(relative, np.zeros_like(relative), target.known)
-        towards *= np.float32(weights.depth)
-        total += weights.depth * loss
-        towards_alpha -= towards
-        towards_depth = towards / target.depth
-    if target.num_labels:
-        weight = np.broadcast_to(target.labelled, rendered.masks.shape)
-        loss, towards_masks = weighted_l1(rendered.masks, target.masks(), weight)
-        towards_masks *= np.float32(weights.mask)
-        total += weights.mask * loss
-    return total, (color.gradient, towards_alpha, towards_depth, towards_masks)
+    color = photometric(
+        rendered.rgb, target.image, target.inside, weights.ssim, workspace=workspace, threads=threads
+    )  # fmt: skip
+    rest = surface(
+        rendered.alpha,
+        rendered.depth,
+        rendered.mismatch,
+        inside=target.inside,
+        judged=target.judged,
+        target_depth=target.depth,
+        known=target.known,
+        labelled=target.labelled,
+        ids=target.ids,
+        alpha_weight=weights.alpha,
+        depth_weight=weights.depth,
+    )
+    total = color.loss + weights.alpha * rest.alpha + weights.depth * rest.depth + weights.mask * rest.labels
+    towards_mismatch = None if target.labelled is None else target.labelled * np.float32(weights.mask)
+    return total, (color.gradient, rest.towards_alpha, rest.towards_depth, towards_mismatch)

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians
 from ss_flow.tasks.gaussians.initialise import with_sh_degree
 from ss_flow.tasks.gaussians.library import address, library
+from ss_flow.tasks.gaussians.native_pass import PARAMETERS
 
 EPSILON = 1e-15
 
 
 class Parameters:
-    """Float32 arrays by name: the rasterizer's, with the colours as sh_base [N, 1, 3] and sh_rest [N, K - 1, 3]."""
+    """The rasterizer's five float32 arrays by name, the colours with all the coefficients they will ever need."""
 
     def __init__(self, initial: Gaussians, sh_degree: int) -> None:
         filled = with_sh_degree(initial, sh_degree)
         self.values: dict[str, Float32] = {
-            "means": np.array(filled.means, np.float32, order="C"),
-            "quaternions": np.array(filled.quaternions, np.float32, order="C"),
-            "log_scales": np.array(filled.log_scales, np.float32, order="C"),
-            "opacity_logits": np.array(filled.opacity_logits, np.float32, order="C"),
-            "sh_base": np.array(filled.sh[:, :1], np.float32, order="C"),
-            "sh_rest": np.array(filled.sh[:, 1:], np.float32, order="C"),
+            name: np.array(getattr(filled, name), np.float32, order="C") for name in PARAMETERS
         }
         self._first = {name: np.zeros_like(a) for name, a in self.values.items()}
         self._second = {name: np.zeros_like(a) for name, a in self.values.items()}
@@ -33,26 +32,27 @@ class Parameters:
     def __len__(self) -> int:
         return len(self.values["means"])
 
-    def for_rendering(self, sh_degree: int) -> tuple[Float32, Float32, Float32, Float32, Float32]:
-        """The five arrays of the rasterizer, the colours with no more coefficients than the degree needs."""
-        v, rest = self.values, (sh_degree + 1) ** 2 - 1
-        sh = np.concatenate([v["sh_base"], v["sh_rest"][:, :rest]], axis=1) if rest else v["sh_base"]
-        return v["means"], v["quaternions"], v["log_scales"], v["opacity_logits"], sh
+    def arrays(self) -> tuple[Float32, Float32, Float32, Float32, Float32]:
+        """As the rasterizer takes them."""
+        v = self.values
+        return v["means"], v["quaternions"], v["log_scales"], v["opacity_logits"], v["sh"]
 
-    def step(self, gradients: dict[str, Float32], rates: dict[str, float], number: int) -> None:
-        """One step of Adam; number: 1 for the first. `gradients` as the rasterizer gives them."""
-        sh = gradients["sh"]
-        parts = {**gradients, "sh_base": sh[:, :1]}
-        if sh.shape[1] > 1:
-            parts["sh_rest"] = np.zeros_like(self.values["sh_rest"])
-            parts["sh_rest"][:, : sh.shape[1] - 1] = sh[:, 1:]
+    def opacities(self) -> NDArray[np.float64]:
+        """[N] between 0 and 1."""
+        return 1 / (1 + np.exp(-self.values["opacity_logits"].astype(np.float64)))
+
+    def step(self, gradients: Mapping[str, Float32], rates: Mapping[str, float], number: int, sh_degree: int) -> None:
+        """One step of Adam; number: 1 for the first. rates: by name, "sh_rest" for the colours above degree 0."""
         for name, value in self.values.items():
-            if name in parts and value.size:
-                gradient = np.ascontiguousarray(parts[name])
-                library().ss_adam(
-                    value.size, address(value), address(gradient), address(self._first[name]),
-                    address(self._second[name]), rates[name], number, EPSILON,
-                )  # fmt: skip
+            rows, width, head = len(value), value[:1].size, 0
+            active = width
+            if name == "sh":
+                active, head = 3 * (sh_degree + 1) ** 2, 3
+            library().ss_adam(
+                rows, width, active, head, address(value), address(gradients[name]), address(self._first[name]),
+                address(self._second[name]), rates[name], rates["sh_rest"] if name == "sh" else rates[name], number,
+                EPSILON,
+            )  # fmt: skip
 
     def rearrange(self, values: dict[str, Float32], source: NDArray[np.integer], fresh: Bool) -> None:
         """Replace the rows by new ones that descend from `source`; those that are fresh start without momentum."""
@@ -65,6 +65,8 @@ class Parameters:
 
     def keep(self, rows: Bool) -> None:
         """Drop the other rows."""
+        if rows.all():
+            return
         source = np.flatnonzero(rows)
         self.rearrange({n: a[source] for n, a in self.values.items()}, source, np.zeros(len(source), bool))
 
@@ -78,16 +80,29 @@ class Parameters:
     def finite(self) -> bool:
         return all(bool(np.isfinite(a).all()) for a in self.values.values())
 
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything, to go on from later."""
+        groups = {"value": self.values, "first": self._first, "second": self._second}
+        arrays = {f"{group}.{name}": a for group, named in groups.items() for name, a in named.items()}
+        return {**arrays, "origin": self.origin}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what `state` gave."""
+        for group, named in (("value", self.values), ("first", self._first), ("second", self._second)):
+            for name in named:
+                named[name] = np.ascontiguousarray(state[f"{group}.{name}"])
+        self.origin = state["origin"]
+
     def to_gaussians(self, initial: Gaussians) -> Gaussians:
         """The artifact; labels come from the initial Gaussian that each descends from."""
-        means, quaternions, log_scales, opacity_logits, _ = self.for_rendering(0)
+        means, quaternions, log_scales, opacity_logits, sh = self.arrays()
         length = np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
         return Gaussians(
             means.copy(),
             (quaternions / length).astype(np.float32),
             log_scales.copy(),
             opacity_logits.copy(),
-            np.concatenate([self.values["sh_base"], self.values["sh_rest"]], axis=1),
+            sh.copy(),
             initial.instance_id[self.origin],
             initial.instance_conf[self.origin],
             initial.part_id[self.origin],

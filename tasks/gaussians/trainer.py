@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from ss_flow.events import progress
+from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
-from ss_flow.tasks.gaussians import densification
+from ss_flow.tasks.gaussians.densification import AdaptiveControl, Fixed, Schedule, Seen, Strategy
+from ss_flow.tasks.gaussians.library import Workspace
+from ss_flow.tasks.gaussians.mcmc import MarkovChain
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Target, Weights, gradients_of
 from ss_flow.tasks.gaussians.optimizer import Parameters
@@ -18,6 +22,9 @@ from ss_flow.tasks.gaussians.rasterize import NEAR_PLANE
 from ss_flow.tasks.gaussians.render import channels_of
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, NonNegative, Positive
+
+CHECKPOINT_SECONDS = 60.0
+"""How much work a kill may cost."""
 
 
 class TrainingDiverged(RuntimeError):
@@ -74,12 +81,16 @@ class TrainParams:
     """Weight of the mask loss of merging (spec A25)."""
     background: Literal["random", "black", "white"] = "random"
     """What lies behind: "random" (a colour for each step), "black" or "white"."""
-    densify: bool = True
-    """Whether to clone and split."""
+    densify: Literal["classic", "mcmc", "none"] = "classic"
+    """How the number of Gaussians grows: "classic" clones and splits as in 3DGS, "mcmc" moves faint Gaussians to where
+    opaque ones are and grows by 5 % at a time, "none" leaves it."""
     densify_grad: Positive = 2e-4
     """Mean screen gradient from which a Gaussian is cloned or split, in 3DGS's units for images 512 pixels high."""
     max_gaussians: Count = 30_000
     """Densification ends at this number."""
+    plateau: Fraction = 0.0
+    """Training ends early when, once the number of Gaussians is settled, the mean loss over all views falls by less
+    than this share twice in a row; 0 = never."""
     reset_opacity: bool = False
     """Whether to start with no opacity above 0.01 (spec A23)."""
     prune_opacity: Fraction = 0.005
@@ -99,7 +110,7 @@ class TrainResult:
     """dB over the inside pixels of all views, before a black background; 100 at most."""
     iterations: int
     loss: Float32
-    """[iterations]."""
+    """[iterations] of each step."""
 
 
 def auto_iterations(num_views: int) -> int:
@@ -115,12 +126,12 @@ def train(
     extent: float,
     seed: int,
     label_ids: Sequence[int] = (),
-    on_progress: Callable[[int, int, str], None] = progress,
 ) -> TrainResult:
     """Fit Gaussians to views with Adam (Kerbl et al. 2023, Sec. 5; spec P1, P4).
 
     extent: size of what is trained, world units: scales the learning rate of the means and tells large Gaussians from
-    small. label_ids: instance ids of the mask loss's channels. Single-threaded, and the same bytes whatever else runs.
+    small. label_ids: instance ids of the mask loss. The number of threads changes no byte, and neither does a kill: a
+    later try goes on from the last checkpoint.
     Raises ValueError when there are no views or Gaussians or an array does not fit its camera, TrainingDiverged when
     numbers blow up. The result has no Gaussians when all were pruned.
     """
@@ -128,64 +139,177 @@ def train(
         raise ValueError(f"training needs Gaussians and views, but got {len(initial)} and {len(views)}")
     if not extent > 0:
         raise ValueError(f"the extent must be positive, not {extent}")
-    if params.background not in ("random", "black", "white"):
-        raise ValueError(f'background must be "random", "black" or "white", not {params.background!r}')
-    targets = [
-        Target.of(v.camera, v.image, v.inside, v.free, v.depth, v.ids, len(label_ids) if params.mask_weight else 0)
-        for v in views
-    ]
-    generator = np.random.default_rng(seed)
-    given_degree = round(initial.sh.shape[1] ** 0.5) - 1
-    last_degree = min(params.sh_degree, params.iterations // 1000) if params.iterations >= 2000 else 0
-    parameters = Parameters(initial, max(given_degree, last_degree))
-    if not parameters.finite():
-        raise ValueError("the initial Gaussians hold values that are not finite")
-    if params.reset_opacity:
-        parameters.limit_opacity(0.01)
-    channels = channels_of(initial.instance_id, label_ids)
-    schedule = densification.Schedule.of(params.iterations)
-    record = densification.GradientRecord(len(parameters))
-    losses = np.zeros(params.iterations, np.float32)
-    order: list[int] = []
-    for step in range(1, params.iterations + 1):
-        if not order:
-            order = generator.permutation(len(targets)).tolist()
-        target = targets[order.pop()]
-        done_share = (step - 1) / max(params.iterations - 1, 1)
-        degree = max(given_degree, min(last_degree, step // 1000))
+    for name, allowed in (("background", ("random", "black", "white")), ("densify", ("classic", "mcmc", "none"))):
+        if getattr(params, name) not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {getattr(params, name)!r}")
+    training = _Training(initial, views, params, extent, seed, label_ids)
+    training.resume()
+    saved = time.monotonic()
+    while training.step < params.iterations and not training.settled():
+        training.advance()
+        if training.step % 50 and training.step < params.iterations:
+            continue
+        training.check()
+        try:
+            note = f"{len(training.parameters)} Gaussians, loss {training.losses[training.step - 1]:.4f}"
+            progress(training.step, params.iterations, note)
+        except BaseException:  # the run is being cancelled
+            training.save()
+            raise
+        if time.monotonic() - saved > CHECKPOINT_SECONDS:
+            training.save()
+            saved = time.monotonic()
+    return training.finish()
+
+
+class _Training:
+    """The state of a training, from step to step."""
+
+    def __init__(
+        self,
+        initial: Gaussians,
+        views: Sequence[TrainView],
+        params: TrainParams,
+        extent: float,
+        seed: int,
+        label_ids: Sequence[int],
+    ) -> None:
+        num_labels = len(label_ids) if params.mask_weight else 0
+        self._initial, self._params, self._extent, self._num_labels = initial, params, extent, num_labels
+        self._targets = [Target.of(v.camera, v.image, v.inside, v.free, v.depth, v.ids, num_labels) for v in views]
+        self._generator = np.random.default_rng(seed)
+        self._given_degree = round(initial.sh.shape[1] ** 0.5) - 1
+        last = min(params.sh_degree, params.iterations // 1000) if params.iterations >= 2000 else 0
+        self._last_degree = max(self._given_degree, last)
+        self.parameters = Parameters(initial, self._last_degree)
+        if not self.parameters.finite():
+            raise ValueError("the initial Gaussians hold values that are not finite")
+        if params.reset_opacity:
+            self.parameters.limit_opacity(0.01)
+        self._channels = channels_of(initial.instance_id, label_ids)
+        self._strategy = _strategy(params, len(initial), extent)
+        self.step = 0
+        self.losses = np.zeros(params.iterations, np.float32)
+        self._order: list[int] = []
+        self._workspace, self._threads = Workspace(), cores()
+        self._gradients: dict[str, Float32] | None = None
+
+    def advance(self) -> None:
+        """One step: render a view, compare, go down the gradient, mind the number of Gaussians."""
+        params, parameters = self._params, self.parameters
+        if not self._order:
+            self._order = self._generator.permutation(len(self._targets)).tolist()
+        target = self._targets[self._order.pop()]
+        done_share = self.step / max(params.iterations - 1, 1)
+        self.step += 1
+        degree = max(self._given_degree, min(self._last_degree, self.step // 1000))
         settings = Settings(
-            _background(params.background, generator),
-            target.num_labels, degree, NEAR_PLANE, params.antialias, winners=False,
+            _background(params.background, self._generator),
+            self._num_labels, degree, NEAR_PLANE, params.antialias, winners=False,
         )  # fmt: skip
-        labels = target.channel_of_label[channels[parameters.origin]] if target.num_labels else None
-        rendered = NativePass(parameters.for_rendering(degree), labels, target.camera, settings)
+        with_labels = target.ids is not None
+        rendered = NativePass(
+            parameters.arrays(),
+            self._channels[parameters.origin] if with_labels else None,
+            target.camera,
+            settings,
+            ids=target.ids,
+            workspace=self._workspace,
+            threads=self._threads,
+        )
         weights = Weights(
             params.ssim_weight,
             params.alpha_weight,
             _decay(params.depth_weight_start, params.depth_weight_final, done_share),
             params.mask_weight,
         )
-        losses[step - 1], towards = gradients_of(rendered, target, weights)
-        gradients = rendered.backward(*towards)
-        parameters.step(gradients, _rates(params, extent, done_share), step)
-        if not np.isfinite(losses[step - 1]) or (step % 50 == 0 and not parameters.finite()):
-            raise TrainingDiverged(f"training of {len(parameters)} Gaussians diverged at step {step}")
-        if params.densify:
-            if step <= schedule.stop:
-                record.add(gradients["centers"], rendered.radii, target.pixels)
-            if schedule.densifies(step):
-                _control(parameters, record, params, extent, step > schedule.reset_every, generator)
-                record = densification.GradientRecord(len(parameters))
-                if len(parameters) == 0:
-                    return TrainResult(parameters.to_gaussians(initial), 0.0, step, losses[:step])
-            if schedule.resets(step):
-                parameters.limit_opacity(0.01)
-        if step % 50 == 0 or step == params.iterations:
-            on_progress(step, params.iterations, f"{len(parameters)} Gaussians, loss {losses[step - 1]:.4f}")
-    if not parameters.finite():
-        raise TrainingDiverged(f"training of {len(parameters)} Gaussians diverged")
-    psnr = _finish(parameters, targets, params, max(given_degree, last_degree))
-    return TrainResult(parameters.to_gaussians(initial), psnr, params.iterations, losses)
+        loss, towards = gradients_of(rendered, target, weights, self._workspace, self._threads)
+        self.losses[self.step - 1] = loss
+        if not np.isfinite(loss):
+            raise TrainingDiverged(f"training of {len(parameters)} Gaussians diverged at step {self.step}")
+        if self._gradients is None or len(self._gradients["means"]) != len(parameters):
+            self._gradients = None
+        self._gradients = rendered.backward(*towards, out=self._gradients)
+        self._strategy.regularise(parameters, self._gradients)
+        rates = _rates(params, self._extent, done_share)
+        parameters.step(self._gradients, rates, self.step, degree)
+        seen = Seen(self._gradients, rendered.radii, target.pixels, rates["means"])
+        self._strategy.after(self.step, parameters, seen, self._generator)
+
+    def check(self) -> None:
+        """Raises TrainingDiverged when a parameter is no longer finite."""
+        if not self.parameters.finite():
+            raise TrainingDiverged(f"training of {len(self.parameters)} Gaussians diverged at step {self.step}")
+
+    def settled(self) -> bool:
+        """Whether nothing is left to train, or training has come to a plateau."""
+        if len(self.parameters) == 0:
+            return True
+        stretch = -(-100 // len(self._targets)) * len(self._targets)  # whole rounds over the views
+        settled_for = self.step - self._strategy.last_step
+        if not self._params.plateau or self.step % stretch or settled_for < 3 * stretch:
+            return False
+        a, b, c = self.losses[self.step - 3 * stretch : self.step].reshape(3, stretch).mean(axis=1)
+        enough = 1 - self._params.plateau
+        return bool(b > enough * a and c > enough * b)
+
+    def save(self) -> None:
+        """Keep everything for a later try."""
+        state = {
+            "step": np.int64(self.step),
+            "losses": self.losses,
+            "order": np.array(self._order, np.int64),
+            "generator": np.frombuffer(json.dumps(self._generator.bit_generator.state).encode(), np.uint8),
+        }
+        save_checkpoint({**state, **self.parameters.state(), **self._strategy.state()})
+
+    def resume(self) -> None:
+        """Go on from what an earlier try kept, if there is any."""
+        state = load_checkpoint()
+        if state is None:
+            return
+        self.step, self._order = int(state["step"]), state["order"].tolist()
+        self.losses[:] = state["losses"]
+        self._generator.bit_generator.state = json.loads(state["generator"].tobytes())
+        self.parameters.restore(state)
+        self._strategy.restore(state)
+
+    def finish(self) -> TrainResult:
+        """Drop what shows nowhere; the PSNR of what stays."""
+        parameters, params = self.parameters, self._params
+        settings = Settings((0.0, 0.0, 0.0), 0, self._last_degree, NEAR_PLANE, params.antialias, winners=True)
+        parameters.keep(parameters.opacities() >= params.prune_opacity)
+        strongest = np.zeros(len(parameters), np.float32)
+        error, count = 0.0, 0
+        for target in self._targets:
+            rendered = NativePass(
+                parameters.arrays(), None, target.camera, settings, workspace=self._workspace, threads=self._threads
+            )
+            assert rendered.strongest is not None
+            np.maximum(strongest, rendered.strongest, out=strongest)
+            inside = target.inside > 0
+            off = np.clip(rendered.rgb[inside], 0, 1) - target.image[inside]
+            error += float(np.square(off, dtype=np.float64).sum())
+            count += 3 * int(inside.sum())
+        if params.prune_contribution > 0:
+            parameters.keep(strongest >= params.prune_contribution)
+        psnr = float(-10 * np.log10(max(error / max(count, 1), 1e-10))) if count else 0.0
+        return TrainResult(parameters.to_gaussians(self._initial), psnr, self.step, self.losses[: self.step])
+
+
+def _strategy(params: TrainParams, count: int, extent: float) -> Strategy:
+    if params.densify == "mcmc":
+        return MarkovChain(params.iterations, extent=extent, most=params.max_gaussians)
+    if params.densify == "classic":
+        return AdaptiveControl(
+            count,
+            Schedule.of(params.iterations),
+            threshold=params.densify_grad,
+            extent=extent,
+            most=params.max_gaussians,
+            prune_opacity=params.prune_opacity,
+        )
+    return Fixed()
 
 
 def _background(kind: str, generator: np.random.Generator) -> tuple[float, float, float]:
@@ -207,51 +331,6 @@ def _rates(params: TrainParams, extent: float, share: float) -> dict[str, float]
         "quaternions": params.rotation_lr,
         "log_scales": params.scale_lr,
         "opacity_logits": params.opacity_lr,
-        "sh_base": params.color_lr,
+        "sh": params.color_lr,
         "sh_rest": params.color_lr / 20,
     }
-
-
-def _opaque_enough(parameters: Parameters, opacity: float) -> Bool:
-    return 1 / (1 + np.exp(-parameters.values["opacity_logits"].astype(np.float64))) >= opacity
-
-
-def _control(
-    parameters: Parameters,
-    record: densification.GradientRecord,
-    params: TrainParams,
-    extent: float,
-    prune_large: bool,
-    generator: np.random.Generator,
-) -> None:
-    parameters.rearrange(
-        *densification.densify(
-            parameters.values,
-            record.mean(),
-            threshold=params.densify_grad,
-            extent=extent,
-            most=params.max_gaussians,
-            generator=generator,
-        )
-    )
-    keep = _opaque_enough(parameters, params.prune_opacity)
-    if prune_large:
-        keep &= np.exp(parameters.values["log_scales"]).max(axis=1) <= 0.1 * extent
-    parameters.keep(keep)
-
-
-def _finish(parameters: Parameters, targets: Sequence[Target], params: TrainParams, degree: int) -> float:
-    """Drop what shows nowhere; the PSNR of what stays."""
-    settings = Settings((0.0, 0.0, 0.0), 0, degree, NEAR_PLANE, params.antialias, winners=True)
-    parameters.keep(_opaque_enough(parameters, params.prune_opacity))
-    strongest = np.zeros(len(parameters), np.float32)
-    error, count = 0.0, 0
-    for target in targets:
-        rendered = NativePass(parameters.for_rendering(degree), None, target.camera, settings)
-        np.maximum(strongest, rendered.strongest, out=strongest)
-        inside = target.inside > 0
-        error += float(np.square(np.clip(rendered.rgb[inside], 0, 1) - target.image[inside], dtype=np.float64).sum())
-        count += 3 * int(inside.sum())
-    if params.prune_contribution > 0:
-        parameters.keep(strongest >= params.prune_contribution)
-    return float(-10 * np.log10(max(error / max(count, 1), 1e-10))) if count else 0.0

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, UInt8
 from ss_flow.tasks.geometry.images import decode_rgb

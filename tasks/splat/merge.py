@@ -78,7 +78,7 @@ class Quality:
 
 @task(
     name="splat.merge_pair",
-    resources=Resources(cores=1, memory_mb=2000),
+    resources=Resources(cores=1, most_cores=8, memory_mb=2000),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=rasterizer,
 )
@@ -125,7 +125,7 @@ def merge_pair(
         iterations=params.iterations(len(views)),
         sh_degree=params.sh_degree,
         background=params.background,
-        densify=False,
+        densify="none",
         mask_weight=w_mask,
         prune_opacity=0.0,
         prune_contribution=0.0,
@@ -183,7 +183,7 @@ def assemble(groups: tuple[Gaussians, ...]) -> Gaussians:
 
 @task(
     name="splat.global_pass",
-    resources=Resources(cores=1, memory_mb=4000),
+    resources=Resources(cores=1, most_cores=8, memory_mb=4000),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=rasterizer,
 )
@@ -209,7 +209,7 @@ def global_pass(
         iterations=params.global_iterations,
         sh_degree=params.sh_degree,
         background=params.background,
-        densify=False,
+        densify="none",
         mask_weight=params.global_mask_weight,
         prune_opacity=params.prune_opacity,
         prune_contribution=params.prune_contribution,

@@ -13,7 +13,7 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame, Gaussians
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.geometry.clustering import nearest_spacing
-from ss_flow.tasks.ranges import Count, HarmonicsDegree, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, NonNegative, Positive
 from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
 from ss_flow.tasks.splat.resolve import REFINED
 from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask_of, training_view
@@ -45,8 +45,12 @@ class ReconstructParams:
     """Colour behind the Gaussians: "random" in each step, or "black" as in the paper."""
     ignore_occluded: bool = True
     """Whether pixels where something else is in front are left out; False calls them empty, as in the paper."""
-    densify: bool = True
-    """Whether Gaussians are split and cloned where the picture is still wrong."""
+    densify: Literal["classic", "mcmc", "none"] = "classic"
+    """How their number grows: "classic" clones and splits where the picture is still wrong (3DGS), "mcmc" moves faint
+    Gaussians to where opaque ones are and grows by 5 % at a time, "none" leaves it."""
+    plateau: Fraction = 0.0
+    """Training ends early when the loss falls by less than this share from one stretch of at least 100 steps to the
+    next, twice in a row; 0 = never."""
     depth_weight_start: NonNegative = 1.0
     """Weight of the depth loss at the first step."""
     depth_weight_final: NonNegative = 0.01
@@ -61,7 +65,7 @@ class ReconstructParams:
 
 @task(
     name="splat.reconstruct",
-    resources=Resources(cores=1, memory_mb=1500),
+    resources=Resources(cores=1, most_cores=8, memory_mb=1500),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=rasterizer,
 )
@@ -94,7 +98,7 @@ def reconstruct(
 
 @task(
     name="splat.retrain",
-    resources=Resources(cores=1, memory_mb=1500),
+    resources=Resources(cores=1, most_cores=8, memory_mb=1500),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=rasterizer,
 )
@@ -189,6 +193,7 @@ def _settings(params: ReconstructParams, iterations: int, fills_scene: bool) -> 
         sh_degree=params.sh_degree,
         background=params.background,
         densify=params.densify,
+        plateau=params.plateau,
         max_gaussians=round(limit),
         depth_weight_start=params.depth_weight_start,
         depth_weight_final=params.depth_weight_final,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, PointCloud
 from ss_flow.tasks.geometry.cameras import backproject, camera_of

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Float64, Int32, MaskSet, PointCloud, PointLabels, Visibility
 from ss_flow.tasks.geometry.clustering import main_clusters

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.events import progress
+from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import (
     InstanceMasks,

@@ -133,6 +133,48 @@ def test_a_task_that_aborts_fails_alone_and_says_how(store):
     assert "SIGABRT" in str(report.values["end"].error)
 
 
+def test_the_last_task_that_waits_gets_the_cores_that_nobody_wants(store):
+    def flow():
+        one, two, three = (toy.source(values=(v,))[0] for v in (1.0, 2.0, 3.0))
+        return {"alone": toy.given_cores(one)}, {"first": toy.given_cores(two), "last": toy.given_cores(three)}
+
+    alone = run(store, lambda: flow()[0], jobs=3)
+    assert value(store, alone.values["alone"]) == 3
+    both = run(store, lambda: flow()[1], jobs=3)
+    assert sorted(value(store, d) for d in both.values.values()) == [1, 2]
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_half_done_work_is_kept_until_the_task_is_done(store, tmp_path, executor):
+    falls_at = tmp_path / "falls_at"
+    falls_at.write_text("3")
+
+    def flow():
+        return {"start": toy.climb(toy.source(values=(1.0,))[0], top=5, falls_at=str(falls_at))}
+
+    failed = run(store, flow, executor=executor)
+    assert isinstance(failed.values["start"], Failure)
+    falls_at.unlink()
+    assert value(store, run(store, flow, executor=executor).values["start"]) == 3
+    assert not list((store.root / "checkpoints").iterdir())
+
+
+def test_a_damaged_checkpoint_is_as_good_as_none(store, tmp_path):
+    falls_at = tmp_path / "falls_at"
+    falls_at.write_text("3")
+
+    def flow():
+        return {"start": toy.climb(toy.source(values=(1.0,))[0], top=5, falls_at=str(falls_at))}
+
+    run(store, flow)
+    (kept,) = (store.root / "checkpoints").iterdir()
+    content = bytearray(kept.read_bytes())
+    content[60] ^= 1
+    kept.write_bytes(bytes(content))
+    falls_at.unlink()
+    assert value(store, run(store, flow).values["start"]) == 0
+
+
 def test_the_same_key_is_computed_once_for_all_its_nodes(store):
     def build():
         numbers = toy.source(values=(3.0, 3.0))

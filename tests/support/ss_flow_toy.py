@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from ss_flow.events import progress
 from ss_flow.graph import each, expand
-from ss_flow.task import task
+from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
+from ss_flow.task import Resources, task
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,26 @@ def half(x: Number) -> Number:
     if x.value[0] < 0:
         raise ValueError("negative")
     return number(float(x.value[0]) / 2)
+
+
+@task(resources=Resources(most_cores=4))
+def given_cores(x: Number) -> Number:
+    time.sleep(0.1)
+    return number(cores())
+
+
+@task()
+def climb(x: Number, *, top: int, falls_at: str) -> Number:
+    """Counts up in steps that it keeps; dies at the step that the file `falls_at` names, while there is one."""
+    kept = load_checkpoint()
+    height = 0 if kept is None else int(kept["height"])
+    start = height
+    while height < top:
+        height += 1
+        save_checkpoint({"height": np.int64(height)})
+        if Path(falls_at).exists() and int(Path(falls_at).read_text()) == height:
+            raise RuntimeError("fell")
+    return number(start)
 
 
 @task(isolate=True)

@@ -70,11 +70,12 @@ struct Block {
         pixels([&](int k, int64_t) { lane[k] = 1; });
         return lanes::load(lane);
     }
-    // What `mismatch` counts the weights of a label with: -1 where the pixel should show it, 1 elsewhere.
-    V16 sign_of(int32_t label, const int32_t* ids) const {
-        alignas(64) float lane[16] = {};
-        pixels([&](int k, int64_t p) { lane[k] = ids[p] == label ? -1.0f : 1.0f; });
-        return lanes::load(lane);
+    I16 gather_ids(const int32_t* ids) const {
+        alignas(64) int32_t lane[16] = {};
+        pixels([&](int k, int64_t p) { lane[k] = ids[p]; });
+        I16 v;
+        std::memcpy(&v, lane, sizeof v);
+        return v;
     }
 };
 
@@ -90,6 +91,9 @@ struct Touch {
         return t;
     }
 };
+
+// What `mismatch` counts the weights of a label with: -1 where the pixel should show it, 1 elsewhere.
+INLINE V16 sign_of(int32_t label, const I16& ids) { return lanes::where_equal(ids, label, splat(-1), splat(1)); }
 
 // A value for each of the labels that occur in the block at hand.
 class LabelSlots {
@@ -131,7 +135,7 @@ constexpr int kAskEvery = 16;
 template <Labels kLabels, bool kWinners>
 void forward(const Scene& s, const Frame& frame, Band& band, const Images& out) {
     const int64_t pixels = (int64_t)s.width * s.height;
-    LabelSlots signs(kLabels == Labels::mismatch ? s.num_labels : 0), masks(kLabels == Labels::masks ? s.num_labels : 0);
+    LabelSlots masks(kLabels == Labels::masks ? s.num_labels : 0);
     float* strongest = kWinners ? band.strongest.room(band.count) : nullptr;
     if (kWinners) std::fill(strongest, strongest + band.count, 0.0f);
     const int blocks = band.rows * frame.blocks_x;
@@ -142,6 +146,8 @@ void forward(const Scene& s, const Frame& frame, Band& band, const Images& out) 
         V16 T = block.whole ? splat(1) : block.inside();
         V16 red = splat(0), green = splat(0), blue = splat(0), depth = splat(0), alpha = splat(0), best = splat(0);
         V16 mismatch = splat(0);
+        I16 ids = lanes::splat_int(0);
+        if (kLabels == Labels::mismatch) ids = block.gather_ids(s.ids);
         I16 winner = lanes::splat_int(-1);
         const int32_t* entries = band.entries.data() + band.first[index];
         const int count = (int)(band.first[index + 1] - band.first[index]);
@@ -165,7 +171,7 @@ void forward(const Scene& s, const Frame& frame, Band& band, const Images& out) 
                     sum = sum + weight;
                 }
                 if (kLabels == Labels::mismatch && p.label >= 0)
-                    mismatch = mismatch + weight * signs.at(p.label, [&] { return block.sign_of(p.label, s.ids); });
+                    mismatch = mismatch + weight * sign_of(p.label, ids);
                 if (kWinners) {
                     winner = where_less(best, weight, lanes::splat_int(p.row), winner);
                     best = lanes::maximum(best, weight);
@@ -182,10 +188,7 @@ void forward(const Scene& s, const Frame& frame, Band& band, const Images& out) 
         block.scatter(alpha, out.alpha);
         block.scatter(depth, out.depth);
         masks.drain([&](int label, const V16& v) { block.scatter(v, out.masks + label * pixels); });
-        if (kLabels == Labels::mismatch) {
-            signs.drain([](int, const V16&) {});
-            block.scatter(mismatch, out.mismatch);
-        }
+        if (kLabels == Labels::mismatch) block.scatter(mismatch, out.mismatch);
         if (kWinners) {
             int32_t lane[16];
             std::memcpy(lane, &winner, sizeof lane);
@@ -265,7 +268,7 @@ template <Labels kLabels>
 void backward(const Scene& s, const Frame& frame, Band& band, const Images& image, const Images& grad,
               float (&background)[3]) {
     const int64_t pixels = (int64_t)s.width * s.height;
-    LabelSlots slots(kLabels == Labels::none ? 0 : s.num_labels);
+    LabelSlots masks(kLabels == Labels::masks ? s.num_labels : 0);
     Sums* sums = band.sums.room(band.count);
     std::memset(static_cast<void*>(sums), 0, band.count * sizeof(Sums));
     V16 towards_background[3] = {splat(0), splat(0), splat(0)};
@@ -275,6 +278,7 @@ void backward(const Scene& s, const Frame& frame, Band& band, const Images& imag
         const V16 column = lanes::load(kColumn) + (block.x + 0.5f), row = lanes::load(kRow) + (block.y + 0.5f);
         V16 T = block.whole ? splat(1) : block.inside();
         V16 g[3], rgb[3], contrast = splat(0);
+        I16 ids = lanes::splat_int(0);
         const V16 alpha = block.gather(image.alpha), g_alpha = block.gather(grad.alpha);
         const V16 g_depth = block.gather(grad.depth);
         block.gather3(grad.rgb, g), block.gather3(image.rgb, rgb);
@@ -288,6 +292,7 @@ void backward(const Scene& s, const Frame& frame, Band& band, const Images& imag
                 behind = behind + block.gather(grad.masks + label * pixels) * block.gather(image.masks + label * pixels);
         if (kLabels == Labels::mismatch) {
             contrast = block.gather(grad.mismatch);
+            ids = block.gather_ids(s.ids);
             behind = behind + contrast * block.gather(image.mismatch);
         }
         harvest.begin({g[0], g[1], g[2], g_depth}, column, row);
@@ -304,16 +309,16 @@ void backward(const Scene& s, const Frame& frame, Band& band, const Images& imag
             T = lanes::maximum(after, splat(kFloor));
             V16 value = g[0] * p.color[0] + g[1] * p.color[1] + g[2] * p.color[2] + (g_depth * p.z + g_alpha);
             if (kLabels == Labels::masks && p.label >= 0)
-                value = value + slots.at(p.label, [&] { return block.gather(grad.masks + p.label * pixels); });
+                value = value + masks.at(p.label, [&] { return block.gather(grad.masks + p.label * pixels); });
             if (kLabels == Labels::mismatch && p.label >= 0)
-                value = value + slots.at(p.label, [&] { return contrast * block.sign_of(p.label, s.ids); });
+                value = value + contrast * sign_of(p.label, ids);
             const V16 gain = weight * value;
             behind = behind - gain;
             const V16 d = where_less(splat(kMaxAlpha), t.raw, splat(0), gain - behind * (counted / through));
             Harvest::add(harvest, entries[e], p, d, weight, sums);
         }
         harvest.flush(sums);
-        slots.drain([](int, const V16&) {});
+        masks.drain([](int, const V16&) {});
     }
     for (int c = 0; c < 3; ++c) {
         alignas(64) float lane[16];

@@ -84,6 +84,16 @@ INLINE Pair<X> where_less(const Pair<H>& a, const Pair<H>& b, const Pair<X>& x, 
     return {where_less(a.lo, b.lo, x.lo, y.lo), where_less(a.hi, b.hi, x.hi, y.hi)};
 }
 
+// a == b ? x : y in each lane.
+template <class I, class X>
+INLINE X where_equal(const I& a, int32_t b, const X& x, const X& y) {
+    return a == b ? x : y;
+}
+template <class H, class X>
+INLINE Pair<X> where_equal(const Pair<H>& a, int32_t b, const Pair<X>& x, const Pair<X>& y) {
+    return {where_equal(a.lo, b, x.lo, y.lo), where_equal(a.hi, b, x.hi, y.hi)};
+}
+
 template <class V>
 struct Broadcast {
     INLINE V of(float x) { return V{} + x; }

@@ -1,14 +1,15 @@
-// L1 + SSIM of two images with its gradient, weighted L1, and Adam: loops over whole arrays, in a fixed order.
+// L1 + SSIM of two images with its gradient, the losses of alpha, depth and labels, and Adam. Rows are worked on in
+// pieces of a fixed size, whose sums are added in their order: the number of threads changes no byte.
 
 #include <cmath>
-#include <cstdint>
-#include <exception>
-#include <vector>
+
+#include "workspace.h"
 
 namespace {
 
 constexpr int kRadius = 5;  // an 11 x 11 window, sigma 1.5 (Wang et al. 2004)
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
+constexpr int kPiece = 16;  // rows
 
 struct Window {
     float tap[kRadius + 1];
@@ -19,11 +20,11 @@ struct Window {
     }
 };
 
-// Row-major planes of width * channels floats a row, zero beyond the border.
-struct Plane {
-    int width, height, channels;  // interleaved
-    int row() const { return width * channels; }
-    size_t size() const { return (size_t)row() * height; }
+// A line with room for the window beyond both ends, where it is zero.
+struct Line {
+    explicit Line(int n, int pad) : values(n + 2 * pad, 0.0f), middle(values.data() + pad) {}
+    std::vector<float> values;
+    float* middle;
 };
 
 // to[i] = t0 * at[i] + t1 * (at[i - step] + at[i + step]) + ..., for n elements. The taps are values, so that no store
@@ -36,124 +37,195 @@ void convolve(int n, int step, const Window& w, const float* __restrict at, floa
                 t5 * (at[i - 5 * step] + at[i + 5 * step]);
 }
 
-// Separable Gaussian blur with zeros beyond the border; symmetric, so it is its own transpose.
-void blur(const Plane& plane, const Window& w, const float* in, float* out, std::vector<float>& line) {
-    const int n = plane.row(), step = plane.channels, pad = kRadius * step;
-    line.assign(n + 2 * pad, 0.0f);
-    float* middle = line.data() + pad;
-    for (int y = 0; y < plane.height; ++y) {
-        const float* at = in + (size_t)y * n;
-        if (y >= kRadius && y + kRadius < plane.height) {
-            convolve(n, n, w, at, middle);
-        } else {
-            for (int i = 0; i < n; ++i) middle[i] = w.tap[0] * at[i];
-            for (int k = 1; k <= kRadius; ++k) {
-                const float tap = w.tap[k];
-                if (y >= k)
-                    for (int i = 0; i < n; ++i) middle[i] += tap * at[i - k * n];
-                if (y + k < plane.height)
-                    for (int i = 0; i < n; ++i) middle[i] += tap * at[i + k * n];
-            }
-        }
-        convolve(n, step, w, middle, out + (size_t)y * n);
+// The window's rows above and below row y that lie in the image.
+template <class F>
+void each_tap(int y, int height, const Window& w, F visit) {
+    for (int k = std::max(-kRadius, -y); k <= std::min(kRadius, height - 1 - y); ++k) visit(y + k, w.tap[std::abs(k)]);
+}
+
+// Down the columns around one row: the moments x, y, xx, yy, xy.
+void add_moments(int n, float tap, const float* __restrict x, const float* __restrict y, float* __restrict mx,
+                 float* __restrict my, float* __restrict mxx, float* __restrict myy, float* __restrict mxy) {
+    for (int i = 0; i < n; ++i) {
+        const float a = tap * x[i], b = tap * y[i];
+        mx[i] += a, my[i] += b, mxx[i] += a * x[i], myy[i] += b * y[i], mxy[i] += a * y[i];
     }
 }
 
-// Per pixel s = (a1 a2) / (b1 b2) from the blurred x, y, xx, yy, xy. mx, mxx, mxy become the gradients towards
-// themselves, `shares` the pixels' shares of the mean.
-void compare(size_t n, float ssim_weight, const float* __restrict share, const float* __restrict my,
-             const float* __restrict myy, float* __restrict mx, float* __restrict mxx, float* __restrict mxy,
-             float* __restrict shares) {
-    for (size_t i = 0; i < n; ++i) {
+// Per pixel s = (a1 a2) / (b1 b2) from the blurred x, y, xx, yy, xy. mx, mxx, mxy become the gradients of
+// -sum(share * s) towards themselves, my the pixels' shares * s.
+void compare(int n, const float* __restrict share, const float* __restrict mx, float* __restrict my,
+             const float* __restrict mxx, const float* __restrict myy, const float* __restrict mxy,
+             float* __restrict towards_mean, float* __restrict towards_square, float* __restrict towards_product) {
+    for (int i = 0; i < n; ++i) {
         const float u = mx[i], v = my[i];
         const float b1 = u * u + v * v + kC1, b2 = (mxx[i] - u * u) + (myy[i] - v * v) + kC2;
         const float a1 = 2 * u * v + kC1, a2 = 2 * (mxy[i] - u * v) + kC2;
-        const float inverse = 1 / (b1 * b2), s = a1 * a2 * inverse, g = -ssim_weight * share[i];
-        shares[i] = share[i] * s;
-        mx[i] = g * (2 * v * (a2 - a1) * inverse - 2 * u * s * inverse * (b2 - b1));
-        mxx[i] = -g * s * b1 * inverse;
-        mxy[i] = g * 2 * a1 * inverse;
+        const float inverse = 1 / (b1 * b2), s = a1 * a2 * inverse, g = -share[i];
+        my[i] = share[i] * s;
+        towards_mean[i] = g * (2 * v * (a2 - a1) * inverse - 2 * u * s * inverse * (b2 - b1));
+        towards_square[i] = -g * s * b1 * inverse;
+        towards_product[i] = g * 2 * a1 * inverse;
     }
 }
+
+struct Sum {  // of many floats: sixteen running sums, added at the end
+    float lane[16] = {};
+    double total = 0;
+    void add(const float* values, int n) {
+        int i = 0;
+        for (; i + 16 <= n; i += 16)
+            for (int k = 0; k < 16; ++k) lane[k] += values[i + k];
+        for (; i < n; ++i) lane[i % 16] += values[i];
+        for (float& v : lane) total += v, v = 0;
+    }
+};
 
 }  // namespace
 
 extern "C" {
 
-// (1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM), means over the pixels of weight > 0 and their channels. Both
-// images are taken as zero where the weight is 0. image, target, gradient: [H, W, C]; weight: [H, W]. out: loss, L1,
-// SSIM. 0 = done, 1 = out of memory.
-int ss_photometric(int32_t width, int32_t height, int32_t channels, const float* image, const float* target,
-                   const float* weight, float ssim_weight, float* gradient, double* out) {
-    try {
-        const Plane plane = {width, height, channels};
-        const size_t n = plane.size();
-        double area = 0, l1 = 0, ssim = 0;
-        for (size_t p = 0; p < n / channels; ++p) area += weight[p];
-        out[0] = out[1] = 0, out[2] = 1;
-        if (!(area > 0)) {
-            for (size_t i = 0; i < n; ++i) gradient[i] = 0;
-            return 0;
+// Colour loss over the pixels of weight > 0; images are [height, width, channels], weight is [height, width]. Writes
+// its gradient towards the image, and {loss, L1, SSIM} to `out`. 0 = done, 1 = out of memory.
+int ss_photometric(void* workspace, int width, int height, int channels, const float* image, const float* target,
+                   const float* weight, float ssim_weight, float* gradient, double* out, int threads) {
+    return guarded([&] {
+        auto& loss = static_cast<Workspace*>(workspace)->loss;
+        const int n = width * channels, pieces = (height + kPiece - 1) / kPiece;
+        const int64_t size = (int64_t)n * height;
+        float *share = loss.share.room(size), *x = loss.x.room(size), *y = loss.y.room(size);
+        float *mean = loss.towards_mean.room(size), *square = loss.towards_square.room(size);
+        float* product = loss.towards_product.room(size);
+        double* sums = loss.sums.room(2 * pieces);
+        double total = 0;
+        for (int64_t p = 0; p < (int64_t)width * height; ++p) total += weight[p];
+        if (!(total > 0)) {
+            std::fill(gradient, gradient + size, 0.0f);
+            out[0] = out[1] = 0, out[2] = 1;
+            return;
         }
-        const float norm = (float)(1 / (area * channels));
-        std::vector<float> x(n), y(n), share(n), line;
-        for (size_t p = 0, i = 0; p < n / channels; ++p)
-            for (int c = 0; c < channels; ++c, ++i) {
-                const bool counts = weight[p] > 0;
-                x[i] = counts ? image[i] : 0, y[i] = counts ? target[i] : 0, share[i] = weight[p] * norm;
-                const float d = x[i] - y[i];
-                l1 += share[i] * std::fabs(d);
-                gradient[i] = (1 - ssim_weight) * share[i] * (float)((d > 0) - (d < 0));
-            }
-        out[1] = l1, out[0] = (1 - ssim_weight) * l1;
+        const float norm = (float)(1 / (total * channels));
+        const auto rows = [&](int64_t piece, auto visit) {
+            for (int r = (int)piece * kPiece; r < std::min(height, ((int)piece + 1) * kPiece); ++r) visit(r, (int64_t)r * n);
+        };
+
+        parallel::each(threads, pieces, [&](int64_t piece) {
+            std::vector<float> terms(n);
+            Sum l1;
+            rows(piece, [&](int r, int64_t at) {
+                for (int p = 0; p < width; ++p)
+                    for (int c = 0; c < channels; ++c) share[at + p * channels + c] = weight[(int64_t)r * width + p] * norm;
+                for (int64_t i = at; i < at + n; ++i) {
+                    x[i] = share[i] > 0 ? image[i] : 0, y[i] = share[i] > 0 ? target[i] : 0;
+                    const float d = x[i] - y[i];
+                    terms[i - at] = share[i] * std::fabs(d);
+                    gradient[i] = (1 - ssim_weight) * share[i] * (float)((d > 0) - (d < 0));
+                }
+                l1.add(terms.data(), n);
+            });
+            sums[2 * piece] = l1.total, sums[2 * piece + 1] = 0;
+        });
+
         if (ssim_weight > 0) {
             const Window w;
-            std::vector<float> product(n), mx(n), my(n), mxx(n), myy(n), mxy(n);
-            blur(plane, w, x.data(), mx.data(), line);
-            blur(plane, w, y.data(), my.data(), line);
-            for (size_t i = 0; i < n; ++i) product[i] = x[i] * x[i];
-            blur(plane, w, product.data(), mxx.data(), line);
-            for (size_t i = 0; i < n; ++i) product[i] = y[i] * y[i];
-            blur(plane, w, product.data(), myy.data(), line);
-            for (size_t i = 0; i < n; ++i) product[i] = x[i] * y[i];
-            blur(plane, w, product.data(), mxy.data(), line);
-            compare(n, ssim_weight, share.data(), my.data(), myy.data(), mx.data(), mxx.data(), mxy.data(), product.data());
-            for (size_t i = 0; i < n; ++i) ssim += product[i];
-            blur(plane, w, mx.data(), my.data(), line);
-            blur(plane, w, mxx.data(), myy.data(), line);
-            blur(plane, w, mxy.data(), product.data(), line);
-            for (size_t p = 0, i = 0; p < n / channels; ++p)
-                for (int c = 0; c < channels; ++c, ++i)
-                    if (weight[p] > 0) gradient[i] += my[i] + 2 * x[i] * myy[i] + y[i] * product[i];
-            out[2] = ssim, out[0] += ssim_weight * (1 - ssim);
+            parallel::each(threads, pieces, [&](int64_t piece) {
+                Line down(n, kRadius * channels);
+                std::vector<float> moments(5 * (size_t)n), blurred(5 * (size_t)n);
+                Sum ssim;
+                rows(piece, [&](int r, int64_t at) {
+                    float* m[5];
+                    for (int k = 0; k < 5; ++k) m[k] = moments.data() + (size_t)k * n;
+                    std::fill(moments.begin(), moments.end(), 0.0f);
+                    each_tap(r, height, w, [&](int row, float tap) {
+                        add_moments(n, tap, x + (int64_t)row * n, y + (int64_t)row * n, m[0], m[1], m[2], m[3], m[4]);
+                    });
+                    for (int k = 0; k < 5; ++k) {
+                        std::copy(m[k], m[k] + n, down.middle);
+                        convolve(n, channels, w, down.middle, blurred.data() + (size_t)k * n);
+                    }
+                    for (int k = 0; k < 5; ++k) m[k] = blurred.data() + (size_t)k * n;
+                    compare(n, share + at, m[0], m[1], m[2], m[3], m[4], mean + at, square + at, product + at);
+                    ssim.add(m[1], n);
+                });
+                sums[2 * piece + 1] = ssim.total;
+            });
+            // The blur is symmetric, so it carries the gradient back as well.
+            parallel::each(threads, pieces, [&](int64_t piece) {
+                Line down(n, kRadius * channels);
+                std::vector<float> blurred[3] = {std::vector<float>(n), std::vector<float>(n), std::vector<float>(n)};
+                const float* planes[3] = {mean, square, product};
+                rows(piece, [&](int r, int64_t at) {
+                    for (int k = 0; k < 3; ++k) {
+                        std::fill(down.middle, down.middle + n, 0.0f);
+                        each_tap(r, height, w, [&](int row, float tap) {
+                            const float* from = planes[k] + (int64_t)row * n;
+                            for (int i = 0; i < n; ++i) down.middle[i] += tap * from[i];
+                        });
+                        convolve(n, channels, w, down.middle, blurred[k].data());
+                    }
+                    const float *m = blurred[0].data(), *s = blurred[1].data(), *p = blurred[2].data();
+                    for (int i = 0; i < n; ++i) {
+                        const float towards = m[i] + 2 * x[at + i] * s[i] + y[at + i] * p[i];
+                        gradient[at + i] += share[at + i] > 0 ? ssim_weight * towards : 0;
+                    }
+                });
+            });
         }
-        return 0;
-    } catch (const std::exception&) {
-        return 1;
-    }
+        out[1] = out[2] = 0;
+        for (int k = 0; k < pieces; ++k) out[1] += sums[2 * k], out[2] += sums[2 * k + 1];
+        if (!(ssim_weight > 0)) out[2] = 1;
+        out[0] = (1 - ssim_weight) * out[1] + ssim_weight * (1 - out[2]);
+    });
 }
 
-// Sum of weight * |value - target|; writes its gradient.
-double ss_weighted_l1(int64_t n, const float* value, const float* target, const float* weight, float* gradient) {
-    double sum = 0;
-    for (int64_t i = 0; i < n; ++i) {
-        const float d = value[i] - target[i];
-        sum += weight[i] * std::fabs(d);
-        gradient[i] = weight[i] * (float)((d > 0) - (d < 0));
+// The losses of alpha, depth and labels over n pixels, and their gradients. out: {sum(judged |alpha - inside|),
+// sum(known |depth / target_depth - alpha|), sum(labelled (mismatch + 1 where the pixel has a label))}; the gradients of
+// the first two, times their weights, are written. mismatch, labelled and ids are null without labels.
+void ss_surface_loss(int64_t n, const float* alpha, const float* depth, const float* mismatch, const float* inside,
+                     const float* judged, const float* target_depth, const float* known, const float* labelled,
+                     const int32_t* ids, float alpha_weight, float depth_weight, float* towards_alpha,
+                     float* towards_depth, double* out) {
+    constexpr int kSome = 1024;
+    float terms[3][kSome] = {};
+    Sum sums[3];
+    for (int64_t begin = 0; begin < n; begin += kSome) {
+        const int count = (int)std::min<int64_t>(kSome, n - begin);
+        for (int k = 0; k < count; ++k) {
+            const int64_t i = begin + k;
+            const float a = alpha[i] - inside[i], r = depth[i] / target_depth[i] - alpha[i];
+            const float slope = depth_weight * known[i] * (float)((r > 0) - (r < 0));
+            terms[0][k] = judged[i] * std::fabs(a), terms[1][k] = known[i] * std::fabs(r);
+            towards_alpha[i] = alpha_weight * judged[i] * (float)((a > 0) - (a < 0)) - slope;
+            towards_depth[i] = slope / target_depth[i];
+        }
+        if (labelled)
+            for (int k = 0; k < count; ++k) {
+                const int64_t i = begin + k;
+                terms[2][k] = labelled[i] * (mismatch[i] + (ids[i] >= 0 ? 1.0f : 0.0f));
+            }
+        for (int t = 0; t < 3; ++t) sums[t].add(terms[t], count);
     }
-    return sum;
+    for (int t = 0; t < 3; ++t) out[t] = sums[t].total;
 }
 
-// One step of Adam (Kingma & Ba 2015, betas 0.9 and 0.999), in place.
-void ss_adam(int64_t n, float* value, const float* gradient, float* first, float* second, double rate, int64_t step,
-             double epsilon) {
+// One step of Adam (Kingma & Ba 2015, betas 0.9 and 0.999), in place, on the first `active` of each row's `width`
+// values; the first `head` of them have a rate of their own.
+void ss_adam(int64_t rows, int64_t width, int64_t active, int64_t head, float* value, const float* gradient,
+             float* first, float* second, double head_rate, double rate, int64_t step, double epsilon) {
     const float correct = (float)(1 / std::sqrt(1 - std::pow(0.999, (double)step)));
-    const float scale = (float)(rate / (1 - std::pow(0.9, (double)step))), small = (float)epsilon;
-    for (int64_t i = 0; i < n; ++i) {
-        const float g = gradient[i];
-        first[i] = 0.9f * first[i] + 0.1f * g;
-        second[i] = 0.999f * second[i] + 0.001f * g * g;
-        value[i] -= scale * first[i] / (std::sqrt(second[i]) * correct + small);
+    const double debias = 1 / (1 - std::pow(0.9, (double)step));
+    const float small = (float)epsilon;
+    const auto update = [&](int64_t begin, int64_t end, float scale) {
+        for (int64_t i = begin; i < end; ++i) {
+            const float g = gradient[i];
+            first[i] = 0.9f * first[i] + 0.1f * g;
+            second[i] = 0.999f * second[i] + 0.001f * g * g;
+            value[i] -= scale * first[i] / (std::sqrt(second[i]) * correct + small);
+        }
+    };
+    for (int64_t r = 0; r < rows; ++r) {
+        update(r * width, r * width + head, (float)(head_rate * debias));
+        update(r * width + head, r * width + active, (float)(rate * debias));
     }
 }
 }

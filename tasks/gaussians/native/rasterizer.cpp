@@ -2,6 +2,7 @@
 // number of calls may run side by side, each with a workspace of its own. The number of threads changes no byte.
 
 #include "blending.h"
+#include "workspace.h"
 
 namespace {
 
@@ -50,16 +51,6 @@ void reduce(const Scene& s, const projection::View& view, const Frame& frame, in
                             out);
 }
 
-template <class F>
-int guarded(F work) {
-    try {
-        work();
-        return 0;
-    } catch (const std::exception&) {
-        return 1;
-    }
-}
-
 }  // namespace
 
 extern "C" {
@@ -67,17 +58,17 @@ extern "C" {
 // Memory for a rendering and its gradient, reused by the next; null when there is none.
 void* ss_workspace() {
     try {
-        return new Frame;
+        return new Workspace;
     } catch (const std::exception&) {
         return nullptr;
     }
 }
 
-void ss_workspace_free(void* workspace) { delete static_cast<Frame*>(workspace); }
+void ss_workspace_free(void* workspace) { delete static_cast<Workspace*>(workspace); }
 
 // How many (splat, block) pairs the last rendering blended: what its time grows with.
 int64_t ss_entries(const void* workspace) {
-    const Frame& frame = *static_cast<const Frame*>(workspace);
+    const Frame& frame = static_cast<const Workspace*>(workspace)->frame;
     int64_t sum = 0;
     for (int b = 0; b < frame.num_bands; ++b)
         for (int64_t k = 0; k < (int64_t)frame.bands[b].rows * frame.blocks_x; ++k) sum += frame.bands[b].used[k];
@@ -88,7 +79,7 @@ int64_t ss_entries(const void* workspace) {
 int ss_rasterize(void* workspace, const Scene* scene, const Images* images, int threads) {
     return guarded([&] {
         const Scene& s = *scene;
-        Frame& frame = *static_cast<Frame*>(workspace);
+        Frame& frame = static_cast<Workspace*>(workspace)->frame;
         binning::prepare(s, frame);
         const projection::View view = projection::view_of(s);
         parallel::each(threads, frame.chunks,
@@ -113,7 +104,7 @@ int ss_rasterize_backward(void* workspace, const Scene* scene, const Images* ima
                           const Gradients* out, int threads) {
     return guarded([&] {
         const Scene& s = *scene;
-        Frame& frame = *static_cast<Frame*>(workspace);
+        Frame& frame = static_cast<Workspace*>(workspace)->frame;
         const auto backward = towards->masks      ? blending::backward<Labels::masks>
                               : towards->mismatch ? blending::backward<Labels::mismatch>
                                                   : blending::backward<Labels::none>;

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from ss_flow.tasks.gaussians.library import address, library
-from ss_flow.tasks.gaussians.losses import photometric, weighted_l1
+from ss_flow.tasks.gaussians.library import Workspace, address, library
+from ss_flow.tasks.gaussians.losses import photometric, surface
 
 
 def reference(image, target, weight, ssim_weight):
@@ -65,20 +65,61 @@ def test_equal_images_have_no_loss_and_nothing_to_judge_has_none_either():
     assert nothing.loss == 0 and not nothing.gradient.any()
 
 
-def test_weighted_l1_of_a_hand_computed_example():
-    loss, gradient = weighted_l1(*(np.array(a, np.float32) for a in ([1, 2, 3], [2, 2, 1], [0.5, 1, 2])))
-    assert loss == 4.5 and gradient.tolist() == [-0.5, 0, 2]
+def test_the_surface_loss_agrees_with_autograd():
+    rng = np.random.default_rng(4)
+    shape = (37, 41)
+    alpha, depth, mismatch, inside, judged, known = rng.random((6, *shape)).astype(np.float32)
+    target_depth = (0.5 + rng.random(shape)).astype(np.float32)
+    ids = rng.integers(-2, 3, shape).astype(np.int32)
+    labelled = rng.random(shape).astype(np.float32)
+    got = surface(
+        alpha, depth, mismatch, inside=inside, judged=judged, target_depth=target_depth, known=known,
+        labelled=labelled, ids=ids, alpha_weight=0.5, depth_weight=2.0,
+    )  # fmt: skip
+    a, d = (torch.tensor(x, requires_grad=True) for x in (alpha, depth))
+    alpha_loss = (torch.tensor(judged) * (a - torch.tensor(inside)).abs()).sum()
+    depth_loss = (torch.tensor(known) * (d / torch.tensor(target_depth) - a).abs()).sum()
+    (0.5 * alpha_loss + 2 * depth_loss).backward()
+    assert got.alpha == pytest.approx(alpha_loss.item(), rel=1e-5)
+    assert got.depth == pytest.approx(depth_loss.item(), rel=1e-5)
+    assert got.labels == pytest.approx(float((labelled * (mismatch + (ids >= 0))).sum()), rel=1e-5)
+    assert np.allclose(got.towards_alpha, a.grad.numpy(), atol=1e-6)
+    assert np.allclose(got.towards_depth, d.grad.numpy(), atol=1e-6)
+
+
+def test_images_of_two_sizes_are_refused():
+    a, b = np.zeros((3, 4), np.float32), np.zeros((4, 3), np.float32)
+    with pytest.raises(ValueError, match=r"must all be \[3, 4\]"):
+        surface(
+            a, b, None, inside=a, judged=a, target_depth=a, known=a, labelled=None, ids=None, alpha_weight=1.0,
+            depth_weight=1.0,
+        )  # fmt: skip
+
+
+def test_threads_and_a_workspace_change_no_byte_of_the_colour_loss():
+    rng = np.random.default_rng(9)
+    workspace = Workspace()
+    for height, width in ((70, 45), (20, 64), (70, 45)):
+        image, target = rng.random((2, height, width, 3)).astype(np.float32)
+        weight = (rng.random((height, width)) < 0.7).astype(np.float32)
+        alone = photometric(image, target, weight)
+        for threads in (1, 2, 5):
+            got = photometric(image, target, weight, workspace=workspace, threads=threads)
+            assert got.loss == alone.loss and got.gradient.tobytes() == alone.gradient.tobytes()
 
 
 def test_adam_agrees_with_torch():
     rng = np.random.default_rng(3)
-    value = rng.normal(size=100).astype(np.float32)
+    value = rng.normal(size=(10, 6)).astype(np.float32)
     ours, first, second = value.copy(), np.zeros_like(value), np.zeros_like(value)
-    theirs = torch.tensor(value, requires_grad=True)
-    optimizer = torch.optim.Adam([theirs], lr=0.01, eps=1e-15)
+    parts = [torch.tensor(part.copy(), requires_grad=True) for part in (value[:, :2], value[:, 2:5])]
+    optimizer = torch.optim.Adam([{"params": parts[0], "lr": 0.01}, {"params": parts[1], "lr": 0.1}], eps=1e-15)
     for step in range(1, 21):
-        gradient = rng.normal(size=100).astype(np.float32)
-        theirs.grad = torch.tensor(gradient)
+        gradient = rng.normal(size=(10, 6)).astype(np.float32)
+        parts[0].grad, parts[1].grad = torch.tensor(gradient[:, :2]), torch.tensor(gradient[:, 2:5])
         optimizer.step()
-        library().ss_adam(100, address(ours), address(gradient), address(first), address(second), 0.01, step, 1e-15)
-    assert np.allclose(ours, theirs.detach().numpy(), atol=1e-5)
+        library().ss_adam(
+            10, 6, 5, 2, address(ours), address(gradient), address(first), address(second), 0.01, 0.1, step, 1e-15
+        )
+    expected = np.concatenate([*(part.detach().numpy() for part in parts), value[:, 5:]], axis=1)
+    assert np.allclose(ours, expected, atol=1e-5)

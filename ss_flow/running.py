@@ -1,0 +1,98 @@
+"""What a task may ask of whoever runs it: how many cores it has, to be heard, and to keep what is half done.
+
+None of it changes a result, so none of it counts in a key. Outside a flow a task has one core, nobody listens, and
+nothing is kept.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Listener = Callable[[int, int, str], None]
+
+
+def _nobody(done: int, total: int, note: str) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the runner of a task gives it."""
+
+    listener: Listener = _nobody
+    cores: int = 1
+    checkpoint: Path | None = None
+    """Where the task's half-done work lies, if there is any."""
+
+
+_ALONE = Surroundings()
+_surroundings: ContextVar[Surroundings] = ContextVar("surroundings", default=_ALONE)
+
+
+@contextmanager
+def running(surroundings: Surroundings) -> Iterator[None]:
+    """Within this, the functions below speak of `surroundings`."""
+    token = _surroundings.set(surroundings)
+    try:
+        yield
+    finally:
+        _surroundings.reset(token)
+
+
+def progress(done: int, total: int, note: str = "") -> None:
+    """Say how far a long task is; free of cost where nobody listens. A cancelled task ends here."""
+    _surroundings.get().listener(done, total, note)
+
+
+def cores() -> int:
+    """How many threads the task may use."""
+    return _surroundings.get().cores
+
+
+def save_checkpoint(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Keep half-done work for the next try at the same key; it takes the place of what was kept before.
+
+    A crash leaves the old checkpoint or the new one. The runner removes it when the task is done.
+    """
+    path = _surroundings.get().checkpoint
+    if path is None:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with unfinished(path).open("wb") as stream:
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
+        stream.flush()
+        os.fsync(stream.fileno())
+    unfinished(path).replace(path)
+
+
+def unfinished(path: Path) -> Path:
+    """Where a checkpoint is written before it takes its name."""
+    return path.with_suffix(".partial")
+
+
+def remove_checkpoint(path: Path) -> None:
+    """Take away what a task kept, when it is done."""
+    path.unlink(missing_ok=True)
+    unfinished(path).unlink(missing_ok=True)
+
+
+def load_checkpoint() -> dict[str, NDArray[Any]] | None:
+    """What an earlier try at the same key kept, if that is whole."""
+    path = _surroundings.get().checkpoint
+    if path is None:
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
