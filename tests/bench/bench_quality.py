@@ -1,0 +1,112 @@
+"""PSNR and SSIM of plain 3DGS on held-out views (every eighth) after so many iterations.
+
+python tests/bench/bench_quality.py CAPTURE --iterations 1000 5000 10000 --densify classic mcmc
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+from ss_flow.flows.capture import capture
+from ss_flow.flows.params import CaptureParams
+from ss_flow.running import Surroundings, running
+from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.evaluate.novel_view import psnr, ssim, to_8bit
+from ss_flow.tasks.gaussians.initialise import initialise
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.trainer import TrainParams, TrainView, train
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.models.catalogue import blake3_of
+from ss_flow.tasks.splat.groups import box_diagonal
+from ss_flow.tasks.splat.reconstruct import thin
+from ss_flow.tasks.split.dense import DenseParams, dense
+
+
+def load(path: Path, store: Store) -> tuple[list[Frame], Cameras, list[DepthMap], PointCloud]:
+    """A capture as the DAG reads it."""
+
+    def build() -> dict[str, object]:
+        nodes = capture(open_scene(path), lambda p: FileRef(p, blake3_of(p)), CaptureParams(), None)
+        points = dense(nodes.frames, nodes.cameras, nodes.depths, params=DenseParams())
+        return {"frames": nodes.frames, "cameras": nodes.cameras, "depths": nodes.depths, "points": points}
+
+    values = run_flow(build, store, scene=str(path), header={}).values
+    many = {name: [store.get(d) for d in values[name]] for name in ("frames", "depths")}
+    return many["frames"], store.get(values["cameras"]), many["depths"], store.get(values["points"])
+
+
+def view_of(frame: Frame, cameras: Cameras, depth: DepthMap, index: int, side: int) -> TrainView:
+    """A whole photo to train on, its longer side at most `side`."""
+    import cv2
+
+    shrink = min(1.0, side / max(frame.width, frame.height))
+    size = (round(frame.width * shrink), round(frame.height * shrink))
+    camera = camera_of(cameras, index).scaled(*size)
+    image = cv2.resize(decode_rgb(frame), size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    inside = cv2.resize(decode_valid(frame).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    z = cv2.resize(depth.depth, size, interpolation=cv2.INTER_NEAREST)
+    return TrainView(camera, image, inside, np.zeros_like(inside), z)
+
+
+def measured(scene: Gaussians, views: list[TrainView]) -> tuple[float, float]:
+    """Mean PSNR and SSIM over views."""
+    values = []
+    for view in views:
+        image, photo = to_8bit(render(scene, view.camera).rgb), to_8bit(view.image)
+        values.append((psnr(image, photo, view.inside), ssim(image, photo, view.inside)))
+    mean = np.mean(values, axis=0)
+    return float(mean[0]), float(mean[1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--iterations", type=int, nargs="+", default=[1000, 5000, 10_000])
+    parser.add_argument("--densify", nargs="+", default=["classic"])
+    parser.add_argument("--side", type=int, default=640)
+    parser.add_argument("--points", type=int, default=50_000)
+    parser.add_argument("--most", type=int, default=150_000)
+    parser.add_argument("--sh-degree", type=int, default=3)
+    parser.add_argument("--plateau", type=float, default=0.0)
+    parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--store", type=Path, default=Path(tempfile.gettempdir()) / "ss-flow-bench")
+    args = parser.parse_args()
+    frames, cameras, depths, cloud = load(args.capture, Store(args.store))
+    views = [view_of(f, cameras, d, i, args.side) for i, (f, d) in enumerate(zip(frames, depths, strict=True))]
+    held_out = [v for i, v in enumerate(views) if i % 8 == 0]
+    training = [v for i, v in enumerate(views) if i % 8]
+    rows = thin(cloud.points, args.points)
+    initial = initialise(cloud.points[rows], cloud.colors[rows], 0, 1.0)
+    print(f"{args.capture.name}: {len(training)} views to train, {len(held_out)} held out, {len(rows)} points")
+    for strategy in args.densify:
+        for iterations in args.iterations:
+            params = TrainParams(
+                iterations=iterations, sh_degree=args.sh_degree, densify=strategy, max_gaussians=args.most
+            )
+            params = replace(params, plateau=args.plateau)
+            start = time.perf_counter()
+            with running(Surroundings(cores=args.cores)):
+                result = train(initial, training, params=params, extent=box_diagonal(cloud.points), seed=0)
+            seconds = time.perf_counter() - start
+            quality = measured(result.gaussians, held_out)
+            print(
+                f"{strategy} {result.iterations:6} iterations: PSNR {quality[0]:.2f} dB, SSIM {quality[1]:.3f}, "
+                f"training views {measured(result.gaussians, training)[0]:.2f} dB, {len(result.gaussians)} Gaussians, "
+                f"{seconds:.0f} s",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
