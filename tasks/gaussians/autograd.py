@@ -23,16 +23,16 @@ def rasterize_cpu(
     near_plane: float,
     antialias: bool,
     winners: bool,
+    center_gradient: Tensor,
 ) -> Rendered:
-    """`rasterize` on the CPU, its arguments checked."""
+    """`rasterize` of one view on the CPU, its arguments checked. center_gradient: [N, 2] zeros, to be filled."""
     red, green, blue = background.detach().tolist()
     settings = Settings((red, green, blue), num_labels, sh_degree, near_plane, antialias, winners)
     channels = None if labels is None else np.ascontiguousarray(labels.numpy())
-    centers = torch.zeros(len(gaussians), 2)
     rgb, alpha, depth, masks, top, radii, strongest = _Rasterize.apply(
-        *gaussians.tensors(), background, channels, camera, settings, centers
+        *gaussians.tensors(), background, channels, camera, settings, center_gradient
     )
-    return Rendered(rgb, alpha, depth, masks, top, radii, strongest, centers)
+    return Rendered(rgb, alpha, depth, masks, top, radii, strongest, center_gradient)
 
 
 class _Rasterize(torch.autograd.Function):

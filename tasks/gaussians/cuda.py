@@ -21,8 +21,9 @@ def rasterize_cuda(
     near_plane: float,
     antialias: bool,
     winners: bool,
+    center_gradient: Tensor,
 ) -> Rendered:
-    """`rasterize` on CUDA, its arguments checked.
+    """`rasterize` of one view on CUDA, its arguments checked. center_gradient: [N, 2] zeros, to be filled.
 
     gsplat ends a pixel and cuts small contributions by its own thresholds, so results agree with the CPU's to about a
     grey level. It gives no winners: with `winners` this raises NotImplementedError.
@@ -47,6 +48,9 @@ def rasterize_cuda(
         one_hot[rows, labels[rows].long()] = 1
         channels.append(one_hot)
     images, alphas, info = _render(rasterization, gaussians, channels, pose, intrinsics, camera, near_plane, antialias)
+    means2d = info["means2d"]
+    if means2d.requires_grad:
+        means2d.register_hook(lambda towards: center_gradient.add_(towards.reshape(center_gradient.shape)))
     image, alpha = images[0], alphas[0, :, :, 0]
     radii = info["radii"][0].float()
     size = (camera.height, camera.width)
@@ -58,7 +62,7 @@ def rasterize_cuda(
         top_contributor=torch.full(size, -1, dtype=torch.int32, device=device),
         radii=radii.amax(dim=-1) if radii.dim() == 2 else radii,
         max_contribution=torch.zeros(len(gaussians), device=device),
-        center_gradient=_center_gradient(info["means2d"]),
+        center_gradient=center_gradient,
     )
 
 
@@ -88,15 +92,3 @@ def _render(
         packed=False,
     )
     return images, alphas, info
-
-
-def _center_gradient(means2d: Tensor) -> Tensor:
-    """[N, 2], filled when a backward pass reaches the projected means ([1, N, 2])."""
-    out = torch.zeros(means2d.shape[-2:], device=means2d.device)
-    if means2d.requires_grad:
-
-        def collect(gradient: Tensor) -> None:
-            out.add_(gradient.reshape(out.shape))
-
-        means2d.register_hook(collect)
-    return out

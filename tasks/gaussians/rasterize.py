@@ -7,7 +7,12 @@ before its transmittance T would fall below 1e-4; weight = T * alpha. A Gaussian
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import ctypes
+import functools
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -99,20 +104,30 @@ class Rendered:
     """[N, 2] after `backward`: gradient towards the projected means, per pixel; zeros before."""
 
 
-def backend_identity(device: str = "cpu") -> dict[str, str]:
-    """What a rendering depends on besides its inputs: the instruction set, or the CUDA rasterizer's version."""
-    if device == "cpu":
-        return {"rasterizer": instruction_set()}
-    from importlib.metadata import version
+@functools.cache
+def training_device() -> str:
+    """Where Gaussians are trained: "cuda" where gsplat, a torch with CUDA and a driver are there, else "cpu".
 
-    import torch
+    Found without importing torch, since every key that depends on it asks.
+    """
+    if importlib.util.find_spec("gsplat") is None or "+cpu" in version("torch"):
+        return "cpu"
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return "cpu"
+    return "cuda" if driver.cuInit(0) == 0 else "cpu"
 
-    return {"rasterizer": f"gsplat {version('gsplat')} on {torch.cuda.get_device_name(device)}"}
+
+def backend_identity() -> dict[str, str]:
+    """What renderings and trainings depend on besides their inputs: the instruction set, and CUDA's rasterizer."""
+    rendering = {"rasterizer": instruction_set()}
+    return rendering if training_device() == "cpu" else {**rendering, "training": f"gsplat {version('gsplat')}, CUDA"}
 
 
 def rasterize(
     gaussians: GaussianTensors,
-    camera: Camera,
+    camera: Camera | Sequence[Camera],
     *,
     background: Tensor | tuple[float, float, float],
     labels: Tensor | None = None,
@@ -122,33 +137,41 @@ def rasterize(
     antialias: bool = False,
     winners: bool = False,
 ) -> Rendered:
-    """Render 3D Gaussians.
+    """Render 3D Gaussians, on the device where they are.
 
-    background: [3] RGB, differentiable when a tensor. labels: [N] int32, the mask channel (0 <= label < num_labels) of
-    each Gaussian, negative = none. sh_degree: the degree in use, by default all that is stored. antialias: lower the
-    opacity by what the 0.3 pixels^2 add to the area (Mip-Splatting, Yu et al. 2024). winners: also find
-    `top_contributor` and `max_contribution`.
+    camera: its principal point may lie anywhere. Several cameras of one image size render a batch: everything in the
+    result then has one axis more in front. background: [3] RGB, differentiable when a tensor. labels: [N] int32, the
+    mask channel (0 <= label < num_labels) of each Gaussian, negative = none. sh_degree: the degree in use, by default
+    all that is stored. antialias: lower the opacity by what the 0.3 pixels^2 add to the area (Mip-Splatting, Yu et al.
+    2024). winners: also find `top_contributor` and `max_contribution`.
 
     Raises ValueError when shapes or types do not fit, a parameter is not finite, or the image is empty.
     """
     import torch
 
-    stored = _check(gaussians, labels, num_labels, camera)
+    cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
+    if len({(c.width, c.height) for c in cameras}) != 1:
+        raise ValueError("the cameras of a batch must be at least one and have one image size")
+    stored = _check(gaussians, labels, num_labels, cameras)
     degree = stored if sh_degree is None else min(sh_degree, stored)
     if not isinstance(background, torch.Tensor):
         background = torch.tensor(background, dtype=torch.float32, device=gaussians.means.device)
     if background.shape != (3,):
         raise ValueError(f"background must be [3], not {list(background.shape)}")
     if gaussians.means.is_cuda:
-        from ss_flow.tasks.gaussians.cuda import rasterize_cuda
+        from ss_flow.tasks.gaussians.cuda import rasterize_cuda as on_device
+    else:
+        from ss_flow.tasks.gaussians.autograd import rasterize_cpu as on_device
+    center_gradient = torch.zeros(len(cameras), len(gaussians), 2, device=gaussians.means.device)
+    options = (background, labels, num_labels, degree, near_plane, antialias, winners)
+    views = [on_device(gaussians, c, *options, g) for c, g in zip(cameras, center_gradient, strict=True)]
+    if isinstance(camera, Camera):
+        return views[0]
+    images = {f.name: torch.stack([getattr(v, f.name) for v in views]) for f in fields(Rendered)}
+    return Rendered(**{**images, "center_gradient": center_gradient})
 
-        return rasterize_cuda(gaussians, camera, background, labels, num_labels, degree, near_plane, antialias, winners)
-    from ss_flow.tasks.gaussians.autograd import rasterize_cpu
 
-    return rasterize_cpu(gaussians, camera, background, labels, num_labels, degree, near_plane, antialias, winners)
-
-
-def _check(gaussians: GaussianTensors, labels: Tensor | None, num_labels: int, camera: Camera) -> int:
+def _check(gaussians: GaussianTensors, labels: Tensor | None, num_labels: int, cameras: Sequence[Camera]) -> int:
     import torch
 
     n = len(gaussians.means)
@@ -172,6 +195,7 @@ def _check(gaussians: GaussianTensors, labels: Tensor | None, num_labels: int, c
             raise ValueError(f"labels must be [{n}] int32, not {list(labels.shape)} {labels.dtype}")
         if n and int(labels.max()) >= num_labels:
             raise ValueError(f"labels must be below num_labels = {num_labels}, but one is {int(labels.max())}")
-    if camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
-        raise ValueError(f"a camera needs pixels and positive focal lengths, not {camera}")
+    for camera in cameras:
+        if camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
+            raise ValueError(f"a camera needs pixels and positive focal lengths, not {camera}")
     return degrees[gaussians.sh.shape[1]]

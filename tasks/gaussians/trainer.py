@@ -12,13 +12,13 @@ import numpy as np
 
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
+from ss_flow.tasks.gaussians.backends import backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, Fixed, Schedule, Seen, Strategy
-from ss_flow.tasks.gaussians.library import Workspace
 from ss_flow.tasks.gaussians.mcmc import MarkovChain
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
-from ss_flow.tasks.gaussians.objective import Target, Weights, gradients_of
+from ss_flow.tasks.gaussians.objective import Target, Weights
 from ss_flow.tasks.gaussians.optimizer import Parameters
-from ss_flow.tasks.gaussians.rasterize import NEAR_PLANE
+from ss_flow.tasks.gaussians.rasterize import NEAR_PLANE, training_device
 from ss_flow.tasks.gaussians.render import channels_of
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, NonNegative, Positive
@@ -130,8 +130,8 @@ def train(
     """Fit Gaussians to views with Adam (Kerbl et al. 2023, Sec. 5; spec P1, P4).
 
     extent: size of what is trained, world units: scales the learning rate of the means and tells large Gaussians from
-    small. label_ids: instance ids of the mask loss. The number of threads changes no byte, and neither does a kill: a
-    later try goes on from the last checkpoint.
+    small. label_ids: instance ids of the mask loss. On the CPU the number of threads changes no byte, and neither does
+    a kill: a later try goes on from the last checkpoint.
     Raises ValueError when there are no views or Gaussians or an array does not fit its camera, TrainingDiverged when
     numbers blow up. The result has no Gaussians when all were pruned.
     """
@@ -191,8 +191,7 @@ class _Training:
         self.step = 0
         self.losses = np.zeros(params.iterations, np.float32)
         self._order: list[int] = []
-        self._workspace, self._threads = Workspace(), cores()
-        self._gradients: dict[str, Float32] | None = None
+        self._backend = backend_for(training_device(), cores())
 
     def advance(self) -> None:
         """One step: render a view, compare, go down the gradient, mind the number of Gaussians."""
@@ -207,33 +206,21 @@ class _Training:
             _background(params.background, self._generator),
             self._num_labels, degree, NEAR_PLANE, params.antialias, winners=False,
         )  # fmt: skip
-        with_labels = target.ids is not None
-        rendered = NativePass(
-            parameters.arrays(),
-            self._channels[parameters.origin] if with_labels else None,
-            target.camera,
-            settings,
-            ids=target.ids,
-            workspace=self._workspace,
-            threads=self._threads,
-        )
         weights = Weights(
             params.ssim_weight,
             params.alpha_weight,
             _decay(params.depth_weight_start, params.depth_weight_final, done_share),
             params.mask_weight,
         )
-        loss, towards = gradients_of(rendered, target, weights, self._workspace, self._threads)
-        self.losses[self.step - 1] = loss
-        if not np.isfinite(loss):
+        labels = self._channels[parameters.origin] if target.ids is not None else None
+        found = self._backend.descent(parameters.arrays(), labels, target, settings, weights)
+        self.losses[self.step - 1] = found.loss
+        if not np.isfinite(found.loss):
             raise TrainingDiverged(f"training of {len(parameters)} Gaussians diverged at step {self.step}")
-        if self._gradients is None or len(self._gradients["means"]) != len(parameters):
-            self._gradients = None
-        self._gradients = rendered.backward(*towards, out=self._gradients)
-        self._strategy.regularise(parameters, self._gradients)
+        self._strategy.regularise(parameters, found.gradients)
         rates = _rates(params, self._extent, done_share)
-        parameters.step(self._gradients, rates, self.step, degree)
-        seen = Seen(self._gradients, rendered.radii, target.pixels, rates["means"])
+        parameters.step(found.gradients, rates, self.step, degree)
+        seen = Seen(found.gradients, found.radii, target.pixels, rates["means"])
         self._strategy.after(self.step, parameters, seen, self._generator)
 
     def check(self) -> None:
@@ -282,9 +269,7 @@ class _Training:
         strongest = np.zeros(len(parameters), np.float32)
         error, count = 0.0, 0
         for target in self._targets:
-            rendered = NativePass(
-                parameters.arrays(), None, target.camera, settings, workspace=self._workspace, threads=self._threads
-            )
+            rendered = NativePass(parameters.arrays(), None, target.camera, settings, threads=cores())
             assert rendered.strongest is not None
             np.maximum(strongest, rendered.strongest, out=strongest)
             inside = target.inside > 0
