@@ -55,7 +55,8 @@ class BuildSharedObjects(build_ext):
         target.parent.mkdir(parents=True, exist_ok=True)
         # Replaced by a rename: a process that has the old object open keeps it.
         fresh = target.with_suffix(f".{os.getpid()}.tmp")
-        command = [*compiler(), *COMMON, *ext.extra_compile_args, *ext.sources, "-o", str(fresh)]
+        more = os.environ.get("CXXFLAGS", "").split()
+        command = [*compiler(), *COMMON, *ext.extra_compile_args, *more, *ext.sources, "-o", str(fresh)]
         try:
             subprocess.run(command, check=True)
             fresh.replace(target)

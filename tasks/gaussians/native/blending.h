@@ -270,7 +270,7 @@ void backward(const Scene& s, const Frame& frame, Band& band, const Images& imag
     const int64_t pixels = (int64_t)s.width * s.height;
     LabelSlots masks(kLabels == Labels::masks ? s.num_labels : 0);
     Sums* sums = band.sums.room(band.count);
-    std::memset(static_cast<void*>(sums), 0, band.count * sizeof(Sums));
+    std::fill(sums, sums + band.count, Sums{});
     V16 towards_background[3] = {splat(0), splat(0), splat(0)};
     Harvest harvest;
     for (int index = 0; index < band.rows * frame.blocks_x; ++index) {
