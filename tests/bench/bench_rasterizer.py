@@ -1,68 +1,223 @@
-"""CPU milliseconds of rendering, its gradient, the colour loss and Adam; run as a script."""
+"""CPU time of rendering and its gradient, of a training step and of many small trainings, on one and two threads.
+
+    python tests/bench/bench_rasterizer.py [--scaling PNG]
+
+Times are the thread's own CPU time (medians), so that neighbours on the machine matter less; its load stands beside
+them. Efficiency is against the peak of the fused multiply-add units, measured in the same run.
+"""
 
 from __future__ import annotations
 
+import argparse
+import ctypes
+import os
+import resource
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from ss_flow.tasks.gaussians.library import instruction_set
-from ss_flow.tasks.gaussians.losses import photometric
+from ss_flow.running import Surroundings, running
+from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.gaussians import library as native
+from ss_flow.tasks.gaussians import native_pass
+from ss_flow.tasks.gaussians.library import Workspace
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.trainer import TrainParams, TrainView, train
 from ss_flow.tasks.geometry.cameras import Camera
 
-CASES = (
-    (1_000, 100, 100, 0),
-    (2_000, 160, 120, 0),
-    (10_000, 320, 240, 0),
-    (10_000, 320, 240, 3),
-    (50_000, 640, 480, 0),
-)
+CASES = ((2_000, 160, 120, 0), (10_000, 320, 240, 0), (10_000, 320, 240, 3), (50_000, 640, 480, 0))
+FLAGS = {
+    "avx512": ["-mavx512f", "-mfma", "-mprefer-vector-width=512"],
+    "avx2": ["-mavx2", "-mfma"],
+    "baseline": [],
+}
+FORWARD_FLOP, BACKWARD_FLOP = 528, 816
+"""Floating-point operations for one Gaussian in one block of sixteen pixels."""
 
 
-def scene(n: int, degree: int) -> tuple[np.ndarray, ...]:
-    """Gaussians of 5 cm all through the view."""
+def scene(n: int, degree: int, size: float = 0.05) -> tuple[np.ndarray, ...]:
+    """Gaussians all through the view, smaller where there are more."""
     rng = np.random.default_rng(0)
     z = rng.uniform(2, 6, n)
     means = np.stack([rng.uniform(-0.7, 0.7, n) * z, rng.uniform(-0.5, 0.5, n) * z, z], axis=1)
     arrays = (
         means,
         rng.normal(size=(n, 4)),
-        np.log(0.05) + 0.4 * rng.normal(size=(n, 3)) - np.log(n / 2000) / 3,
+        np.log(size) + 0.4 * rng.normal(size=(n, 3)) - np.log(n / 2000) / 3,
         rng.normal(size=n),
         0.3 * rng.normal(size=(n, (degree + 1) ** 2, 3)),
     )
     return tuple(np.ascontiguousarray(a, np.float32) for a in arrays)
 
 
-def milliseconds(call: Callable[[], object], repeats: int) -> float:
-    """The median of the thread's CPU time."""
-    taken = []
-    for _ in range(repeats):
+def camera_of(width: int, height: int, shift: float = 0.0) -> Camera:
+    return Camera(width, height, 0.75 * width, 0.75 * width, width / 2 + shift, height / 2, np.eye(4))
+
+
+def milliseconds(call: Callable[[], object], seconds: float = 0.7) -> float:
+    """The median of the thread's CPU time over calls for so long, five at least."""
+    taken: list[float] = []
+    while len(taken) < 5 or sum(taken) < seconds:
         start = time.thread_time()
         call()
         taken.append(time.thread_time() - start)
     return 1e3 * float(np.median(taken))
 
 
-def main() -> None:
-    print(f"instruction set: {instruction_set()}")
-    for n, width, height, degree in CASES:
-        parameters = scene(n, degree)
-        camera = Camera(width, height, 0.75 * width, 0.75 * width, width / 2, height / 2, np.eye(4))
-        settings = Settings((0.1, 0.2, 0.3), 0, degree, 0.01, False, winners=False)
-        done = NativePass(parameters, None, camera, settings)
-        towards = np.full_like(done.rgb, 1e-3)
-        image, weight = np.zeros_like(done.rgb), np.ones_like(done.alpha)
-        repeats = max(5, 100_000 // n)
-        forward = milliseconds(lambda: NativePass(parameters, None, camera, settings), repeats)  # noqa: B023
-        backward = milliseconds(lambda: done.backward(towards, None, None, None), repeats)  # noqa: B023
-        loss = milliseconds(lambda: photometric(done.rgb, image, weight), repeats)  # noqa: B023
+def fma_peak(name: str) -> float:
+    """GFLOP/s of one thread with an instruction set."""
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "peak.so"
+        source = Path(__file__).with_name("fma_peak.cpp")
+        compiler = os.environ.get("CXX", "c++")
+        command = [compiler, "-O3", "-std=c++17", "-shared", "-fPIC", *FLAGS[name], str(source), "-o", str(target)]
+        subprocess.run(command, check=True)
+        measure = ctypes.CDLL(str(target)).fma_peak
+        measure.restype, measure.argtypes = ctypes.c_double, [ctypes.c_int64, ctypes.c_float, ctypes.c_void_p]
+        sink = np.zeros(1, np.float32)
+        return max(float(measure(20_000_000, 0.5, sink.ctypes.data)) for _ in range(5))
+
+
+def passes(n: int, width: int, height: int, degree: int, size: float = 0.05) -> tuple[float, float, int]:
+    """Milliseconds forward and backward, and the entries of one scene."""
+    parameters, camera = scene(n, degree, size), camera_of(width, height)
+    settings = Settings((0.1, 0.2, 0.3), 0, degree, 0.01, False, winners=False)
+    workspace = Workspace()
+    done = NativePass(parameters, None, camera, settings, workspace=workspace)
+    towards = np.full_like(done.rgb, 1e-3)
+    surface = np.full_like(done.alpha, 1e-3)
+    out = done.backward(towards, surface, surface, None)
+    backward = milliseconds(lambda: done.backward(towards, surface, surface, None, out=out))
+    entries = done.entries
+    forward = milliseconds(lambda: NativePass(parameters, None, camera, settings, workspace=workspace))
+    return forward, backward, entries
+
+
+def rendering() -> None:
+    """The four sizes on each instruction set."""
+    for name in (n for n in FLAGS if native._NEEDS[n] <= native._processor_flags()):
+        chosen = native.library(name)
+        native_pass.library = lambda chosen=chosen: chosen  # type: ignore[assignment]
+        peak = fma_peak(name)
+        print(f"\n{name}: {peak:.0f} GFLOP/s at the peak of one thread")
+        print("| Gaussians, image | forward ms | forward + backward ms | ns an entry | share of the peak |")
+        print("|---|---|---|---|---|")
+        for n, width, height, degree in CASES:
+            forward, backward, entries = passes(n, width, height, degree)
+            flops = ((FORWARD_FLOP, forward), (BACKWARD_FLOP, backward))
+            shares = (100 * flop * entries / (1e6 * ms) / peak for flop, ms in flops)
+            print(
+                f"| {n // 1000}k, {width}x{height}, SH{degree} | {forward:.2f} | {forward + backward:.2f} "
+                f"| {1e6 * forward / entries:.1f}, {1e6 * backward / entries:.1f} | "
+                + ", ".join(f"{s:.0f} %" for s in shares)
+                + " |"
+            )
+
+
+def training_scene(n: int, side: tuple[int, int], labels: int) -> tuple[Gaussians, list[TrainView]]:
+    """A scene slightly out of place, and six views of where it should be."""
+    rng = np.random.default_rng(1)
+    ids = rng.integers(1, max(labels, 1) + 1, n).astype(np.int32)
+    ones, zeros = np.ones(n, np.float32), np.zeros(n, np.int32)
+    still = Gaussians(*scene(n, 0), instance_id=ids, instance_conf=ones, part_id=zeros)
+    views, everywhere = [], np.ones(side[::-1], bool)
+    for k in range(6):
+        camera = camera_of(*side, shift=3 * k)
+        seen = render(still, camera, label_ids=range(1, labels + 1))
+        owner = seen.label_masks.argmax(axis=0).astype(np.int32) if labels else None
+        views.append(TrainView(camera, np.clip(seen.rgb, 0, 1), everywhere, ~everywhere, seen.depth, owner))
+    moved = still.means + 0.01 * rng.normal(size=still.means.shape).astype(np.float32)
+    return replace(still, means=moved), views
+
+
+def steps_a_second(n: int, side: tuple[int, int], labels: int, threads: int, iterations: int = 300) -> float:
+    start, views = training_scene(n, side, labels)
+    params = TrainParams(iterations=iterations, sh_degree=0, densify="none", mask_weight=1.0 if labels else 0.0)
+    with running(Surroundings(cores=threads)):
+        began = time.perf_counter()
+        train(start, views, params=params, extent=4.0, seed=0, label_ids=range(1, labels + 1))
+        return iterations / (time.perf_counter() - began)
+
+
+def training() -> None:
+    """Steps a second: render, L1 + SSIM + alpha + depth, gradient, Adam."""
+    print("\nTraining, steps a second:")
+    for threads in (1, 2):
+        plain, labelled = (steps_a_second(10_000, (320, 240), labels, threads) for labels in (0, 20))
         print(
-            f"{n:6} Gaussians {width}x{height} SH{degree}: forward {forward:6.1f}, backward {backward:6.1f}, "
-            f"colour loss {loss:5.1f} ms"
+            f"10k Gaussians, 320x240, SH0, {threads} threads: {plain:.0f}; with 20 labels {labelled:.0f} "
+            f"({100 * (plain / labelled - 1):+.0f} % time)"
         )
+    rate = steps_a_second(100_000, (640, 480), 0, 2, 20)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+    print(f"100k Gaussians, 640x480, 2 threads: {rate:.1f}; the process has used {peak} MB at most")
+
+
+def small_trainings() -> None:
+    """Sixteen instances in crops of 96x96, as the executor runs them."""
+    start, views = training_scene(1_000, (96, 96), 0)
+    params = TrainParams(iterations=300, sh_degree=0)
+
+    def one(seed: int) -> None:
+        train(start, views, params=params, extent=4.0, seed=seed)
+
+    seconds = {}
+    for workers in (1, 2):
+        began = time.perf_counter()
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(one, range(16)))
+        seconds[workers] = time.perf_counter() - began
+    print(
+        f"\n16 instances, 1k Gaussians, 96x96, 300 steps: {16 / seconds[1]:.2f} a second with one worker, "
+        f"{16 / seconds[2]:.2f} with two ({100 * seconds[1] / seconds[2] / 2:.0f} % of twice as fast)"
+    )
+
+
+def scaling(path: Path) -> None:
+    """Time over the number of (Gaussian, block) entries, from 1k to 1M Gaussians and 160x120 to 1920x1080."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    print("\n| Gaussians, image | entries | forward ns an entry | backward ns an entry |\n|---|---|---|---|")
+    for width, height in ((160, 120), (320, 240), (640, 480), (1920, 1080)):
+        rows = []
+        for n in (1_000, 10_000, 100_000, 1_000_000):
+            forward, backward, entries = passes(n, width, height, 0)
+            rows.append((entries, forward, backward))
+            print(
+                f"| {n // 1000}k, {width}x{height} | {entries} | {1e6 * forward / entries:.1f} "
+                f"| {1e6 * backward / entries:.1f} |",
+                flush=True,
+            )
+        entries_, forward_, backward_ = zip(*rows, strict=True)
+        (line,) = axes.loglog(entries_, forward_, "o-", label=f"{width}x{height} forward")
+        axes.loglog(entries_, backward_, "s--", color=line.get_color(), label=f"{width}x{height} backward")
+    axes.set_xlabel("(Gaussian, 4x4-pixel block) entries")
+    axes.set_ylabel("CPU time of one thread, ms")
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scaling", type=Path, help="only measure how time grows, and plot it here")
+    args = parser.parse_args()
+    print(f"load of the machine: {os.getloadavg()[0]:.2f}")
+    if args.scaling:
+        scaling(args.scaling)
+    else:
+        training()
+        small_trainings()
+        rendering()
 
 
 if __name__ == "__main__":

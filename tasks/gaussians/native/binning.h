@@ -38,6 +38,10 @@ struct Span {
     int32_t splat, block, length;
 };
 
+struct Range {
+    int first, last;
+};
+
 struct Band {
     int top, rows;                 // of blocks
     int64_t count;                 // of splats
@@ -56,22 +60,16 @@ struct Frame {
     int64_t chunks;
     Buffer<Splat> candidates;      // chunk c writes from c * kChunk
     Buffer<int32_t> chunk_count;
-    Buffer<int64_t> place_first;   // of each candidate, into places
-    Buffer<int32_t> places;        // its splat in each of its bands
+    Buffer<Range> rows;            // of blocks, of each candidate
+    Buffer<int64_t> place_first;   // of each candidate: places[place_first + band] is its splat there
+    Buffer<int32_t> places;
     int num_bands;
     std::vector<Band> bands;       // never fewer than before, so that their memory stays
 };
 
-struct Range {
-    int first, last;
-};
 inline Range block_rows(const Frame& frame, const Splat& p) {
     return {(int)std::fmax(std::ceil((p.v - p.half_height - 3.501f) / 4), 0.0f),
             (int)std::fmin(std::floor((p.v + p.half_height - 0.499f) / 4), frame.blocks_y - 1.0f)};
-}
-inline Range bands_of(const Frame& frame, const Splat& p) {
-    const Range rows = block_rows(frame, p);
-    return {rows.first / kBandRows, rows.last / kBandRows};
 }
 
 inline V16 as_floats(const int32_t (&lane)[16]) {
@@ -116,8 +114,12 @@ inline void project_chunk(const Scene& s, const projection::View& view, int64_t 
                           color[0], color[1], color[2], f.z, as_floats(label), as_floats(row),
                           half_width, half_height, correlation, f.chord};
         lanes::transpose(fields);
-        for (int k = 0; k < rows.count; ++k)
-            if (is_seen[k] > 0) lanes::store(reinterpret_cast<float*>(to++), fields[k]);
+        for (int k = 0; k < rows.count; ++k) {
+            if (!(is_seen[k] > 0)) continue;
+            lanes::store(reinterpret_cast<float*>(to), fields[k]);
+            frame.rows[to - frame.candidates.data()] = block_rows(frame, *to);
+            ++to;
+        }
     }
     frame.chunk_count[chunk] = (int32_t)(to - (frame.candidates.data() + chunk * kChunk));
 }
@@ -133,10 +135,10 @@ inline void distribute(Frame& frame) {
     int64_t places = 0;
     for (int b = 0; b < frame.num_bands; ++b) frame.bands[b].count = 0;
     each_candidate(frame, [&](int64_t k) {
-        const Range range = bands_of(frame, frame.candidates[k]);
-        frame.place_first[k] = places;
-        places += std::max(range.last - range.first + 1, 0);
-        for (int b = range.first; b <= range.last; ++b) ++frame.bands[b].count;
+        const int first = frame.rows[k].first / kBandRows, last = frame.rows[k].last / kBandRows;
+        frame.place_first[k] = places - first;
+        places += last - first + 1;
+        for (int b = first; b <= last; ++b) ++frame.bands[b].count;
     });
     frame.places.room(places);
     for (int b = 0; b < frame.num_bands; ++b) {
@@ -144,11 +146,9 @@ inline void distribute(Frame& frame) {
         frame.bands[b].count = 0;
     }
     each_candidate(frame, [&](int64_t k) {
-        const Splat& p = frame.candidates[k];
-        const Range range = bands_of(frame, p);
         uint32_t depth;  // positive, so its bits are in its order
-        std::memcpy(&depth, &p.z, sizeof depth);
-        for (int b = range.first; b <= range.last; ++b) {
+        std::memcpy(&depth, &frame.candidates[k].z, sizeof depth);
+        for (int b = frame.rows[k].first / kBandRows; b <= frame.rows[k].last / kBandRows; ++b) {
             Band& band = frame.bands[b];
             band.order[band.count++] = (uint64_t)depth << 32 | (uint64_t)k;
         }
@@ -158,18 +158,17 @@ inline void distribute(Frame& frame) {
 // By depth, ties by row.
 inline void sort(Band& band) {
     uint64_t *items = band.order.data(), *spare = band.other.room(band.count);
-    if (band.count < 1000) {
+    if (band.count < 64) {
         std::sort(items, items + band.count);
         return;
     }
-    for (int shift = 32; shift < 64; shift += 11) {  // three stable passes; the candidates are in order already
-        int64_t start[2049] = {};
-        for (int64_t k = 0; k < band.count; ++k) ++start[((items[k] >> shift) & 2047) + 1];
-        for (int k = 0; k < 2048; ++k) start[k + 1] += start[k];
-        for (int64_t k = 0; k < band.count; ++k) spare[start[(items[k] >> shift) & 2047]++] = items[k];
+    for (int shift = 32; shift < 64; shift += 8) {  // four stable passes; the candidates are in order already
+        int64_t start[257] = {};
+        for (int64_t k = 0; k < band.count; ++k) ++start[((items[k] >> shift) & 255) + 1];
+        for (int k = 0; k < 256; ++k) start[k + 1] += start[k];
+        for (int64_t k = 0; k < band.count; ++k) spare[start[(items[k] >> shift) & 255]++] = items[k];
         std::swap(items, spare);
     }
-    std::memcpy(spare, items, band.count * sizeof *items);  // after an odd number of passes, the result is in `other`
 }
 
 alignas(64) constexpr float kBlockRow[16] = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};
@@ -206,13 +205,16 @@ inline void fill(Band& band, Frame& frame) {
     const auto candidate_at = [&](int64_t k) { return (int64_t)(band.order[k] & 0xffffffffu); };
     for (int64_t k = 0; k < band.count; ++k) {
         // The order of depth jumps about in memory.
-        if (k + 12 < band.count) __builtin_prefetch(&frame.candidates[candidate_at(k + 12)]);
+        if (k + 12 < band.count) {
+            __builtin_prefetch(&frame.candidates[candidate_at(k + 12)]);
+            __builtin_prefetch(&frame.rows[candidate_at(k + 12)]);
+        }
         const int64_t candidate = candidate_at(k);
         const Splat& p = band.splats[k] = frame.candidates[candidate];
-        frame.places[frame.place_first[candidate] + number - bands_of(frame, p).first] = (int32_t)k;
+        frame.places[frame.place_first[candidate] + number] = (int32_t)k;
         int32_t block[16];
         columns(p, band.top, frame.blocks_x, block);
-        const Range rows = block_rows(frame, p);
+        const Range rows = frame.rows[candidate];
         const int end = std::min(rows.last - band.top + 1, band.rows);
         for (int r = std::max(rows.first - band.top, 0); r < end; ++r) {
             const int32_t length = block[8 + r] - block[r], from = r * frame.blocks_x + block[r];
@@ -230,8 +232,11 @@ inline void fill(Band& band, Frame& frame) {
     }
     int32_t* entries = band.entries.room(total + kAhead);
     std::memset(entries + total, 0, kAhead * sizeof *entries);
-    for (int64_t k = 0; k < num_spans; ++k)
-        for (int32_t b = spans[k].block; b < spans[k].block + spans[k].length; ++b) entries[change[b]++] = spans[k].splat;
+    for (int64_t k = 0; k < num_spans; ++k) {
+        const Span span = spans[k];
+        int64_t* next = change + span.block;
+        for (int32_t b = 0; b < span.length; ++b) entries[next[b]++] = span.splat;
+    }
     // Each change[b] has moved on to where the next block begins, which is what first[b + 1] should say.
     first[0] = 0;
 }
@@ -240,6 +245,7 @@ inline void prepare(const Scene& s, Frame& frame) {
     frame.blocks_x = (s.width + 3) / 4, frame.blocks_y = (s.height + 3) / 4;
     frame.chunks = (s.count + kChunk - 1) / kChunk;
     frame.candidates.room(frame.chunks * kChunk);
+    frame.rows.room(frame.chunks * kChunk);
     frame.place_first.room(frame.chunks * kChunk);
     frame.chunk_count.room(frame.chunks);
     frame.num_bands = (frame.blocks_y + kBandRows - 1) / kBandRows;

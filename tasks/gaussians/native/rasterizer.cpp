@@ -8,6 +8,7 @@ namespace {
 
 using binning::Band;
 using binning::Frame;
+using binning::kBandRows;
 using binning::kChunk;
 using binning::Range;
 using binning::Splat;
@@ -36,13 +37,11 @@ void reduce(const Scene& s, const projection::View& view, const Frame& frame, in
     for (int k = 0; k < 16; ++k) {
         const int64_t candidate = begin + std::min(k, count - 1);
         const Splat& p = frame.candidates[candidate];
-        const Range bands = binning::bands_of(frame, p);
+        const Range blocks = frame.rows[candidate];
         rows.at[k] = p.row;
         v[k] = splat(0);
-        for (int b = bands.first; b <= bands.last; ++b) {
-            const int32_t place = frame.places[frame.place_first[candidate] + b - bands.first];
-            v[k] = v[k] + lanes::load(frame.bands[b].sums[place].value);
-        }
+        for (int b = blocks.first / kBandRows; b <= blocks.last / kBandRows; ++b)
+            v[k] = v[k] + lanes::load(frame.bands[b].sums[frame.places[frame.place_first[candidate] + b]].value);
         for (int c = 0; c < 3; ++c) shown[c][k] = p.color[c];
     }
     lanes::transpose(v);
