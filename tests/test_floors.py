@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = {"cache": "ss_flow.cache", "ss_flow": "ss_flow", "tasks": "ss_flow.tasks", "flows": "ss_flow.flows"}
 ORDER = list(FLOORS)
-LATE = {"ss_flow.tasks.gaussians.autograd", "ss_flow.tasks.gaussians.cuda"}
+LATE = {f"ss_flow.tasks.gaussians.{name}" for name in ("autograd", "cuda", "torch_backend")}
 """Modules that cannot be defined without torch, and so are imported inside functions only."""
 HEAVY = {"torch", "cv2", "scipy", "open3d", "onnxruntime", "onnx", "pycolmap", "zarr", "matplotlib", "jinja2"}
 

@@ -1,8 +1,8 @@
 """The number of Gaussians under control: training as sampling (Kheradmand et al. 2024, "3DGS as MCMC").
 
 Faint Gaussians move to where opaque ones are, in a way that keeps the picture; their number grows by 5 % at a time up
-to a cap; noise lets faint ones explore, and a small price on opacity and size makes what is not needed fade. Lengths
-are taken in units of the extent, so that the scale of the world does not matter.
+to a cap; noise lets faint ones explore, and a small price on opacity and size makes what is not needed fade. Unlike in
+the paper, lengths are in units of the extent, so that the scale of the world does not matter.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ DEAD_OPACITY = 0.005
 GROWTH = 1.05
 OPACITY_PRICE = 0.01
 """lambda_o of Eq. 13: on the mean opacity."""
-SCALE_PRICE = 0.01
-"""lambda_Sigma of Eq. 13: on the mean standard deviation, in units of the extent."""
+SCALE_PRICE = 0.05
+"""lambda_Sigma of Eq. 13: on the mean standard deviation; the paper's 0.01 where the extent is 5 units."""
 NOISE = 5e5
 """lambda_noise of Eq. 8."""
 NOISE_SHARPNESS = 100.0
@@ -85,13 +85,14 @@ class MarkovChain:
         parameters.rearrange(values, rows, divided)
 
     def _shake(self, parameters: Parameters, rate: float, generator: np.random.Generator) -> None:
-        """Eq. 8: noise of the Gaussian's own shape, where it is hardly opaque."""
+        """Eq. 8: noise of the Gaussian's own shape, where it is hardly opaque; of its own size at most."""
         faint = 1 / (1 + np.exp(NOISE_SHARPNESS * (parameters.opacities() - DEAD_OPACITY)))
-        axes = rotations(parameters.values["quaternions"])
-        variance = np.square(np.exp(parameters.values["log_scales"].astype(np.float64)))
-        along = np.einsum("nji,nj->ni", axes, generator.normal(size=(len(parameters), 3))) * variance
-        offset = np.einsum("nij,nj->ni", axes, along) * (NOISE * rate / self._extent * faint)[:, None] / self._extent
-        parameters.values["means"] += offset.astype(np.float32)
+        rows = np.flatnonzero(faint > 1e-3)
+        axes = rotations(parameters.values["quaternions"][rows])
+        size = np.exp(parameters.values["log_scales"][rows].astype(np.float64))
+        reach = np.minimum(NOISE * rate * np.square(size / self._extent), size) * faint[rows, None]
+        noise = reach * generator.normal(size=(len(rows), 3))
+        parameters.values["means"][rows] += np.einsum("nij,nj->ni", axes, noise).astype(np.float32)
 
     def state(self) -> dict[str, NDArray[Any]]:
         return {}

@@ -47,7 +47,7 @@ class ReconstructParams:
     """Whether pixels where something else is in front are left out; False calls them empty, as in the paper."""
     densify: Literal["classic", "mcmc", "none"] = "classic"
     """How their number grows: "classic" clones and splits where the picture is still wrong (3DGS), "mcmc" moves faint
-    Gaussians to where opaque ones are and grows by 5 % at a time, "none" leaves it."""
+    Gaussians to where opaque ones are and grows by 5 % at a time (for many views), "none" leaves it."""
     plateau: Fraction = 0.0
     """Training ends early when the loss falls by less than this share from one stretch of at least 100 steps to the
     next, twice in a row; 0 = never."""
