@@ -69,4 +69,5 @@ def render(
     red, green, blue = background
     settings = Settings((red, green, blue), len(label_ids), degree, NEAR_PLANE, antialias, winners=True)
     done = NativePass(parameters, labels, camera, settings)  # type: ignore[arg-type]
+    assert done.top is not None and done.strongest is not None
     return Rendering(done.rgb, done.alpha, done.depth, done.masks, done.top, done.radii > 0, done.strongest)

@@ -68,7 +68,7 @@ class TorchBackend:
         loss = _color_loss(out.rgb, here, weights.ssim)
         loss = loss + weights.alpha * (here.judged * (out.alpha - here.inside).abs()).sum()
         loss = loss + weights.depth * (here.known * (out.depth / here.depth - out.alpha).abs()).sum()
-        if channels is not None:
+        if here.labelled is not None:
             loss = loss + weights.mask * (here.labelled * (out.label_masks - here.one_hot).abs()).sum()
         loss.backward()
         gradients = {
@@ -85,8 +85,8 @@ class TorchBackend:
 
 
 def _moved(target: Target, num_labels: int, device: str) -> _Target:
-    def put(array: np.ndarray | None) -> Tensor | None:
-        return None if array is None else torch.tensor(array, device=device)
+    def put(array: np.ndarray) -> Tensor:
+        return torch.tensor(array, device=device)
 
     height, width = target.inside.shape
     channel_of_label = np.zeros(num_labels, np.int32)
@@ -97,8 +97,16 @@ def _moved(target: Target, num_labels: int, device: str) -> _Target:
         channel_of_label[present] = np.arange(len(present))
         one_hot = np.zeros((len(present) + 1, height, width), np.float32)
         one_hot[: len(present)] = target.ids == present[:, None, None]
-    arrays = (target.image, target.inside, target.judged, target.depth, target.known, target.labelled, one_hot)
-    return _Target(*(put(a) for a in arrays), channel_of_label)  # type: ignore[arg-type]
+    return _Target(
+        put(target.image),
+        put(target.inside),
+        put(target.judged),
+        put(target.depth),
+        put(target.known),
+        None if target.labelled is None else put(target.labelled),
+        put(one_hot),
+        channel_of_label,
+    )
 
 
 def _color_loss(image: Tensor, target: _Target, ssim_weight: float) -> Tensor:

@@ -6,9 +6,10 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
@@ -242,8 +243,8 @@ class _Training:
 
     def save(self) -> None:
         """Keep everything for a later try."""
-        state = {
-            "step": np.int64(self.step),
+        state: dict[str, NDArray[Any]] = {
+            "step": np.array(self.step),
             "losses": self.losses,
             "order": np.array(self._order, np.int64),
             "generator": np.frombuffer(json.dumps(self._generator.bit_generator.state).encode(), np.uint8),

@@ -181,30 +181,35 @@ def small_trainings() -> None:
 
 
 def scaling(path: Path) -> None:
-    """Time over the number of (Gaussian, block) entries, from 1k to 1M Gaussians and 160x120 to 1920x1080."""
+    """Time from 1k to 1M Gaussians and from 160x120 to 1920x1080, and how well two prices explain it: one for a
+    Gaussian, one for an entry, a (Gaussian, block) pair."""
     from matplotlib.figure import Figure
+    from scipy.optimize import nnls
 
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes = figure.subplots()
-    print("\n| Gaussians, image | entries | forward ns an entry | backward ns an entry |\n|---|---|---|---|")
-    for width, height in ((160, 120), (320, 240), (640, 480), (1920, 1080)):
-        rows = []
+    sizes = ((160, 120), (320, 240), (640, 480), (1920, 1080))
+    rows = []
+    print("\n| Gaussians, image | entries | forward ms | backward ms |\n|---|---|---|---|")
+    for width, height in sizes:
         for n in (1_000, 10_000, 100_000, 1_000_000):
             forward, backward, entries = passes(n, width, height, 0)
-            rows.append((entries, forward, backward))
-            print(
-                f"| {n // 1000}k, {width}x{height} | {entries} | {1e6 * forward / entries:.1f} "
-                f"| {1e6 * backward / entries:.1f} |",
-                flush=True,
-            )
-        entries_, forward_, backward_ = zip(*rows, strict=True)
-        (line,) = axes.loglog(entries_, forward_, "o-", label=f"{width}x{height} forward")
-        axes.loglog(entries_, backward_, "s--", color=line.get_color(), label=f"{width}x{height} backward")
-    axes.set_xlabel("(Gaussian, 4x4-pixel block) entries")
-    axes.set_ylabel("CPU time of one thread, ms")
-    axes.grid(True, which="both", alpha=0.3)
-    axes.legend(fontsize=7)
-    figure.savefig(path, dpi=120)
+            rows.append((width, n, entries, forward, backward))
+            print(f"| {n // 1000}k, {width}x{height} | {entries} | {forward:.2f} | {backward:.2f} |", flush=True)
+    table = np.array(rows, float)
+    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    for axes, column, name in zip(figure.subplots(1, 2), (3, 4), ("forward", "backward"), strict=True):
+        counts, measured = table[:, 1:3], table[:, column]
+        prices, _ = nnls(counts / measured[:, None], np.ones(len(table)))  # least squares of relative errors
+        for width, height in sizes:
+            chosen = table[:, 0] == width
+            axes.loglog((counts @ prices)[chosen], measured[chosen], "o-", label=f"{width}x{height}")
+        ends = np.array([measured.min(), measured.max()])
+        axes.loglog(ends, ends, "k--", linewidth=1)
+        axes.set_xlabel(f"{1e6 * prices[0]:.0f} ns x Gaussians + {1e6 * prices[1]:.1f} ns x entries, in ms")
+        axes.set_ylabel("measured CPU time of one thread, ms")
+        axes.set_title(f"{name}: off by {100 * np.abs(counts @ prices / measured - 1).mean():.0f} % in the mean")
+        axes.grid(True, which="both", alpha=0.3)
+        axes.legend(fontsize=8)
+    figure.savefig(path, dpi=100)
 
 
 def main() -> None:
