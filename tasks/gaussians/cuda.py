@@ -30,8 +30,7 @@ def rasterize_cuda(
     """
     if winners:
         raise NotImplementedError("top contributors are found on the CPU only: render with CPU tensors")
-    from gsplat import rasterization
-    from gsplat.cuda._wrapper import spherical_harmonics
+    from gsplat import rasterization, spherical_harmonics
 
     device = gaussians.means.device
     pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32, device=device)
