@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ import numpy as np
 from blake3 import blake3
 
 CHUNK_BYTES = 1 << 20
+_LENGTH = struct.Struct("<Q").pack
+_FLOAT = struct.Struct("<d").pack
 
 
 def digest(value: Any) -> str:
@@ -27,68 +29,95 @@ def digest(value: Any) -> str:
 
     Raises TypeError for any other type, naming it.
     """
-    hasher = blake3()
-    _feed(hasher, value)
-    return hasher.hexdigest()
+    encoder = _Encoder()
+    encoder.add(value)
+    return encoder.hexdigest()
 
 
-def digest_file(path: Path) -> str:
+def digest_file(path: Path | str) -> str:
     """The hexadecimal blake3 digest of a file's content."""
     hasher = blake3()
-    with path.open("rb") as stream:
+    with open(path, "rb") as stream:
         while block := stream.read(CHUNK_BYTES):
             hasher.update(block)
     return hasher.hexdigest()
 
 
-def _tagged(hasher: Any, tag: bytes, content: bytes) -> None:
-    hasher.update(tag + struct.pack("<Q", len(content)))
-    hasher.update(content)
+class _Encoder:
+    """Encodes values one after the other; small ones are gathered before they are hashed."""
 
+    def __init__(self) -> None:
+        self._hasher = blake3()
+        self._pending = bytearray()
 
-def _feed(hasher: Any, value: Any) -> None:
-    if isinstance(value, np.generic):
-        value = value.item()
-    match value:
-        case None:
-            _tagged(hasher, b"0", b"")
-        case bool():
-            _tagged(hasher, b"b", b"\x01" if value else b"\x00")
-        case int():
-            _tagged(hasher, b"i", str(value).encode())
-        case float():
-            _tagged(hasher, b"f", struct.pack("<d", float("nan") if value != value else value))
-        case str():
-            _tagged(hasher, b"s", value.encode())
-        case bytes():
-            _tagged(hasher, b"y", value)
-        case np.ndarray():
-            _feed_array(hasher, value)
-        case list() | tuple():
-            hasher.update(b"l" + struct.pack("<Q", len(value)))
-            for item in value:
-                _feed(hasher, item)
-        case Mapping():
-            hasher.update(b"m" + struct.pack("<Q", len(value)))
-            for name in sorted(value):
-                if not isinstance(name, str):
-                    raise TypeError(f"cannot digest a mapping with a key of type {type(name).__name__}")
-                _tagged(hasher, b"k", name.encode())
-                _feed(hasher, value[name])
-        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            counted = [f.name for f in dataclasses.fields(value) if f.metadata.get("key", True)]
-            _tagged(hasher, b"d", f"{type(value).__module__}.{type(value).__qualname__}".encode())
-            _feed(hasher, {name: getattr(value, name) for name in counted})
-        case _:
+    def hexdigest(self) -> str:
+        self._hasher.update(self._pending)
+        return self._hasher.hexdigest()
+
+    def add(self, value: Any) -> None:
+        known = _ENCODERS.get(type(value))
+        if known is not None:
+            known(self, value)
+        elif isinstance(value, np.generic):
+            self.add(value.item())
+        elif isinstance(value, Mapping):
+            self._add_mapping(value)
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            counted = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.metadata.get("key", True)}
+            self._tagged(b"d", f"{type(value).__module__}.{type(value).__qualname__}".encode())
+            self._add_mapping(counted)
+        else:
+            for kind, encode in _ENCODERS.items():  # a subclass, such as a named tuple, counts as what it is
+                if isinstance(value, kind):
+                    encode(self, value)
+                    return
             raise TypeError(f"cannot digest a value of type {type(value).__module__}.{type(value).__qualname__}")
 
+    def _tagged(self, tag: bytes, content: bytes) -> None:
+        self._pending += tag
+        self._pending += _LENGTH(len(content))
+        self._pending += content
 
-def _feed_array(hasher: Any, array: np.ndarray) -> None:
-    if array.dtype.hasobject:
-        raise TypeError("cannot digest an array of Python objects")
-    array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-    if array.dtype.kind in "fc" and np.isnan(array).any():
-        array = np.where(np.isnan(array), np.array(np.nan, array.dtype), array)
-    _tagged(hasher, b"a", array.dtype.str.encode())
-    _feed(hasher, list(array.shape))
-    hasher.update(array.reshape(-1).view(np.uint8).data if array.size else b"")
+    def _add_items(self, value: list[Any] | tuple[Any, ...]) -> None:
+        self._pending += b"l" + _LENGTH(len(value))
+        for item in value:
+            self.add(item)
+
+    def _add_mapping(self, value: Mapping[str, Any]) -> None:
+        self._pending += b"m" + _LENGTH(len(value))
+        for name in value:
+            if not isinstance(name, str):
+                raise TypeError(f"cannot digest a mapping with a key of type {type(name).__name__}")
+        for name in sorted(value):
+            self._tagged(b"k", name.encode())
+            self.add(value[name])
+
+    def _add_array(self, array: np.ndarray) -> None:
+        if array.dtype.hasobject:
+            raise TypeError("cannot digest an array of Python objects")
+        array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+        self._tagged(b"a", array.dtype.str.encode())
+        self._add_items(array.shape)
+        self._hasher.update(self._pending)
+        self._pending.clear()
+        flat = array.reshape(-1)
+        rows = max(1, CHUNK_BYTES // array.dtype.itemsize) if array.dtype.itemsize else 1
+        for start in range(0, flat.size, rows):  # in blocks that stay in the processor's cache
+            block = flat[start : start + rows]
+            if array.dtype.kind in "fc" and np.isnan(block).any():
+                block = np.where(np.isnan(block), np.array(np.nan, array.dtype), block)
+            self._hasher.update(block.view(np.uint8).data)
+
+
+_ENCODERS: dict[type, Callable[[_Encoder, Any], None]] = {
+    str: lambda encoder, value: encoder._tagged(b"s", value.encode()),
+    bool: lambda encoder, value: encoder._tagged(b"b", b"\x01" if value else b"\x00"),
+    int: lambda encoder, value: encoder._tagged(b"i", str(value).encode()),
+    float: lambda encoder, value: encoder._tagged(b"f", _FLOAT(float("nan") if value != value else value)),
+    type(None): lambda encoder, value: encoder._tagged(b"0", b""),
+    bytes: lambda encoder, value: encoder._tagged(b"y", value),
+    list: _Encoder._add_items,
+    tuple: _Encoder._add_items,
+    dict: _Encoder._add_mapping,
+    np.ndarray: _Encoder._add_array,
+}

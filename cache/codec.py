@@ -2,7 +2,8 @@
 
 Arrays become Zarr arrays (blosc-lz4 with shuffle, chunks of about 4 MiB along the first axis; small ones are one plain
 chunk); every other field goes, with the type's name, into the group's attributes as JSON. Nothing is ever unpickled:
-reading an object can build only dataclasses of this package's own modules.
+reading an object can build only dataclasses of this package's own modules, and takes no more memory than what is
+stored can hold.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import dataclasses
 import importlib
 import json
 import math
+import os
+import stat
 import typing
 from pathlib import Path
 from typing import Any
@@ -19,9 +22,17 @@ import numpy as np
 
 CHUNK_BYTES = 4 << 20
 PLAIN_BYTES = 64 << 10
-"""Smaller arrays are not compressed, so that plans and figures can be read back without loading Zarr."""
+"""Smaller arrays are not compressed, and are written and read without loading Zarr."""
+MOST_COMPRESSION = 256
+"""More than lz4 can gain: an array that claims to hold more than so many times its files is refused."""
 TRUSTED_PREFIXES = ("ss_flow.", "ss_flow_")
-FORMAT = 1
+FORMAT = 2
+MOST_HEADER_BYTES = 64 << 20
+DTYPES = frozenset(
+    ["bool", "complex64", "complex128", *(f"float{n}" for n in (16, 32, 64))]
+    + [f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64)]
+)
+"""What arrays may hold."""
 
 
 def write(value: Any, folder: Path) -> None:
@@ -29,9 +40,6 @@ def write(value: Any, folder: Path) -> None:
 
     Raises TypeError for a value that is not a dataclass, or a field that neither Zarr nor JSON can hold.
     """
-    import zarr
-    from zarr.codecs import BloscCodec
-
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         raise TypeError(f"a task returned {type(value).__name__}; only dataclasses of arrays are stored")
     kind = type(value)
@@ -40,89 +48,159 @@ def write(value: Any, folder: Path) -> None:
     for item in dataclasses.fields(value):
         content = getattr(value, item.name)
         if isinstance(content, np.ndarray):
+            if content.dtype.name not in DTYPES:
+                raise TypeError(f"{kind.__name__}.{item.name} holds {content.dtype}, which is not stored")
             arrays[item.name] = content
         else:
             attributes[item.name] = _plain(content, f"{kind.__name__}.{item.name}")
     header = {"format": FORMAT, "type": f"{kind.__module__}:{kind.__qualname__}", "values": attributes}
-    group = zarr.create_group(store=folder, zarr_format=3, attributes=header)
-    compressor = BloscCodec(cname="lz4", clevel=5, shuffle="shuffle")
+    folder.mkdir()
     for name, array in arrays.items():
-        stored = group.create_array(
-            name,
-            shape=array.shape,
-            dtype=array.dtype,
-            chunks=_chunks(array),
-            compressors=None if array.nbytes <= PLAIN_BYTES and array.dtype.kind in "biuf" else compressor,
-            fill_value=0,
-        )
-        if array.size:
-            stored[...] = array
+        if array.nbytes <= PLAIN_BYTES:
+            _write_plain(array, folder / name)
+        else:
+            _write_zarr(array, folder / name)
+    group = {"zarr_format": 3, "node_type": "group", "attributes": header}
+    (folder / "zarr.json").write_text(json.dumps(group))
+
+
+def _write_plain(array: np.ndarray, folder: Path) -> None:
+    """One chunk, not compressed, as Zarr would write it."""
+    dtype = array.dtype.newbyteorder("<")
+    zero: Any = [0.0, 0.0] if dtype.kind == "c" else False if dtype.kind == "b" else 0.0 if dtype.kind == "f" else 0
+    header = {
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": array.shape,
+        "data_type": dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [max(1, n) for n in array.shape]}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},
+        "fill_value": zero,
+        "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}],
+        "attributes": {},
+        "storage_transformers": [],
+    }
+    if dtype.itemsize == 1:
+        header["codecs"] = [{"name": "bytes"}]
+    folder.mkdir()
+    (folder / "zarr.json").write_text(json.dumps(header))
+    if array.size:
+        (folder / _only_chunk(array.shape)).write_bytes(np.ascontiguousarray(array, dtype).tobytes())
+
+
+def _only_chunk(shape: tuple[int, ...]) -> str:
+    return ".".join(["c", *("0" for _ in shape)])
+
+
+def _write_zarr(array: np.ndarray, folder: Path) -> None:
+    import zarr
+    from zarr.codecs import BloscCodec
+
+    stored = zarr.create_array(
+        folder,
+        shape=array.shape,
+        dtype=array.dtype,
+        chunks=_chunks(array),
+        compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
+        fill_value=0,
+        config={"write_empty_chunks": True},  # so that what is stored tells how much there is
+    )
+    stored[...] = array
 
 
 def read(folder: Path) -> Any:
     """Read what `write` wrote. Arrays come back read-only, since the store shares them between tasks.
 
-    Raises ValueError when the type is not one of this package's dataclasses, or was written by another format.
+    Raises ValueError when it is damaged, of a type that is not one of this package's dataclasses, or was written by
+    another format.
     """
     try:
-        header: dict[str, Any] = json.loads((folder / "zarr.json").read_bytes())["attributes"]
-    except (OSError, ValueError, KeyError) as error:
+        header: dict[str, Any] = json.loads(_read_file(folder / "zarr.json", MOST_HEADER_BYTES))["attributes"]
+        form, name, content = header.get("format"), header["type"], header["values"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{folder}: not a stored object ({error})") from None
-    if header.get("format") != FORMAT:
-        raise ValueError(f"{folder}: object format {header.get('format')}, this version reads format {FORMAT}")
-    kind = type_named(header["type"])
+    if form != FORMAT:
+        raise ValueError(f"{folder}: object format {form}, this version reads format {FORMAT}")
+    kind = type_named(name)
     hints = typing.get_type_hints(kind)
-    values = {name: _restored(content, hints[name]) for name, content in header["values"].items()}
-    for array in sorted(path.parent for path in folder.glob("*/zarr.json")):
-        content = _read_plain(array)
-        content = _read_zarr(array) if content is None else content
-        content.flags.writeable = False
-        values[array.name] = content
-    return kind(**values)
+    try:
+        values = {item.name: _field(folder, item.name, content, hints) for item in dataclasses.fields(kind)}
+        return kind(**values)
+    except (OSError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError) as error:
+        raise ValueError(f"{folder}: damaged; {type(error).__name__}: {error}") from None
+
+
+def _field(folder: Path, name: str, content: dict[str, Any], hints: dict[str, Any]) -> Any:
+    if name in content:
+        return _restored(content[name], hints[name])
+    array = _read_array(folder / name)
+    array.flags.writeable = False
+    return array
+
+
+def _read_array(folder: Path) -> np.ndarray:
+    header = json.loads(_read_file(folder / "zarr.json", MOST_HEADER_BYTES))
+    shape = tuple(int(n) for n in header["shape"])
+    chunk = tuple(int(n) for n in header["chunk_grid"]["configuration"]["chunk_shape"])
+    codecs = [codec["name"] for codec in header["codecs"]]
+    if (
+        header["data_type"] not in DTYPES
+        or codecs not in (["bytes"], ["bytes", "blosc"])
+        or any(not 1 <= c <= max(n, 1) for n, c in zip(shape, chunk, strict=True))
+    ):
+        raise ValueError(f"{folder}: damaged; no array of ours is {header['data_type']} {shape} in {chunk} {codecs}")
+    dtype = np.dtype(header["data_type"])
+    declared = math.prod(shape) * dtype.itemsize
+    if codecs != ["bytes"]:
+        stored = sum(f.stat().st_size for f in (folder / "c").rglob("*") if f.is_file())
+        if declared > MOST_COMPRESSION * stored:
+            raise ValueError(f"{folder}: damaged; {declared} bytes are declared, but {stored} stored")
+        return _read_zarr(folder)
+    if not declared:
+        return np.zeros(shape, dtype)
+    content = _read_file(folder / _only_chunk(shape), declared)
+    if len(content) != declared:
+        raise ValueError(f"{folder}: damaged; {len(content)} bytes where there should be {declared}")
+    return np.frombuffer(content, dtype.newbyteorder("<")).reshape(shape)
 
 
 def _read_zarr(folder: Path) -> np.ndarray:
     import zarr
 
-    stored = zarr.open_array(store=folder, mode="r", zarr_format=3)
-    return np.asarray(stored[...])
+    return np.asarray(zarr.open_array(store=folder, mode="r", zarr_format=3)[...])
 
 
-def _read_plain(folder: Path) -> np.ndarray | None:
-    """An array whose one chunk is not compressed; None for any other. Zarr leaves out a chunk that is all zeros."""
-    header = json.loads((folder / "zarr.json").read_bytes())
-    shape = tuple(header["shape"])
-    chunk = tuple(header["chunk_grid"]["configuration"]["chunk_shape"])
-    codecs = [(codec["name"], codec.get("configuration", {}).get("endian", "little")) for codec in header["codecs"]]
-    if codecs != [("bytes", "little")] or (chunk != shape and 0 not in shape):
-        return None
-    dtype = np.dtype(header["data_type"]).newbyteorder("<")
-    path = folder.joinpath("c", *("0" for _ in shape))
-    if 0 in shape or not path.exists():
-        return np.zeros(shape, dtype)
-    content = np.frombuffer(path.read_bytes(), dtype)
-    if content.size != math.prod(shape):
-        raise ValueError(f"{folder}: damaged; {content.size} values where there should be {math.prod(shape)}")
-    return content.reshape(shape)
+def _read_file(path: Path, most: int) -> bytes:
+    """A regular file of limited size: no pipe that never ends, no link to a device."""
+    status = os.lstat(path)
+    if not stat.S_ISREG(status.st_mode) or status.st_size > most:
+        raise ValueError(f"{path}: damaged; {status.st_size} bytes, where {most} are the most")
+    with open(path, "rb") as stream:
+        return stream.read(most)
 
 
 def type_named(name: str) -> type:
-    """The dataclass that a stored object names as "module:class"."""
-    module, _, qualified = name.partition(":")
+    """The dataclass that a stored object names as "module:class".
+
+    Raises ValueError when it is not a dataclass of this package's own modules.
+    """
+    module, _, qualified = str(name).partition(":")
     if not module.startswith(TRUSTED_PREFIXES):
         raise ValueError(f"refused to build an object of the foreign type {name}")
-    found: Any = importlib.import_module(module)
-    for part in qualified.split("."):
-        found = getattr(found, part)
-    if not dataclasses.is_dataclass(found):
-        raise ValueError(f"{name} is not a dataclass")
-    return typing.cast(type, found)
+    try:
+        found: Any = importlib.import_module(module)
+        for part in qualified.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError):
+        raise ValueError(f"there is no type {name}") from None
+    if not dataclasses.is_dataclass(found) or not isinstance(found, type) or found.__module__ != module:
+        raise ValueError(f"{name} is not a dataclass of its module")
+    return found
 
 
 def _chunks(array: np.ndarray) -> tuple[int, ...]:
-    row_bytes = max(1, array.nbytes // max(1, len(array))) if array.ndim else 1
-    rows = max(1, CHUNK_BYTES // row_bytes)
-    return (min(max(1, len(array)), rows), *(max(1, n) for n in array.shape[1:])) if array.ndim else ()
+    row_bytes = max(1, array.nbytes // max(1, len(array)))
+    return (min(len(array), max(1, CHUNK_BYTES // row_bytes)), *array.shape[1:])
 
 
 def _plain(content: Any, where: str) -> Any:

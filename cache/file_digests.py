@@ -4,17 +4,20 @@ Notes
 -----
 *Concurrent writers.* Each saves the whole table by rename; what the loser had learnt is learnt again.
 
+*A damaged table* is noticed by its own digest, and learnt again.
+
 *A file changed within the clock's resolution, at equal size*, is missed; `verify=True` reads every file again.
 """
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from ss_flow.cache.canonical import digest_file
+from ss_flow.cache.canonical import digest, digest_file
 from ss_flow.cache.store import write_atomically
 
 T = TypeVar("T")
@@ -27,21 +30,18 @@ class FileDigests:
         self._table = table
         self._verify = verify
         self._changed = False
-        try:
-            self._known: dict[str, list[object]] = json.loads(table.read_text())
-        except (FileNotFoundError, ValueError):
-            self._known = {}
+        self._known: dict[str, list[object]] = _read(table)
 
     def __call__(self, path: Path) -> str:
         """The blake3 digest of a file. Raises OSError when it cannot be read."""
-        path = path.resolve()
-        status = path.stat()
+        place = os.path.abspath(path)
+        status = os.stat(place)
         stamp: list[object] = [status.st_size, status.st_mtime_ns, status.st_ino]
-        known = self._known.get(str(path))
+        known = self._known.get(place)
         if known is not None and known[:3] == stamp and not self._verify:
             return str(known[3])
-        content = digest_file(path)
-        self._known[str(path)] = [*stamp, content]
+        content = digest_file(place)
+        self._known[place] = [*stamp, content]
         self._changed = True
         return content
 
@@ -54,6 +54,16 @@ class FileDigests:
             self._changed = True
 
     def save(self) -> None:
+        """Write the table, if anything was learnt."""
         if self._changed:
-            write_atomically(self._table, json.dumps(self._known, separators=(",", ":")))
+            write_atomically(self._table, json.dumps({"digest": digest(self._known), "files": self._known}))
             self._changed = False
+
+
+def _read(table: Path) -> dict[str, list[object]]:
+    try:
+        content = json.loads(table.read_bytes())
+        known: dict[str, list[object]] = content["files"]
+        return known if digest(known) == content["digest"] else {}
+    except (FileNotFoundError, ValueError, TypeError, KeyError):
+        return {}

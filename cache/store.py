@@ -2,32 +2,41 @@
 
     objects/aa/<digest>/    Zarr groups
     actions/aa/<key>.json   key -> output digests, the key's components, seconds, memory, host, warnings
+    closures/<digest>.json  which definitions a digest of code stands for
     claims/<key>            who is computing what, now
-    roots/runs/             a manifest and an event log for every run
+    roots/runs/, roots/pins/    what must be kept: a manifest and an event log for every run; what the user pinned
     checkpoints/            what long tasks keep of half-done work, by key
     tmp/                    what is being written
 
 Notes
 -----
-*Crash.* An object or an action appears by one rename of something complete and fsynced; what a killed process leaves is
-in tmp/, and is never read. The action comes after all of its objects.
+*Crash.* An object or an action appears by one rename of something complete; what a killed process leaves is in tmp/,
+and is never read. The action comes after all of its objects.
+
+*Power cut, failing disk, foreign hands.* Nothing is synced; everything is checked when it is read: an object whose
+content is not what its name says is taken out, and its maker runs again.
 
 *Concurrent writers.* Two processes that write the same object write the same bytes; the loser of the rename discards
 its copy. Readers never lock.
 
-*Full disk.* The write fails with OSError before anything is visible; the store stays as it was.
+*Full disk.* The write fails with StoreFailure before anything is visible; the store stays as it was.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import os
+import re
 import shutil
 import socket
 import threading
+import time
 import uuid
 from collections import OrderedDict
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +44,26 @@ import numpy as np
 
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import digest
+from ss_flow.cache.claims import Claims
+from ss_flow.cache.errors import Gone, writing
 
 MEMORY_BYTES = 2 << 30
 """How much of what was read lately a process keeps in memory."""
+GRACE_SECONDS = 3600.0
+"""What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Something that a store holds."""
+
+    name: str
+    """The digest of an object, or the key of an action."""
+    used: float
+    """When it was last written or used, by the clock that stamps the store's files (about a quarter of the grace
+    period behind, at most)."""
+    bytes: int
 
 
 @dataclass(frozen=True)
@@ -50,8 +76,9 @@ class Action:
     """Digests of the results, in order."""
     is_list: bool
     """Whether the task returned a list (of any length) rather than one artifact."""
-    components: dict[str, dict[str, Any]]
-    """What the key is the digest of: code, parameters, inputs, packages, environment."""
+    components: dict[str, Any]
+    """What the key is the digest of: task, code (of which only the digest), parameters, inputs, packages, environment.
+    """
     seconds: float
     peak_rss_mb: float
     host: str = field(default_factory=socket.gethostname)
@@ -70,7 +97,9 @@ class Store:
         self._recent: OrderedDict[str, Any] = OrderedDict()
         self._held = 0
         self._lock = threading.Lock()
-        for name in ("objects", "actions", "claims", "roots/runs", "tmp"):
+        self._actions = f"{root}/actions"
+        self._objects = f"{root}/objects"
+        for name in ("objects", "actions", "closures", "claims", "roots/runs", "roots/pins", "tmp"):
             (root / name).mkdir(parents=True, exist_ok=True)
 
     def object_path(self, object_digest: str) -> Path:
@@ -79,39 +108,104 @@ class Store:
     def action_path(self, key: str) -> Path:
         return self.root / "actions" / key[:2] / f"{key}.json"
 
+    @property
+    def location(self) -> str:
+        """Where the store is, as `open_store` takes it."""
+        return str(self.root)
+
+    def checkpoint(self, key: str) -> Path:
+        """Where a long task may keep half-done work."""
+        return self.root / "checkpoints" / f"{key}.npz"
+
+    def open_claims(self) -> Claims:
+        """The claims of this process."""
+        return Claims(self.root)
+
     def __contains__(self, object_digest: str) -> bool:
-        return self.object_path(object_digest).is_dir()
+        return os.path.isdir(f"{self._objects}/{object_digest[:2]}/{object_digest}")
 
     def put(self, value: Any) -> str:
-        """Store a dataclass of arrays; return its digest. Storing the same content again costs only the hashing."""
+        """Store a dataclass of arrays; return its digest. Storing the same content again costs only the hashing.
+
+        Raises StoreFailure when it cannot be written, TypeError for a value that cannot be stored.
+        """
         object_digest = digest(value)
         target = self.object_path(object_digest)
-        if not target.is_dir():
-            temporary = self.root / "tmp" / uuid.uuid4().hex
+        with writing(self.root):
             try:
-                codec.write(value, temporary)
-                _sync_tree(temporary)
-                target.parent.mkdir(exist_ok=True)
-                _rename_folder(temporary, target)
-            finally:
-                shutil.rmtree(temporary, ignore_errors=True)
+                os.utime(target)  # used again: it must not be collected before its action is recorded
+            except FileNotFoundError:
+                with self.temporary() as place:
+                    codec.write(value, place)
+                    target.parent.mkdir(exist_ok=True)
+                    _rename_folder(place, target)
         return object_digest
 
     def get(self, object_digest: str) -> Any:
         """The stored value. Shared between callers: its arrays are read-only.
 
-        Raises KeyError when the store holds no such object.
+        Raises Gone when the store holds no such object, or one that is damaged, which is then taken out.
         """
         with self._lock:
             if object_digest in self._recent:
                 self._recent.move_to_end(object_digest)
                 return self._recent[object_digest]
-        path = self.object_path(object_digest)
-        if not path.is_dir():
-            raise KeyError(f"no object {object_digest} in {self.root}")
-        value = codec.read(path)
+        value = self.read(object_digest)
         self._remember(object_digest, value)
         return value
+
+    def read(self, object_digest: str) -> Any:
+        """The same, from the disk."""
+        if object_digest not in self:
+            raise Gone(object_digest, "is not in the store")
+        try:
+            value = codec.read(self.object_path(object_digest))
+        except ValueError as error:
+            self.discard(object_digest)
+            raise Gone(object_digest, f"was damaged ({error})") from None
+        if digest(value) != object_digest:
+            self.discard(object_digest)
+            raise Gone(object_digest, "was damaged (its content is not what its name says)")
+        return value
+
+    def discard(self, object_digest: str, *, unused_since: float = math.inf) -> bool:
+        """Take an object out, at once for all readers; False when it is not there, or was used since."""
+        with self._lock:
+            if object_digest in self._recent:
+                self._held -= _array_bytes(self._recent.pop(object_digest))
+        return self._take_out(self.object_path(object_digest), unused_since)
+
+    def forget(self, key: str, *, unused_since: float = math.inf) -> bool:
+        """Take an action out, at once for all readers; False when it is not there, or was used since."""
+        return self._take_out(self.action_path(key), unused_since)
+
+    def _take_out(self, path: Path, unused_since: float) -> bool:
+        with writing(self.root), self.temporary() as place:
+            try:
+                path.rename(place)
+            except FileNotFoundError:
+                return False
+            if place.stat().st_mtime < unused_since:
+                return True
+            with contextlib.suppress(OSError):  # back again, unless someone has just made it anew
+                place.rename(path)
+            return False
+
+    def objects(self) -> Iterator[Entry]:
+        """Every object."""
+        for folder in _entries(self._objects):
+            for entry in _entries(folder.path):
+                with contextlib.suppress(FileNotFoundError):
+                    size = sum(f.stat().st_size for f in Path(entry.path).rglob("*") if f.is_file())
+                    yield Entry(entry.name, entry.stat().st_mtime, size)
+
+    def actions(self) -> Iterator[Entry]:
+        """Every action."""
+        for folder in _entries(self._actions):
+            for entry in _entries(folder.path):
+                with contextlib.suppress(FileNotFoundError):
+                    status = entry.stat()
+                    yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)
 
     def _remember(self, object_digest: str, value: Any) -> None:
         size = _array_bytes(value)
@@ -124,30 +218,103 @@ class Store:
                 self._held -= _array_bytes(self._recent.popitem(last=False)[1])
 
     def action(self, key: str, *, whole: bool = True) -> Action | None:
-        """The record under a key, or None when there is none; with `whole`, also when one of its outputs is gone."""
+        """The record under a key, or None when there is none; with `whole`, also when one of its outputs is gone.
+
+        A whole one counts as used now.
+        """
+        path = f"{self._actions}/{key[:2]}/{key}.json"
         try:
-            record = json.loads(self.action_path(key).read_text())
-        except FileNotFoundError:
+            with open(path, "rb") as stream:
+                modified = os.fstat(stream.fileno()).st_mtime
+                record = json.loads(stream.read())
+            action = _action_of(record, key)
+        except (FileNotFoundError, ValueError, TypeError, KeyError):  # not there, or not one of ours
             return None
-        record["outputs"], record["warnings"] = tuple(record["outputs"]), tuple(record["warnings"])
-        action = Action(**record)
-        return action if not whole or all(output in self for output in action.outputs) else None
+        if not whole:
+            return action
+        if not all(output in self for output in action.outputs):
+            return None
+        if time.time() - modified > GRACE_SECONDS / 4:
+            with contextlib.suppress(OSError):
+                for used in (path, *(self.object_path(output) for output in action.outputs)):
+                    os.utime(used)
+        return action
 
     def record(self, action: Action) -> None:
         """Publish an action; its outputs must be stored already."""
-        write_atomically(self.action_path(action.key), json.dumps(asdict(action), separators=(",", ":")))
+        self._write(self.action_path(action.key), json.dumps(vars(action), separators=(",", ":")))
+
+    def put_closure(self, code: str, closure: dict[str, str]) -> None:
+        """Keep which definitions a digest of code stands for."""
+        if not self._closure_path(code).exists():
+            self._write(self._closure_path(code), json.dumps(closure, separators=(",", ":")))
+
+    def closure(self, code: str) -> dict[str, str]:
+        """The digests of definitions, by qualified name, that a digest of code stands for; {} when not known."""
+        try:
+            found: dict[str, str] = json.loads(self._closure_path(code).read_text())
+        except (OSError, ValueError):
+            return {}
+        return found
+
+    def _closure_path(self, code: str) -> Path:
+        return self.root / "closures" / f"{code}.json"
 
     def find(self, prefix: str) -> list[str]:
         """Digests of the stored objects that begin with `prefix` (at least two characters)."""
-        folder = self.root / "objects" / prefix[:2]
-        return sorted(path.name for path in folder.glob(f"{prefix}*")) if len(prefix) >= 2 else []
+        if len(prefix) < 2 or not re.fullmatch("[0-9a-f]+", prefix):
+            return []
+        return sorted(path.name for path in (self.root / "objects" / prefix[:2]).glob(f"{prefix}*"))
 
-    def sweep_temporaries(self, older_than_seconds: float, now: float) -> int:
+    @contextlib.contextmanager
+    def temporary(self) -> Iterator[Path]:
+        """A name in tmp/ for a file or a folder; what is left of it is removed."""
+        place = self.root / "tmp" / uuid.uuid4().hex
+        try:
+            yield place
+        finally:
+            remove(place)
+
+    def _write(self, path: Path, text: str) -> None:
+        with writing(self.root), self.temporary() as place:
+            place.write_text(text, encoding="utf-8")
+            path.parent.mkdir(exist_ok=True)
+            place.replace(path)
+
+    def now(self) -> float:
+        """The time by the clock that stamps the store's files, which may be another host's."""
+        with writing(self.root), self.temporary() as place:
+            place.touch()
+            return place.stat().st_mtime
+
+    def sweep_temporaries(self, older_than_seconds: float = GRACE_SECONDS) -> int:
         """Delete what killed processes left half-written; return how many. A writer at work is left alone by age."""
-        stale = [path for path in (self.root / "tmp").iterdir() if now - path.stat().st_mtime > older_than_seconds]
-        for path in stale:
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-        return len(stale)
+        before = self.now() - older_than_seconds
+        stale = 0
+        for entry in _entries(f"{self.root}/tmp"):
+            with contextlib.suppress(FileNotFoundError):  # its writer has just finished
+                if entry.stat().st_mtime < before:
+                    remove(Path(entry.path))
+                    stale += 1
+        return stale
+
+
+def _entries(folder: str) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as found:
+            return sorted(found, key=lambda entry: entry.name)
+    except FileNotFoundError:
+        return []
+
+
+def remove(path: Path) -> None:
+    """Delete a file or a folder, if it is there."""
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        pass
+    except (IsADirectoryError, PermissionError):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -164,6 +331,17 @@ def write_atomically(path: Path, text: str) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def _action_of(record: dict[str, Any], key: str) -> Action:
+    """Raises ValueError, TypeError or KeyError for what is not the record of this key."""
+    record["outputs"], record["warnings"] = tuple(record["outputs"]), tuple(record["warnings"])
+    action = Action(**record)
+    if action.key != key or not all(map(_DIGEST.fullmatch, action.outputs)):
+        raise ValueError(f"not the record of {key}")
+    if not action.is_list and len(action.outputs) != 1:
+        raise ValueError(f"one output is due, not {len(action.outputs)}")
+    return action
+
+
 def _rename_folder(source: Path, target: Path) -> None:
     try:
         source.rename(target)
@@ -171,16 +349,6 @@ def _rename_folder(source: Path, target: Path) -> None:
         # A folder cannot be renamed onto one that is not empty: another writer was first, with the same bytes.
         if not target.is_dir():
             raise
-
-
-def _sync_tree(folder: Path) -> None:
-    for directory, _, files in os.walk(folder):
-        for name in (*files, "."):
-            handle = os.open(os.path.join(directory, name), os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
 
 
 def _array_bytes(value: Any) -> int:

@@ -1,23 +1,45 @@
-"""The engine as a whole: build a flow, run it against a store, keep a record of the run."""
+"""The engine as a whole: build flows, run them against a store, keep a record of each run."""
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import psutil
 
 from ss_flow.cache.claims import Claims
+from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.store import Store
 from ss_flow.events import JsonLines, Reporter, Reporters
-from ss_flow.executors import open_executor
-from ss_flow.graph import Flow
+from ss_flow.executors import Executor, open_executor
+from ss_flow.graph import Flow, Node
 from ss_flow.keys import Value
-from ss_flow.runs import previous_keys, start_run
-from ss_flow.scheduler import Failure, Scheduler
+from ss_flow.runs import PreviousKeys, settled, start_run
+from ss_flow.scheduler import Failure, Listening, Scheduler
 from ss_flow.task import Resources
+
+RUN_CLAIM = "run-"
+"""What the claim of a living run begins with; its results are not collected."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """One flow to run."""
+
+    build: Callable[[], Mapping[str, Any]]
+    """Called in a flow; returns its outputs by name. Called again when results turn out to be damaged."""
+    scene: str
+    """What the run is about; runs of the same scene are compared by `why`."""
+    header: Mapping[str, Any] = field(default_factory=dict)
+    """What the record of the run should say besides."""
+    until: str | None = None
+    """Run only what this output needs."""
+    reporter: Reporter | None = None
+    """Hears of this flow."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +56,11 @@ class Report:
 
 class _Recorder(Reporter):
     def __init__(self) -> None:
-        self.nodes: list[dict[str, Any]] = []
+        self.events: list[dict[str, Any]] = []
 
     def event(self, kind: str, **details: Any) -> None:
-        if kind in ("hit", "finished", "failed", "skipped", "would run"):
-            self.nodes.append({"event": kind, **details})
+        if kind in ("hit", "finished", "failed", "skipped", "would run", "restarted"):
+            self.events.append({"event": kind, **details})
 
 
 def usable_cores() -> int:
@@ -51,52 +73,167 @@ def run_flow(
     store: Store,
     *,
     scene: str,
-    header: Mapping[str, Any],
+    header: Mapping[str, Any] | None = None,
     until: str | None = None,
-    jobs: int = 0,
-    executor: str = "threads",
     reporter: Reporter | None = None,
+    **options: Any,
+) -> Report:
+    """Run what `build` describes: `run_flows` for one flow, and with its options."""
+    return run_flows([Request(build, scene, header or {}, until, reporter)], store, **options)[0]
+
+
+def run_flows(
+    requests: Sequence[Request],
+    store: Store,
+    *,
+    jobs: int = 0,
+    memory_mb: int = 0,
+    executor: str = "threads",
     dry: bool = False,
     recorded: bool = True,
-) -> Report:
-    """Run what `build` describes.
+    done: Callable[[int, Report], None] = lambda position, report: None,
+) -> list[Report]:
+    """Run several flows as one graph; what they share is computed once. Earlier flows go first.
 
-    build: called in a flow; returns its outputs by name. until: run only what this output needs. jobs: how many cores
-    to use, 0 = all. scene: what the run is about; runs of the same scene are compared by `why`. recorded: whether the
-    run is kept among the store's runs; a question about a result need not be.
-    Raises KeyError when `until` names no output, and KeyboardInterrupt when interrupted; running tasks are then told to
-    stop.
+    jobs: how many cores to use, 0 = all. memory_mb: how much memory tasks may declare together, 0 = what is free.
+    recorded: whether the run is kept among the store's runs; a question about a result need not be. done: called with
+    a flow's position and report as soon as it has ended.
+
+    Raises KeyError when `until` names no output, StoreFailure when the store cannot be used, and KeyboardInterrupt when
+    interrupted: what runs is then told to stop at its next sign of progress, and waited for; a second interrupt does
+    not wait.
     """
-    jobs = jobs or usable_cores()
-    flow = Flow(scene)
-    with flow.building():
-        outputs = dict(build())
-    targets = {until: outputs[until]} if until else outputs
-    runs = store.root / "roots" / "runs"
-    previous = previous_keys(runs, scene)
-    recorder = _Recorder()
-    listeners: list[Reporter] = [recorder, *([reporter] if reporter else [])]
-    folder = ""
-    if recorded and not dry:
-        run = start_run(runs, {"scene": scene, **header})
-        listeners.append(JsonLines(run.folder / "events.jsonl"))
-        folder = str(run.folder)
-    told = Reporters(*listeners)
-    claims = Claims(store.root / "claims")
-    workers = open_executor(executor, jobs, store, told.progressed)
-    capacity = Resources(cores=jobs, memory_mb=psutil.virtual_memory().available >> 20, gpus=1)
-    scheduler = Scheduler(store, claims, workers, told, capacity, previous=previous, dry=dry)
-    told.event("run started", scene=scene)
+    claims = store.open_claims()
+    run = _Run(requests, store, claims, recorded=recorded and not dry, done=done)
+    workers = open_executor(executor, jobs or usable_cores(), store, run.progressed)
+    capacity = Resources(
+        cores=jobs or usable_cores(),
+        memory_mb=memory_mb or psutil.virtual_memory().available >> 20,
+        gpus=min(len(glob.glob("/dev/nvidia[0-9]*")), 1),  # tasks use the first one
+    )
+    store.sweep_temporaries()
     try:
-        outcome = scheduler.run(flow, list(targets.values()))
-        told.event("run ended", failed=len(outcome.failures))
+        while not run.attempt(workers, capacity, memory_is_strict=memory_mb > 0, dry=dry):
+            pass
         workers.close()
-    except BaseException:
-        told.event("run ended", interrupted=True)
-        workers.cancel()
+    except BaseException as error:
+        _stop(workers, run, patiently=isinstance(error, KeyboardInterrupt))
         raise
     finally:
         claims.release_all()
-        told.close()
-    values = {name: outcome.values[node] for name, node in targets.items()}
-    return Report(values, recorder.nodes, outcome.failures, folder)
+        run.close()
+    return run.reports
+
+
+def _stop(workers: Executor, run: _Run, *, patiently: bool) -> None:
+    """Let what runs finish or keep what it has; at the next interrupt do not wait."""
+    workers.cancel()
+    try:
+        with contextlib.suppress(StoreFailure):
+            run.stop()
+            run.tell("run ended", interrupted=True)
+    except KeyboardInterrupt:
+        patiently = False
+    finally:
+        if patiently:
+            workers.close()
+        else:
+            workers.kill()
+
+
+class _Run:
+    """Several requests on their way; attempted again when results of earlier runs turn out to be damaged."""
+
+    def __init__(
+        self,
+        requests: Sequence[Request],
+        store: Store,
+        claims: Claims,
+        *,
+        recorded: bool,
+        done: Callable[[int, Report], None],
+    ) -> None:
+        self._requests, self._store, self._claims, self._done = requests, store, claims, done
+        self._recorders = [_Recorder() for _ in requests]
+        self._folders = ["" for _ in requests]
+        self._healed: set[str] = set()
+        self._flows, self._targets = self._built()
+        self.scheduler: Scheduler | None = None
+        self._reported: dict[int, Report] = {}
+        self._reporters: list[Reporter] = []
+        runs = store.root / "roots" / "runs"
+        self._previous = [PreviousKeys(runs, request.scene) for request in requests]
+        for position, request in enumerate(requests):
+            listeners: list[Reporter] = [self._recorders[position], *([request.reporter] if request.reporter else [])]
+            if recorded:
+                folder = start_run(runs, {"scene": request.scene, **request.header}).folder
+                claims.take(RUN_CLAIM + folder.name)
+                self._folders[position] = str(folder)
+                listeners.append(JsonLines(folder / "events.jsonl", store.root))
+            self._reporters.append(Reporters(*listeners))
+            self._reporters[-1].event("run started", scene=request.scene)
+
+    @property
+    def reports(self) -> list[Report]:
+        return [self._reported[position] for position in range(len(self._requests))]
+
+    def _built(self) -> tuple[list[Flow], list[dict[str, Node]]]:
+        """A flow for each request, and its outputs by name."""
+        flows = [Flow(request.scene) for request in self._requests]
+        targets: list[dict[str, Node]] = []
+        for flow, request in zip(flows, self._requests, strict=True):
+            with flow.building():
+                outputs = dict(request.build())
+            targets.append({request.until: outputs[request.until]} if request.until else outputs)
+        return flows, targets
+
+    def attempt(self, workers: Executor, capacity: Resources, *, memory_is_strict: bool, dry: bool) -> bool:
+        """Run to the end; False when something must be made again first."""
+        if self.scheduler is not None:
+            self._flows, self._targets = self._built()
+        flows, targets = self._flows, self._targets
+        listening = {f: Listening(r, p) for f, r, p in zip(flows, self._reporters, self._previous, strict=True)}
+        scheduler = Scheduler(
+            self._store, self._claims, workers, capacity, listening, memory_is_strict=memory_is_strict, dry=dry
+        )
+        self.scheduler = scheduler
+
+        def ended(flow: Flow) -> None:
+            position = flows.index(flow)
+            values = {name: scheduler.value(node) for name, node in targets[position].items()}
+            failures = scheduler.failures[flow]
+            self._reporters[position].event("run ended", failed=len(failures))
+            report = Report(values, settled(self._recorders[position].events), failures, self._folders[position])
+            if position not in self._reported:
+                self._done(position, report)
+            self._reported[position] = report
+
+        try:
+            scheduler.run({f: list(t.values()) for f, t in zip(flows, targets, strict=True)}, ended)
+        except Gone as gone:
+            scheduler.drain()
+            if gone.digest in self._healed:
+                raise StoreFailure(f"{gone}, and this run does not make it; run its scene again.") from None
+            self._healed.add(gone.digest)
+            self.tell("restarted", because=str(gone))
+            return False
+        return True
+
+    def progressed(self, key: str, done: int, total: int, note: str) -> None:
+        if self.scheduler is not None:
+            self.scheduler.progressed(key, done, total, note)
+
+    def stop(self) -> None:
+        """Wait for what runs to finish or to keep what it has."""
+        if self.scheduler is not None:
+            self.tell("stopping", running=self.scheduler.running())
+            self.scheduler.drain()
+
+    def tell(self, kind: str, **details: Any) -> None:
+        for reporter in self._reporters:
+            reporter.event(kind, **details)
+
+    def close(self) -> None:
+        for reporter in self._reporters:
+            with contextlib.suppress(OSError):
+                reporter.close()

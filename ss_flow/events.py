@@ -10,13 +10,15 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
+from ss_flow.cache.errors import writing
+
 
 class Reporter:
     """Hears what the scheduler does; this one is silent."""
 
     def event(self, kind: str, **details: Any) -> None:
-        """Something happened to a node (hit, started, finished, failed, skipped, waiting, would run), or to
-        the whole (run started, run ended)."""
+        """Something happened to a node (hit, started, finished, failed, retried, skipped, waiting, would run), or to
+        the whole (run started, restarted, stopping, run ended)."""
 
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
         """A running node is so far; called from any thread."""
@@ -45,14 +47,22 @@ class Reporters(Reporter):
 
 
 class JsonLines(Reporter):
-    """Appends every event to a file, one JSON document a line; a line is complete or absent."""
+    """Appends every event to a file, one JSON document a line; a line is complete or absent.
 
-    def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._stream: IO[str] = path.open("a", encoding="utf-8", buffering=1)
+    Hits come in great numbers and tell nothing new: they are written together with whatever comes next, or at the end.
+    store: the store that holds the file; named when the disk is full.
+    """
+
+    def __init__(self, path: Path, store: Path) -> None:
+        self._store = store
+        self._stream: IO[str] = path.open("a", encoding="utf-8", buffering=1 << 16)
 
     def event(self, kind: str, **details: Any) -> None:
-        self._stream.write(json.dumps({"time": round(time.time(), 3), "event": kind, **details}) + "\n")
+        with writing(self._store):
+            self._stream.write(json.dumps({"time": round(time.time(), 3), "event": kind, **details}) + "\n")
+            if kind != "hit":
+                self._stream.flush()
 
     def close(self) -> None:
-        self._stream.close()
+        with writing(self._store):
+            self._stream.close()

@@ -5,18 +5,18 @@ Only digests and parameters travel to whoever runs a call; inputs are read from 
 
 from __future__ import annotations
 
+import functools
 import importlib
 import threading
 import time
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import psutil
 
+from ss_flow.cache.location import open_store
 from ss_flow.cache.store import Action, Store
 from ss_flow.keys import Components, Value
 from ss_flow.running import Listener, Surroundings, remove_checkpoint, running
@@ -38,7 +38,8 @@ class Invocation:
     components: Components
     resources: Resources
     isolate: bool
-    store: Path
+    store: str
+    """Where the store is, as `open_store` takes it."""
 
 
 class Cancelled(Exception):
@@ -46,17 +47,20 @@ class Cancelled(Exception):
 
 
 def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
-    """Run a call in this thread. Whatever the task raises passes through; nothing is then stored under the key."""
+    """Run a call in this thread. Whatever the task raises passes through; nothing is then stored under the key.
+
+    Raises Gone when an input is no longer in the store.
+    """
     task = find_task(invocation.task)
     arguments = {
         name: store.get(value) if isinstance(value, str) else tuple(store.get(item) for item in value)
         for name, value in invocation.inputs.items()
     }
-    checkpoint = store.root / "checkpoints" / f"{invocation.key}.npz"
+    checkpoint = store.checkpoint(invocation.key)
+    warned: list[str] = []
+    surroundings = Surroundings(listener, max(1, invocation.resources.cores), checkpoint, warned)
     started = time.monotonic()
-    surroundings = Surroundings(listener, max(1, invocation.resources.cores), checkpoint)
-    with running(surroundings), _peak_memory() as peak_mb, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
+    with running(surroundings), _peaks.watching() as peak:
         result = task.function(**arguments, **invocation.parameters)
     seconds = time.monotonic() - started
     items = result if task.returns_list else (result,)
@@ -67,12 +71,22 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
         is_list=task.returns_list,
         components=invocation.components,
         seconds=round(seconds, 3),
-        peak_rss_mb=round(peak_mb(), 1),
-        warnings=tuple(dict.fromkeys(str(w.message) for w in caught if w.category is UserWarning)),
+        peak_rss_mb=round(peak.bytes / 2**20, 1),
+        warnings=tuple(warned),
     )
     store.record(action)
     remove_checkpoint(checkpoint)
     return action
+
+
+def execute_here(invocation: Invocation, listener: Listener) -> Action:
+    """The same in a process that has no store open yet."""
+    return execute(invocation, _store_of_this_process(invocation.store), listener)
+
+
+@functools.cache
+def _store_of_this_process(location: str) -> Store:
+    return open_store(location)
 
 
 def find_task(reference: str) -> Task[..., Any]:
@@ -82,21 +96,51 @@ def find_task(reference: str) -> Task[..., Any]:
     return found
 
 
-@contextmanager
-def _peak_memory() -> Iterator[Callable[[], float]]:
-    """Sample this process's resident memory; the caller gets the peak in MB. Neighbours in the process count too."""
-    process = psutil.Process()
-    peak = process.memory_info().rss
-    done = threading.Event()
+@dataclass(eq=False)
+class _Peak:
+    bytes: int
 
-    def sample() -> None:
-        nonlocal peak
-        while not done.wait(SAMPLE_SECONDS):
-            peak = max(peak, process.memory_info().rss)
 
-    sampler = threading.Thread(target=sample, name="peak-memory", daemon=True)
-    sampler.start()
-    try:
-        yield lambda: max(peak, process.memory_info().rss) / 2**20
-    finally:
-        done.set()
+class _Peaks:
+    """Samples this process's resident memory while anyone wants to know; neighbours in the process count too."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._watched: set[_Peak] = set()
+        self._sampler: threading.Thread | None = None
+
+    @contextmanager
+    def watching(self) -> Iterator[_Peak]:
+        """The caller's peak, complete when the context ends."""
+        peak = _Peak(_resident_bytes())
+        with self._lock:
+            self._watched.add(peak)
+            if self._sampler is None:
+                self._sampler = threading.Thread(target=self._sample, name="peak-memory", daemon=True)
+                self._sampler.start()
+        try:
+            yield peak
+        finally:
+            with self._lock:
+                self._watched.discard(peak)
+            peak.bytes = max(peak.bytes, _resident_bytes())
+
+    def _sample(self) -> None:
+        while True:
+            time.sleep(SAMPLE_SECONDS)
+            with self._lock:
+                now = _resident_bytes() if self._watched else 0
+                for peak in self._watched:
+                    peak.bytes = max(peak.bytes, now)
+
+
+def _resident_bytes() -> int:
+    return int(_process().memory_info().rss)
+
+
+@functools.cache
+def _process() -> psutil.Process:
+    return psutil.Process()
+
+
+_peaks = _Peaks()

@@ -10,11 +10,13 @@ SHOWN_CHARACTERS = 60
 
 
 def first_difference(before: Components, now: Components) -> str:
-    """One phrase that names the first part of a key that changed.
+    """One phrase that names the first part of a key that changed; code as a closure, digests by qualified name.
 
     Ordered from cause to effect: the task's own parameters, its code, packages and machine come before its inputs,
     which may have changed only because of another step. Returns "" when nothing differs.
     """
+    if before["task"] != now["task"]:
+        return "the format of keys changed"
     for name in _changed(before["parameters"], now["parameters"]):
         old, new = (_shown(side["parameters"], name) for side in (before, now))
         return f"parameter {name} {old} -> {new}"
@@ -27,8 +29,6 @@ def first_difference(before: Components, now: Components) -> str:
     for name in _changed(before["environment"], now["environment"]):
         old, new = (_shown(side["environment"], name) for side in (before, now))
         return f"{name} of this machine {old} -> {new}"
-    if before["task"] != now["task"]:
-        return "the format of keys changed"
     for name in changed_inputs(before, now):
         return f"input {name} changed{_which(before['inputs'].get(name), now['inputs'].get(name))}"
     return ""

@@ -7,7 +7,6 @@ comes next, a plain sequence of nodes passed to a task is a list.
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -119,7 +118,7 @@ class Flow:
 
         Raises TypeError when the arguments do not fit the task, or an input is not a node.
         """
-        bound = inspect.signature(task.function).bind(*args, **kwargs)
+        bound = task.signature.bind(*args, **kwargs)
         bound.apply_defaults()
         inputs: dict[str, Node] = {}
         for name in task.inputs:

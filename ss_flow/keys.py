@@ -7,42 +7,82 @@ import functools
 import importlib.metadata
 import platform
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from ss_flow.cache.canonical import digest
 from ss_flow.closure import code_closure
 from ss_flow.task import FileRef, Task
 
-SCHEMA = 1
+SCHEMA = 2
 """Raised when the meaning of keys or of stored objects changes: everything is then computed anew."""
 
-Components = dict[str, dict[str, Any]]
+Components = dict[str, Any]
 Value = tuple[str, ...] | str
 """What an input resolves to: one digest, or the digests of a list."""
 
 
-def components(task: Task[..., Any], inputs: Mapping[str, Value], parameters: Mapping[str, Any]) -> Components:
-    """The parts of the key of one call, as plain data.
+@dataclass(frozen=True)
+class Recipe:
+    """What all calls of a task have in common."""
 
-    Returns task (schema, name), code (digest by qualified name), parameters (by dotted name), inputs (digests by
-    name), packages (version by name), environment (what the task declares of this machine).
-    """
-    flat: dict[str, Any] = {}
-    for name, value in parameters.items():
-        flat |= _flat("" if name == "params" else name, value)
-    return {
-        "task": {"schema": SCHEMA, "name": task.name},
-        "code": code_closure(task.function),
-        "parameters": flat,
-        "inputs": {name: value if isinstance(value, str) else list(value) for name, value in inputs.items()},
-        "packages": {"python": ".".join(platform.python_version_tuple()[:2])} | {n: _version(n) for n in task.uses},
-        "environment": dict(task.environment()) if task.environment else {},
-    }
+    components: Components
+    """task (schema, name), code (the digest of `closure`), packages (version by name), environment (what the task
+    declares of this machine)."""
+    closure: dict[str, str]
+    """Digests of the definitions that the task depends on, by qualified name."""
+    digest: str
+
+    @classmethod
+    def of(cls, task: Task[..., Any]) -> Recipe:
+        closure = code_closure(task.function)
+        parts = {
+            "task": {"schema": SCHEMA, "name": task.name},
+            "code": digest(closure),
+            "packages": {"python": ".".join(platform.python_version_tuple()[:2])} | {n: _version(n) for n in task.uses},
+            "environment": dict(task.environment()) if task.environment else {},
+        }
+        return cls(parts, closure, digest(parts))
 
 
-def key_of(parts: Components) -> str:
-    """The key: the digest of the parts."""
-    return digest(parts)
+class Keys:
+    """Makes the keys of one run. What calls share (a task's recipe, a set of parameters) is digested once."""
+
+    def __init__(self) -> None:
+        self._recipes: dict[int, tuple[object, Recipe]] = {}
+        self._parameters: dict[int, tuple[object, str]] = {}
+
+    def recipe(self, task: Task[..., Any]) -> Recipe:
+        """What all calls of the task have in common."""
+        if id(task) not in self._recipes:
+            self._recipes[id(task)] = (task, Recipe.of(task))
+        return self._recipes[id(task)][1]
+
+    def key(self, task: Task[..., Any], inputs: Mapping[str, Value], parameters: Mapping[str, Any]) -> str:
+        """The key of one call.
+
+        Raises TypeError when a parameter is of a type that has no canonical form.
+        """
+        given = {name: self._digest(name, value) for name, value in parameters.items()}
+        return digest({"recipe": self.recipe(task).digest, "parameters": given, "inputs": inputs})
+
+    def components(
+        self, task: Task[..., Any], inputs: Mapping[str, Value], parameters: Mapping[str, Any]
+    ) -> Components:
+        """All that the key of one call is made from, as plain data: those of the recipe, parameters (by dotted name)
+        and inputs (digests by name)."""
+        flat: dict[str, Any] = {}
+        for name, value in parameters.items():
+            flat |= _flat("" if name == "params" else name, value)
+        plain = {name: value if isinstance(value, str) else list(value) for name, value in inputs.items()}
+        return {**self.recipe(task).components, "parameters": flat, "inputs": plain}
+
+    def _digest(self, name: str, value: Any) -> str:
+        if not dataclasses.is_dataclass(value):
+            return digest(_flat(name, value))
+        if id(value) not in self._parameters:  # kept together with the value, so that its id is not used again
+            self._parameters[id(value)] = (value, digest(_flat(name, value)))
+        return self._parameters[id(value)][1]
 
 
 def _flat(name: str, value: Any) -> dict[str, Any]:

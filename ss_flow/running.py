@@ -6,7 +6,9 @@ nothing is kept.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -33,6 +35,8 @@ class Surroundings:
     cores: int = 1
     checkpoint: Path | None = None
     """Where the task's half-done work lies, if there is any."""
+    warned: list[str] | None = None
+    """Collects what the task warns of; None = Python's own warnings do."""
 
 
 _ALONE = Surroundings()
@@ -59,20 +63,31 @@ def cores() -> int:
     return _surroundings.get().cores
 
 
+def warn(message: str) -> None:
+    """Say something that whoever uses the result should know; it is kept in the record of the result."""
+    warned = _surroundings.get().warned
+    if warned is None:
+        warnings.warn(message, stacklevel=2)
+    elif message not in warned:
+        warned.append(message)
+
+
 def save_checkpoint(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Keep half-done work for the next try at the same key; it takes the place of what was kept before.
 
-    A crash leaves the old checkpoint or the new one. The runner removes it when the task is done.
+    A crash leaves the old checkpoint or the new one. The runner removes it when the task is done. Where it cannot be
+    written, the old one stays.
     """
     path = _surroundings.get().checkpoint
     if path is None:
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with unfinished(path).open("wb") as stream:
-        np.savez(stream, **arrays)  # type: ignore[arg-type]
-        stream.flush()
-        os.fsync(stream.fileno())
-    unfinished(path).replace(path)
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with unfinished(path).open("wb") as stream:
+            np.savez(stream, **arrays)  # type: ignore[arg-type]
+            stream.flush()
+            os.fsync(stream.fileno())
+        unfinished(path).replace(path)
 
 
 def unfinished(path: Path) -> Path:
@@ -94,5 +109,5 @@ def load_checkpoint() -> dict[str, NDArray[Any]] | None:
     try:
         with np.load(path, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile):
         return None

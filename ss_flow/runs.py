@@ -6,10 +6,12 @@ that a killed run is known up to its last step).
 
 from __future__ import annotations
 
+import functools
+import itertools
 import json
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,10 @@ from typing import Any
 from ss_flow.cache.store import write_atomically
 
 DONE = ("hit", "finished")
+RUNS_BACK = 5
+"""How many runs `why` looks back."""
+ENDS = (*DONE, "failed", "skipped", "would run")
+"""Kinds of events that say what a node came to."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,22 @@ class Run:
 
     def nodes(self) -> list[dict[str, Any]]:
         """The events of the nodes that have a result."""
-        return [event for event in self.events() if event["event"] in DONE]
+        return [event for event in settled(self.events()) if event["event"] in DONE]
+
+
+def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What each node came to, in order: its last event, unless that only found again what the same run computed.
+
+    A run that found a damaged result starts anew, and then finds again what it had computed before.
+    """
+    last: dict[tuple[str, str], dict[str, Any]] = {}
+    for event in events:
+        if event["event"] in ENDS:
+            node = (event["label"], event.get("key", ""))
+            if last.get(node, event)["event"] != "finished" or event["event"] == "finished":
+                last.pop(node, None)
+                last[node] = event
+    return list(last.values())
 
 
 def start_run(runs: Path, header: dict[str, Any]) -> Run:
@@ -71,13 +92,23 @@ def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
     yield from sorted(found, key=lambda run: run.header["started"], reverse=True)
 
 
-def previous_keys(runs: Path, scene: str) -> dict[str, str]:
-    """The key under which the latest run of a scene found each label's result.
+class PreviousKeys:
+    """The key under which the latest of the runs so far of a scene found each label's result.
 
     A label that the latest run never reached counts with the run before, so that `why` survives an interrupted run.
+    Read when first asked: most runs find everything.
     """
-    keys: dict[str, str] = {}
-    for run, _ in zip(latest_runs(runs, scene), range(5), strict=False):
-        for event in run.nodes():
-            keys.setdefault(event["label"], event["key"])
-    return keys
+
+    def __init__(self, runs: Path, scene: str) -> None:
+        self._latest = list(itertools.islice(latest_runs(runs, scene), RUNS_BACK))
+
+    def __call__(self, label: str) -> str | None:
+        return self._keys.get(label)
+
+    @functools.cached_property
+    def _keys(self) -> dict[str, str]:
+        keys: dict[str, str] = {}
+        for run in self._latest:
+            for event in run.nodes():
+                keys.setdefault(event["label"], event["key"])
+        return keys

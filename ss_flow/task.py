@@ -26,7 +26,8 @@ class Resources:
     most_cores: int = 1
     """Cores that it can make use of; it gets more than `cores` where nothing else waits for them."""
     memory_mb: int = 0
-    gpus: int = 0
+    gpus: float = 0
+    """Share of a GPU that it takes where there is one; where there is none, it does without."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,17 @@ class Task(Generic[P, R]):
         return self.function(*args, **kwargs) if flow is None else typing.cast(R, flow.add(self, args, kwargs))
 
     @functools.cached_property
+    def signature(self) -> inspect.Signature:
+        return inspect.signature(self.function)
+
+    @functools.cached_property
     def inputs(self) -> dict[str, bool]:
         """Names of the artifact parameters, and whether each takes a list."""
         hints = typing.get_type_hints(self.function)
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         return {
             p.name: typing.get_origin(hints[p.name]) is tuple
-            for p in inspect.signature(self.function).parameters.values()
+            for p in self.signature.parameters.values()
             if p.kind in positional
         }
 

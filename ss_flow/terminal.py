@@ -40,8 +40,10 @@ class Terminal(Reporter):
         label = escape(details.get("label", ""))
         if kind == "started":
             self._rows[label] = self._display.add_task(label, total=None, note="")
-        elif kind in ("finished", "failed") and label in self._rows:
+        elif kind in ("finished", "failed", "retried") and label in self._rows:
             self._display.remove_task(self._rows.pop(label))
+        elif kind == "restarted":
+            self._done = 0
         if kind in ("hit", "finished", "failed", "skipped"):
             self._done += 1
             self._display.update(self._all, completed=self._done, total=max(self._done, details.get("known", 0)))
@@ -49,6 +51,11 @@ class Terminal(Reporter):
             self._console.print(f"[green]done[/]  {label:<34} {details['seconds']:8.1f} s", highlight=False)
         elif kind == "failed" and not details["bad_input"]:  # whoever asked for the run tells of bad input, once
             self._console.print(f"[red]failed[/] {label}: {escape(details['error'])}", highlight=False)
+        elif kind in ("retried", "restarted"):
+            self._console.print(f"[yellow]again[/]  {label}: {escape(details['because'])}", highlight=False)
+        elif kind == "stopping" and details["running"]:
+            waiting = f"{len(details['running'])} running steps finish, or keep what they have"
+            self._console.print(f"[yellow]stopping[/] when {waiting}; Ctrl-C again stops at once", highlight=False)
 
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
         if (label := escape(label)) in self._rows:

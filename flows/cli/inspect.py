@@ -42,7 +42,10 @@ class Status:
         )
         for event in events:
             row = steps[event["step"]] if "step" in event else {}
-            if event["event"] == "started":
+            if event["event"] == "restarted":  # what it had found, it finds again
+                for row in steps.values():
+                    row |= {"hit": 0, "skipped": 0, "running": 0}
+            elif event["event"] == "started":
                 row["running"] += 1
             elif event["event"] in row:
                 row[event["event"]] += 1

@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 failed, 2 bad usage or bad input, 3 done but degraded, 130
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -19,6 +20,7 @@ from rich.markup import escape
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
+from ss_flow.cache.errors import StoreFailure  # noqa: E402
 from ss_flow.errors import InputError  # noqa: E402
 from ss_flow.flows.cli.inspect import CacheList, CacheShow, Graph, Status, Why  # noqa: E402
 from ss_flow.flows.cli.query import Query  # noqa: E402
@@ -86,6 +88,9 @@ def main(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         errors.print("[yellow]ss-flow: interrupted; what was finished is kept, and the next run goes on from it.[/]")
         return INTERRUPTED
+    except StoreFailure as error:
+        errors.print(f"[red]ss-flow:[/] {escape(str(error))}")
+        return FAILED
     except BrokenPipeError:
         return 0
     except Exception as error:
@@ -98,6 +103,8 @@ def main(arguments: list[str]) -> int:
 
 def entry() -> None:
     """The console script."""
+    # A cluster's queue asks a job to go by SIGTERM: it then keeps what it has, as after Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     code = main(sys.argv[1:])
     sys.stdout.flush()
     sys.stderr.flush()

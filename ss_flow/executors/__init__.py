@@ -10,10 +10,10 @@ from ss_flow.cache.store import Action, Store
 from ss_flow.errors import InputError
 from ss_flow.execute import Invocation
 
-NAMES = ("threads", "processes")
+NAMES = ("threads", "processes", "dask", "dask://HOST:PORT")
 
 OnProgress = Callable[[str, int, int, str], None]
-"""Called with a node's label, how much is done, of how much, and a note."""
+"""Called from any thread with the key of a call, how much is done, of how much, and a note."""
 
 
 class Executor(Protocol):
@@ -24,7 +24,11 @@ class Executor(Protocol):
         ...
 
     def cancel(self) -> None:
-        """Make running calls stop as soon as they can, without waiting for them."""
+        """Ask running calls to stop at their next sign of progress, without waiting for them."""
+        ...
+
+    def kill(self) -> None:
+        """End running calls at once, where that is possible, without waiting for them."""
         ...
 
     def close(self) -> None:
@@ -33,9 +37,16 @@ class Executor(Protocol):
 
 
 def open_executor(name: str, workers: int, store: Store, on_progress: OnProgress) -> Executor:
-    """The executor "threads" or "processes". Raises InputError for another name."""
-    from ss_flow.executors.local import LocalPool
+    """The executor "threads", "processes", "dask" (a cluster on this machine) or "dask://HOST:PORT".
 
-    if name not in NAMES:
-        raise InputError(f"executor {name!r} is unknown; choose one of: {', '.join(NAMES)}.")
-    return LocalPool(workers, store, on_progress, processes=name == "processes")
+    Raises InputError for another name, or when Dask is not installed or does not answer.
+    """
+    if name in ("threads", "processes"):
+        from ss_flow.executors.local import LocalPool
+
+        return LocalPool(workers, store, on_progress, processes=name == "processes")
+    if name == "dask" or name.startswith("dask://"):
+        from ss_flow.executors.dask import open_dask
+
+        return open_dask(name.removeprefix("dask").removeprefix("://"), workers, on_progress)
+    raise InputError(f"executor {name!r} is unknown; choose one of: {', '.join(NAMES)}.")

@@ -10,7 +10,6 @@ from ss_flow.cache.store import Action, Store
 from ss_flow.execute import Cancelled, Invocation, execute
 from ss_flow.executors import OnProgress
 from ss_flow.executors.worker import Worker
-from ss_flow.running import Listener
 
 
 class LocalPool:
@@ -36,18 +35,19 @@ class LocalPool:
         def listener(done: int, total: int, note: str) -> None:
             if self._cancelled:
                 raise Cancelled(invocation.label)
-            self._on_progress(invocation.label, done, total, note)
+            self._on_progress(invocation.key, done, total, note)
 
         if self._processes or invocation.isolate:
-            return self._run_in_process(invocation, listener)
+            return self._run_in_process(invocation)
+        if self._cancelled:
+            raise Cancelled(invocation.label)
         return execute(invocation, self._store, listener)
 
-    def _run_in_process(self, invocation: Invocation, listener: Listener) -> Action:
-        with self._lock:
-            if self._cancelled:
-                raise Cancelled(invocation.label)
-            worker = self._idle.pop() if self._idle and not invocation.isolate else Worker(self._store.root)
-            self._busy.add(worker)
+    def _run_in_process(self, invocation: Invocation) -> Action:
+        def listener(done: int, total: int, note: str) -> None:
+            self._on_progress(invocation.key, done, total, note)
+
+        worker = self._take_worker(invocation)
         whole = False
         try:
             action = worker.run(invocation, listener)
@@ -56,18 +56,33 @@ class LocalPool:
         finally:
             with self._lock:
                 self._busy.discard(worker)
-                # After a fault the process may be damaged, or still at work on what was given up.
+                # After a fault the process may be damaged.
                 keep = whole and not invocation.isolate and not self._cancelled
                 if keep:
                     self._idle.append(worker)
             if not keep:
                 worker.stop()
 
+    def _take_worker(self, invocation: Invocation) -> Worker:
+        with self._lock:
+            if self._cancelled:
+                raise Cancelled(invocation.label)
+            worker = self._idle.pop() if self._idle and not invocation.isolate else Worker()
+            self._busy.add(worker)
+        return worker
+
     def cancel(self) -> None:
         with self._lock:
             self._cancelled = True
-            running = [*self._busy, *self._idle]
-        for worker in running:
+            busy = list(self._busy)
+        for worker in busy:
+            worker.cancel()
+
+    def kill(self) -> None:
+        self.cancel()
+        with self._lock:
+            workers = [*self._busy, *self._idle]
+        for worker in workers:
             worker.kill()
         self._pool.shutdown(wait=False, cancel_futures=True)
 

@@ -1,21 +1,28 @@
-"""A worker: a spawned process that runs calls one after the other, and says how far it is.
+"""A worker: a process of its own that runs calls one after the other, and says how far it is.
 
-Spawned, never forked: a fork after torch or OpenCV started their threads may hang.
+A fresh interpreter, never a fork: a fork after torch or OpenCV started their threads may hang. It ends by itself when
+whoever started it is gone.
 """
 
 from __future__ import annotations
 
-import multiprocessing
+import contextlib
+import os
+import queue
 import signal
+import subprocess
+import sys
+import threading
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
-from ss_flow.cache.store import Action, Store
-from ss_flow.execute import Invocation, execute
+from ss_flow.cache.store import Action
+from ss_flow.execute import Cancelled, Invocation, execute_here
 from ss_flow.running import Listener
 
 GRACE_SECONDS = 3.0
+_CANCEL = None
 
 
 class WorkerDied(RuntimeError):
@@ -23,19 +30,26 @@ class WorkerDied(RuntimeError):
 
 
 class Worker:
-    """One process. Not for use from several threads at once."""
+    """One process. One call at a time; `cancel` and `kill` may come from any thread."""
 
-    def __init__(self, store: Path) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, remote = context.Pipe()
-        self._process = context.Process(target=_serve, args=(remote, store), daemon=True)
-        self._process.start()
+    def __init__(self) -> None:
+        self._connection, remote = Pipe()
+        self._sending = threading.Lock()
+        program = f"from ss_flow.executors.worker import serve; serve({remote.fileno()})"
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-c", program],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            stdin=subprocess.DEVNULL,
+            stdout=2,  # what a library prints must not get between a document on stdout
+            pass_fds=[remote.fileno()],
+            start_new_session=True,  # Ctrl-C reaches the whole group; the parent decides
+        )
         remote.close()
 
     def run(self, invocation: Invocation, listener: Listener) -> Action:
         """Run a call there; what it raises is raised here. Raises WorkerDied when the process ends."""
         try:
-            self._connection.send(invocation)
+            self._send(invocation)
             while True:
                 kind, content = self._connection.recv()
                 if kind == "progress":
@@ -45,44 +59,70 @@ class Worker:
                 else:
                     return content
         except (EOFError, BrokenPipeError, ConnectionResetError):
-            self._process.join(GRACE_SECONDS)
-            raise WorkerDied(f"the process of {invocation.label} {_ending(self._process.exitcode)}") from None
+            raise WorkerDied(f"the process of {invocation.label} {self._ending()}") from None
+
+    def cancel(self) -> None:
+        """Make the call that runs stop at its next sign of progress."""
+        with contextlib.suppress(OSError):
+            self._send(_CANCEL)
 
     def kill(self) -> None:
-        """End the process, whatever it does; a call that waits for it raises WorkerDied. From any thread."""
-        self._process.terminate()
+        """End the process, whatever it does; a call that waits for it raises WorkerDied."""
+        self._process.kill()
 
     def stop(self) -> None:
-        """End the process, and release what it held: it leaves by itself when idle, and is ended when it does not."""
+        """End the process, and release what it held: it leaves by itself, and is ended when it does not."""
         self._connection.close()
-        self._process.join(GRACE_SECONDS)
-        self._process.terminate()
-        self._process.join(GRACE_SECONDS)
+        try:
+            self._process.wait(GRACE_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _send(self, message: Any) -> None:
+        with self._sending:
+            self._connection.send(message)
+
+    def _ending(self) -> str:
+        try:
+            code = self._process.wait(GRACE_SECONDS)
+        except subprocess.TimeoutExpired:
+            return "no longer answers"
+        if code == -signal.SIGKILL:
+            return "was killed, as happens when memory runs out"
+        return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
 
-def _serve(connection: Connection, root: Path) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    store = Store(root)
+def serve(descriptor: int) -> None:
+    """What the process does: calls come in over the pipe, signs of progress and results go out."""
+    connection = Connection(descriptor)
+    inbox: queue.SimpleQueue[Invocation] = queue.SimpleQueue()
+    cancelled = threading.Event()
+
+    def read() -> None:
+        while True:
+            try:
+                message = connection.recv()
+            except (EOFError, OSError):
+                os._exit(0)  # nobody waits for what runs here
+            if message is _CANCEL:
+                cancelled.set()
+            else:
+                inbox.put(message)
 
     def listener(done: int, total: int, note: str) -> None:
+        if cancelled.is_set():
+            raise Cancelled
         connection.send(("progress", (done, total, note)))
 
+    threading.Thread(target=read, name="inbox", daemon=True).start()
     while True:
+        invocation = inbox.get()
         try:
-            invocation = connection.recv()
-        except EOFError:
-            return
-        try:
-            reply: tuple[str, Any] = ("finished", execute(invocation, store, listener))
+            reply: tuple[str, Any] = ("finished", execute_here(invocation, listener))
         except Exception as error:
             reply = ("raised", error)
         try:
             connection.send(reply)
         except Exception as error:  # what cannot be pickled travels as its text
             connection.send(("raised", RuntimeError(f"{type(reply[1]).__name__}: {reply[1]} ({error})")))
-
-
-def _ending(exit_code: int | None) -> str:
-    if exit_code is not None and exit_code < 0:
-        return f"was ended by {signal.Signals(-exit_code).name}"
-    return f"ended with exit code {exit_code}"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
+from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import concatenate, select
@@ -291,9 +291,8 @@ def _guarded(before: Gaussians, after: Gaussians, views: list[TrainView], ids: I
     old, new = quality(before, views[::step], ids), quality(after, views[::step], ids)
     if new.iou >= old.iou - params.guard_iou and new.psnr >= old.psnr - params.guard_psnr:
         return after
-    warnings.warn(
+    warn(
         f"Refining instances {', '.join(map(str, ids))} together was undone: it took the IoU of their masks from "
-        f"{old.iou:.3f} to {new.iou:.3f} and the PSNR from {old.psnr:.1f} to {new.psnr:.1f} dB.",
-        stacklevel=2,
+        f"{old.iou:.3f} to {new.iou:.3f} and the PSNR from {old.psnr:.1f} to {new.psnr:.1f} dB."
     )
     return before

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks, Int32
 from ss_flow.tasks.gaussians.initialise import initialise
@@ -179,9 +179,7 @@ def _trained(
         seed=instance.instance_id,
     )
     if not len(result.gaussians):
-        warnings.warn(
-            f"Training left nothing of instance {instance.instance_id}; it stays as its points.", stacklevel=2
-        )
+        warn(f"Training left nothing of instance {instance.instance_id}; it stays as its points.")
         return initial
     return result.gaussians
 

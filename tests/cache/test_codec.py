@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from ss_flow.cache import codec
+from ss_flow.cache.canonical import digest
 from ss_flow.tasks.artifacts import Gaussians, LabelMap
 
-KINDS = (np.float32, np.float64, np.int32, np.int64, np.uint8, np.uint16, np.bool_, np.dtype(">i4"))
+KINDS = (*sorted(codec.DTYPES), ">i4", ">f8", ">c8")
 ANY = st.sampled_from(KINDS).flatmap(
-    lambda kind: hnp.arrays(kind, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4))
+    lambda kind: hnp.arrays(np.dtype(kind), hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4))
 )
 
 
@@ -31,6 +32,67 @@ def test_a_small_array_reads_back_as_zarr_reads_it(tmp_path_factory, content):
     assert ours.dtype == theirs.dtype == content.dtype.newbyteorder("=")
     np.testing.assert_array_equal(ours, theirs)
     np.testing.assert_array_equal(ours, content)
+
+
+@dataclass(frozen=True)
+class Everything:
+    """Fields of every kind that is stored."""
+
+    numbers: np.ndarray
+    offsets: np.ndarray
+    """Rows of different lengths, one after the other: row i is numbers[offsets[i]:offsets[i + 1]]."""
+    names: tuple[str, ...]
+    table: dict[str, float]
+    unit: float
+    count: int
+    flag: bool
+    nothing: None = None
+
+
+texts = st.text(st.characters(exclude_categories=["Cs"]))
+
+
+@given(
+    st.lists(st.lists(st.floats(width=32), max_size=4), max_size=4),
+    st.lists(texts, max_size=3),
+    st.dictionaries(texts, st.floats()),
+    st.floats(),
+    st.integers(),
+)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_ragged_rows_texts_and_tables_read_back_equal(tmp_path_factory, rows, names, table, unit, count):
+    value = Everything(
+        np.array([x for row in rows for x in row], np.float32),
+        np.cumsum([0, *map(len, rows)]),
+        tuple(names),
+        table,
+        unit,
+        count,
+        count > 0,
+    )
+    folder = tmp_path_factory.mktemp("codec") / "object"
+    codec.write(value, folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "type_named", lambda name: Everything)
+        back = codec.read(folder)
+    assert digest(back) == digest(value)
+    assert (back.names, back.count, back.flag, back.nothing) == (value.names, value.count, value.flag, None)
+    assert [type(x) for x in vars(back).values()] == [type(x) for x in vars(value).values()]
+
+
+@pytest.mark.parametrize("count", [3, codec.PLAIN_BYTES])
+def test_the_payload_of_a_nan_survives(tmp_path, count):
+    bits = np.full(count, 0x7FC00123, np.uint32)
+    codec.write(LabelMap("x", bits.view(np.float32)), tmp_path / "object")
+    np.testing.assert_array_equal(codec.read(tmp_path / "object").ids.view(np.uint32), bits)
+
+
+@pytest.mark.parametrize(
+    "content", [np.array(["a"]), np.array([b"a"]), np.array(["2026-01-01"], "M8[D]"), np.array([{}])]
+)
+def test_an_array_of_anything_but_numbers_is_refused(tmp_path, content):
+    with pytest.raises(TypeError, match=r"LabelMap\.ids holds .*, which is not stored"):
+        codec.write(LabelMap("x", content), tmp_path / "object")
 
 
 @pytest.mark.parametrize("count", [codec.PLAIN_BYTES // 2, codec.PLAIN_BYTES // 2 + 1, 3 * codec.CHUNK_BYTES])
@@ -48,7 +110,7 @@ def test_a_small_object_is_read_without_zarr(tmp_path, monkeypatch):
 
 def test_a_cut_chunk_is_a_fault_and_not_an_array(tmp_path):
     codec.write(LabelMap("x", np.eye(3, dtype=np.uint16)), tmp_path / "object")
-    chunk = tmp_path / "object/ids/c/0/0"
+    chunk = tmp_path / "object/ids/c.0.0"
     chunk.write_bytes(chunk.read_bytes()[:-2])
     with pytest.raises(ValueError, match="damaged"):
         codec.read(tmp_path / "object")

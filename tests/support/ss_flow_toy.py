@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,3 +107,43 @@ def flow(values=(1.0, 2.0, 3.0), limit=100.0, on_error="fail"):
     numbers = source(values=values)
     squares = each(numbers, build=lambda x: clip(square(x), limit=limit), names=[f"n{i}" for i in range(len(values))])
     return {"squares": squares, "total": total(squares)}
+
+
+@task(resources=Resources(memory_mb=1000))
+def hungry(x: Number) -> Number:
+    time.sleep(0.2)
+    return x
+
+
+@task(isolate=True)
+def killed_once(x: Number, *, marker: str) -> Number:
+    """Dies as by the kernel's out-of-memory killer, the first time."""
+    if not Path(marker).exists():
+        Path(marker).write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+@task(isolate=True)
+def killed(x: Number) -> Number:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+@task(isolate=True)
+def slow_elsewhere(x: Number, *, pid_file: str) -> Number:
+    """Counts in a process of its own, for a long time, and keeps its height."""
+    Path(pid_file).write_text(str(os.getpid()))
+    for i in range(400):
+        time.sleep(0.05)
+        save_checkpoint({"height": np.int64(i)})
+        progress(i, 400)
+    return x
+
+
+@task(isolate=True)
+def deaf(x: Number, *, pid_file: str) -> Number:
+    """Works for a long time without a sign."""
+    Path(pid_file).write_text(str(os.getpid()))
+    time.sleep(60)
+    return x

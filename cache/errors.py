@@ -1,0 +1,37 @@
+"""What can go wrong with a store."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+
+class StoreFailure(OSError):
+    """The store cannot be used any more; says why, and what to do."""
+
+
+class Gone(LookupError):
+    """An object that the store was said to hold is not there, or was damaged and has been taken out."""
+
+    def __init__(self, object_digest: str, reason: str) -> None:
+        super().__init__(object_digest, reason)
+        self.digest, self.reason = object_digest, reason
+
+    def __str__(self) -> str:
+        return f"object {self.digest[:12]} {self.reason}"
+
+
+@contextlib.contextmanager
+def writing(root: Path) -> Iterator[None]:
+    """Within this, an OSError becomes the StoreFailure of the store in this folder."""
+    try:
+        yield
+    except StoreFailure:
+        raise
+    except OSError as error:
+        reason = (error.strerror or str(error)) if (root / "tmp").is_dir() else "it has vanished"
+        raise StoreFailure(
+            f"the store {root} cannot be written: {reason}. What was finished is kept: when there is room "
+            "(`ss-flow cache gc` makes some) and permission, run again to go on."
+        ) from error

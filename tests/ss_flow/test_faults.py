@@ -1,0 +1,281 @@
+"""What can go wrong while a flow runs: damage, full disks, lost processes, too little memory, interrupts."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+import ss_flow_toy as toy
+
+from ss_flow.cache import codec
+from ss_flow.cache.errors import StoreFailure
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+from ss_flow.errors import InputError
+from ss_flow.events import Reporter
+from ss_flow.graph import each
+from ss_flow.runs import latest_runs
+
+
+def run(store, build=toy.flow, **options):
+    return run_flow(build, Store(store.root), scene="toy", **options)
+
+
+def computed(report):
+    return sorted(n["label"] for n in report.nodes if n["event"] == "finished")
+
+
+def flip(store, object_digest, byte=-1):
+    """Flip one bit in the values of a stored object."""
+    chunk = next(store.object_path(object_digest).glob("*/c*"))
+    content = bytearray(chunk.read_bytes())
+    content[byte] ^= 1
+    chunk.write_bytes(content)
+
+
+def one(build):
+    """A flow over one number."""
+    return lambda: {"out": build(toy.source(values=(2.0,))[0])}
+
+
+def test_a_damaged_input_is_made_again_before_it_is_used(store):
+    squares = run(store).values["squares"]
+    flip(store, squares[1])
+    again = run(store, lambda: {"total": toy.total(toy.flow()["squares"]), "half": each_half()})
+    fresh = run(
+        Store(store.root.parent / "fresh"), lambda: {"total": toy.total(toy.flow()["squares"]), "half": each_half()}
+    )
+    assert again.values == fresh.values
+    assert computed(again) == [
+        "ss_flow_toy.half[0]",
+        "ss_flow_toy.half[1]",
+        "ss_flow_toy.half[2]",
+        "ss_flow_toy.square[n1]",
+    ]
+
+
+def each_half():
+    return each(toy.flow()["squares"], build=toy.half)
+
+
+def test_a_damaged_result_that_decides_what_comes_next_is_made_again(store):
+    def build():
+        return {"end": toy.halving(toy.source(values=(10.0,))[0])}
+
+    first = run(store, build)
+    [number] = [n["outputs"][0] for n in first.nodes if n["step"] == "ss_flow_toy.source"]
+    flip(store, number)
+    again = run(store, build)
+    assert again.values == first.values
+    assert computed(again) == ["ss_flow_toy.source"]
+    assert again.nodes[0]["why"] == "its result is no longer in the store"
+    kinds = [event["event"] for event in next(latest_runs(store.root / "roots" / "runs")).events()]
+    assert kinds.count("restarted") == 1
+
+
+def test_bits_flipped_in_many_objects_change_no_result(store):
+    first = run(store)
+    objects = [entry.name for entry in store.objects()]
+    for seed in range(5):
+        for name in random.Random(seed).sample(objects, 3):
+            if name in store:
+                flip(store, name, byte=seed)
+        again = run(store, lambda seed=seed: toy.flow(limit=50.0 + seed))
+        assert again.values == first.values
+        run(store)
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_a_disk_that_is_full_now_and_then_costs_runs_but_no_result(store, executor, monkeypatch):
+    expected = run(Store(store.root.parent / "fresh")).values
+    write, chance = codec.write, random.Random(0)
+
+    def sometimes_full(value, folder):
+        if chance.random() < 0.4:
+            raise OSError(28, "No space left on device")
+        write(value, folder)
+
+    monkeypatch.setattr(codec, "write", sometimes_full)
+    refusals, report = 0, None
+    while report is None and refusals < 40:
+        try:
+            report = run(store, executor=executor)
+        except StoreFailure as failure:
+            refusals += 1
+            assert "No space left on device" in str(failure)
+            assert list((store.root / "claims").iterdir()) == list((store.root / "tmp").iterdir()) == []
+    assert report is not None
+    assert report.values == expected
+    assert refusals or executor == "processes"  # the workers write with a codec of their own
+
+
+def test_a_store_that_vanishes_ends_the_run_with_one_sentence(store):
+    import shutil
+
+    class Vanish(Reporter):
+        def event(self, kind, **details):
+            if kind == "finished":
+                shutil.rmtree(store.root, ignore_errors=True)
+
+    with pytest.raises(StoreFailure, match="it has vanished"):
+        run(store, reporter=Vanish())
+
+
+def test_a_store_on_a_path_with_spaces_and_unicode_works_on_every_executor(tmp_path):
+    store = Store(tmp_path / "ein Örtchen für 数据")
+    values = [run(store, executor=executor).values for executor in ("processes", "threads")]
+    assert values[0] == values[1]
+
+
+def test_tasks_never_declare_more_memory_together_than_the_run_may_use(store):
+    running, most = set(), []
+
+    class Watch(Reporter):
+        def event(self, kind, **details):
+            if kind == "started" and "hungry" in details["step"]:
+                running.add(details["label"])
+                most.append(len(running))
+            elif kind == "finished":
+                running.discard(details["label"])
+
+    def build():
+        return {"all": each(toy.source(values=tuple(map(float, range(4)))), build=toy.hungry)}
+
+    run(store, build, memory_mb=1500, jobs=4, reporter=Watch())
+    assert max(most) == 1
+    with pytest.raises(InputError, match="needs 1000 MB of memory, but the run may use 500 MB"):
+        raise run(Store(store.root.parent / "b"), build, memory_mb=500).failures[0].error
+
+
+def test_a_task_whose_process_was_killed_is_tried_once_more_alone(store, tmp_path):
+    told = []
+
+    class Watch(Reporter):
+        def event(self, kind, **details):
+            if kind in ("retried", "failed"):
+                told.append((kind, details.get("because", details.get("error"))))
+
+    marker = str(tmp_path / "marker")
+    report = run(store, one(lambda x: toy.killed_once(x, marker=marker)), reporter=Watch())
+    assert computed(report) == ["ss_flow_toy.killed_once", "ss_flow_toy.source"]
+    assert told == [
+        ("retried", "WorkerDied: the process of ss_flow_toy.killed_once was killed, as happens when memory runs out")
+    ]
+    told.clear()
+    run(store, one(toy.killed), reporter=Watch())
+    assert [kind for kind, _ in told] == ["retried", "failed"]
+    assert all("memory runs out" in because for _, because in told)
+
+
+PROGRAM = """
+import sys
+sys.path.insert(0, {support!r})
+import ss_flow_toy as toy
+from pathlib import Path
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+x = lambda: toy.source(values=(2.0,))[0]
+run_flow(lambda: {{"out": {call}}}, Store(Path({store!r})), scene="toy", executor={executor!r})
+"""
+
+
+def start(store, call, executor="threads"):
+    support = str(Path(toy.__file__).parent)
+    text = PROGRAM.format(support=support, call=call, store=str(store.root), executor=executor)
+    return subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True)
+
+
+def wait_for(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def claims(store):
+    return [path.name for path in (store.root / "claims").iterdir()]
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_the_first_interrupt_lets_a_task_keep_what_it_has_and_leaves_neither_process_nor_claim(
+    store, tmp_path, executor
+):
+    process = start(store, f"toy.slow_elsewhere(x(), pid_file={str(tmp_path / 'pid')!r})", executor)
+    wait_for(lambda: list(store.root.glob("checkpoints/*.npz")))
+    worker = int((tmp_path / "pid").read_text())
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=20)
+    assert error.strip().endswith("KeyboardInterrupt")
+    assert not psutil.pid_exists(worker)
+    assert claims(store) == []
+    assert len(list(store.root.glob("checkpoints/*.npz"))) == 1
+    events = [event["event"] for event in next(latest_runs(store.root / "roots" / "runs")).events()]
+    assert events[-2:] == ["stopping", "run ended"]
+
+
+def test_the_second_interrupt_does_not_wait(store, tmp_path):
+    process = start(store, f"toy.deaf(x(), pid_file={str(tmp_path / 'pid')!r})")
+    wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+    worker = int((tmp_path / "pid").read_text())
+    process.send_signal(signal.SIGINT)
+    time.sleep(1)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=10)
+    wait_for(lambda: not psutil.pid_exists(worker))
+    assert claims(store) == []
+
+
+def test_a_killed_run_leaves_no_worker_behind(store, tmp_path):
+    process = start(store, f"toy.slow_elsewhere(x(), pid_file={str(tmp_path / 'pid')!r})")
+    wait_for(lambda: list(store.root.glob("checkpoints/*.npz")))
+    worker = int((tmp_path / "pid").read_text())
+    process.kill()
+    process.communicate()
+    wait_for(lambda: not psutil.pid_exists(worker), 5)
+
+
+def test_a_run_goes_on_where_a_killed_one_was(store, tmp_path):
+    process = start(store, f"toy.slow_elsewhere(x(), pid_file={str(tmp_path / 'pid')!r})")
+    wait_for(lambda: list(store.root.glob("checkpoints/*.npz")))
+    process.kill()
+    process.communicate()
+    assert claims(store)
+    report = run(store, lambda: {"source": toy.source(values=(2.0,))})
+    assert computed(report) == []
+    second = start(store, f"toy.slow_elsewhere(x(), pid_file={str(tmp_path / 'pid2')!r})")
+    wait_for(lambda: (tmp_path / "pid2").exists(), 5)  # the claim of the dead holds nobody up
+    second.kill()
+    second.communicate()
+
+
+def test_two_threads_may_run_flows_at_once_on_one_store(store):
+    reports = []
+    threads = [threading.Thread(target=lambda: reports.append(run(store))) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len({json.dumps(report.values) for report in reports}) == 1
+    assert sum(len(computed(report)) for report in reports) == 8
+
+
+def test_the_event_log_names_the_store_when_the_disk_is_full(store, monkeypatch):
+    class Full(Reporter):
+        def event(self, kind, **details):
+            if kind == "started":
+                raise StoreFailure("the store cannot be written: No space left on device")
+
+    with pytest.raises(StoreFailure, match="No space left"):
+        run(store, reporter=Full())
+    assert claims(store) == []
+    assert os.listdir(store.root / "tmp") == []
