@@ -2,7 +2,7 @@
 
 Notes
 -----
-*Concurrent claimants.* A claim is a file created exclusively: one of them wins, the others wait for the action record.
+*Concurrent claimants.* A claim is created exclusively: one of them wins, the others wait for the action record.
 
 *Crash.* A holder touches its claims every few seconds. A claim is stale, and may be taken over, when its process on
 this machine is gone, or when it was not touched while we watched it for `EXPIRY_SECONDS`. Only our own monotonic clock
@@ -21,7 +21,9 @@ import socket
 import threading
 import time
 import uuid
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import psutil
 
@@ -31,125 +33,135 @@ HEARTBEAT_SECONDS = 5.0
 EXPIRY_SECONDS = 60.0
 
 
+@dataclass(frozen=True)
+class Seen:
+    """A claim as it was at one moment."""
+
+    content: bytes
+    """Who holds it."""
+    touched: float
+    """When it was last touched, by the clock of where it lies."""
+    version: Any
+    """Changes with every touch."""
+
+
+class Place(Protocol):
+    """Where the claims of a store lie. Raises StoreFailure when it cannot be used."""
+
+    poll_seconds: float
+    """How often it may be asked for a key that another process holds."""
+
+    def create(self, key: str, content: bytes) -> bool:
+        """Make a claim; False when there is one."""
+        ...
+
+    def look(self, key: str) -> Seen | None:
+        """A claim; None when there is none."""
+        ...
+
+    def touch(self, key: str, seen: Seen) -> None:
+        """Show that the holder lives, unless the claim has changed hands."""
+        ...
+
+    def remove(self, key: str, seen: Seen) -> bool:
+        """Remove a claim; False when it is no longer the one that was seen."""
+        ...
+
+    def claimed(self) -> list[str]:
+        """What is claimed."""
+        ...
+
+
 class Claims:
     """The claims of one process on the keys of one store."""
 
-    def __init__(self, root: Path) -> None:
-        self._root, self._folder = root, str(root / "claims")
+    def __init__(self, place: Path | Place) -> None:
+        """place: a store's folder, or where else its claims lie."""
+        self._place: Place = Folder(place) if isinstance(place, Path) else place
         self._token = json.dumps({**_this_process(), "token": uuid.uuid4().hex}).encode()
         self._held: set[str] = set()
-        self._watched: dict[str, tuple[object, float]] = {}
+        self._watched: dict[str, tuple[Seen, float]] = {}
+        self._refused: dict[str, float] = {}
         self._lock = threading.Lock()
         self._beating: threading.Thread | None = None
         self._stop = threading.Event()
 
     def take(self, key: str) -> bool:
         """Claim a key; False when another living process holds it. Raises StoreFailure."""
-        with writing(self._root):
-            return self._take(key)
-
-    def _take(self, key: str) -> bool:
-        path = f"{self._folder}/{key}"
+        if time.monotonic() - self._refused.get(key, -math.inf) < self._place.poll_seconds:
+            return False
         for _ in range(2):
-            try:
-                handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
-            except FileExistsError:
-                if not self._remove_stale(key):
-                    return False
-            else:
-                try:
-                    os.write(handle, self._token)
-                finally:
-                    os.close(handle)
+            if self._place.create(key, self._token):
+                self._refused.pop(key, None)
                 with self._lock:
                     self._held.add(key)
                 self._beat()
                 return True
+            if not self._remove_stale(key):
+                break
+        self._refused[key] = time.monotonic()
         return False
 
     def release(self, key: str) -> None:
-        """Give a claim back."""
+        """Give a claim back. One that cannot be reached is stale after a while."""
         with self._lock:
             self._held.discard(key)
-        if self._is_ours(key):
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(f"{self._folder}/{key}")
+        with contextlib.suppress(OSError):
+            if (seen := self._ours(key)) is not None:
+                self._place.remove(key, seen)
 
     def release_all(self) -> None:
         """Give every claim back, and stop the heartbeat."""
         self._stop.set()
         for key in list(self._held):
-            with contextlib.suppress(OSError):
-                self.release(key)
+            self.release(key)
 
     def living(self) -> set[str]:
         """The keys that are claimed by processes that may be alive."""
-        return {name for name in self._names() if not self._is_stale(name, self._content(name))}
+        return {key for key, seen in self._all() if not self._is_stale(key, seen)}
 
     def distrust(self, untouched_since: float) -> None:
         """Take claims for stale that were not touched since then, by the clock that stamps the store's files.
 
         For who cannot wait `EXPIRY_SECONDS` to see what another host's claims do.
         """
-        for name in self._names():
-            with contextlib.suppress(FileNotFoundError):
-                status = os.stat(f"{self._folder}/{name}")
-                if status.st_mtime < untouched_since:
-                    self._watched[name] = ((self._content(name), status.st_mtime_ns), -math.inf)
+        for key, seen in self._all():
+            if seen.touched < untouched_since:
+                self._watched[key] = (seen, -math.inf)
 
     def sweep(self, *, dry: bool = False) -> int:
         """Remove stale claims; return how many there are."""
-        stale = [name for name in self._names() if self._is_stale(name, self._content(name))]
+        stale = [key for key, seen in self._all() if self._is_stale(key, seen)]
         return len(stale) if dry else sum(map(self._remove_stale, stale))
 
-    def _names(self) -> list[str]:
-        return [name for name in os.listdir(self._folder) if not name.startswith(".")]
+    def _all(self) -> list[tuple[str, Seen]]:
+        return [(key, seen) for key in self._place.claimed() if (seen := self._place.look(key)) is not None]
 
-    def _content(self, key: str) -> bytes | None:
-        try:
-            with open(f"{self._folder}/{key}", "rb") as stream:
-                return stream.read(4096)
-        except FileNotFoundError:
-            return None
-
-    def _is_ours(self, key: str) -> bool:
-        return self._content(key) == self._token
+    def _ours(self, key: str) -> Seen | None:
+        seen = self._place.look(key)
+        return seen if seen is not None and seen.content == self._token else None
 
     def _remove_stale(self, key: str) -> bool:
         """Whether a claim in the way is gone now."""
-        content = self._content(key)
-        if content is None:
+        seen = self._place.look(key)
+        if seen is None:
             return True  # it was released just now
-        if not self._is_stale(key, content):
+        if not self._is_stale(key, seen):
             return False
         self._watched.pop(key, None)
-        path, aside = f"{self._folder}/{key}", f"{self._folder}/.{uuid.uuid4().hex}"
-        try:
-            os.rename(path, aside)  # of several who find it stale, one moves it
-        except FileNotFoundError:
-            return True
-        with open(aside, "rb") as stream:
-            fresh = stream.read(4096) != content
-        if fresh:  # another one took it over in between: put it back
-            with contextlib.suppress(FileExistsError):
-                os.link(aside, path)
-        os.unlink(aside)
-        return not fresh
+        return self._place.remove(key, seen)
 
-    def _is_stale(self, key: str, content: bytes | None) -> bool:
+    def _is_stale(self, key: str, seen: Seen) -> bool:
         try:
-            stamp = (content, os.stat(f"{self._folder}/{key}").st_mtime_ns)
-            holder = json.loads(content or b"")
+            holder = json.loads(seen.content)
             if holder["host"] == _this_process()["host"] and not _lives(holder["pid"], holder["started"]):
                 return True
-        except FileNotFoundError:
-            return False  # released, or taken over, just now
         except (ValueError, KeyError, TypeError):
             pass  # created but not yet filled in, or its writer died in between: time tells
         now = time.monotonic()
-        before, since = self._watched.setdefault(key, (stamp, now))
-        if before != stamp:
-            self._watched[key] = (stamp, now)
+        before, since = self._watched.setdefault(key, (seen, now))
+        if before != seen:
+            self._watched[key] = (seen, now)
             return False
         return now - since > EXPIRY_SECONDS
 
@@ -165,8 +177,60 @@ class Claims:
             for key in held:
                 # A claim that someone took over as stale (this machine slept) must not be made ours again.
                 with contextlib.suppress(OSError):
-                    if self._is_ours(key):
-                        os.utime(f"{self._folder}/{key}")
+                    if (seen := self._ours(key)) is not None:
+                        self._place.touch(key, seen)
+
+
+class Folder:
+    """Claims as files of a store in a folder."""
+
+    poll_seconds = 0.0
+
+    def __init__(self, root: Path) -> None:
+        self._root, self._folder = root, str(root / "claims")
+
+    def create(self, key: str, content: bytes) -> bool:
+        with writing(self._root):
+            try:
+                handle = os.open(f"{self._folder}/{key}", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+            except FileExistsError:
+                return False
+            try:
+                os.write(handle, content)
+            finally:
+                os.close(handle)
+        return True
+
+    def look(self, key: str) -> Seen | None:
+        with writing(self._root):
+            try:
+                with open(f"{self._folder}/{key}", "rb") as stream:
+                    status = os.fstat(stream.fileno())
+                    return Seen(stream.read(4096), status.st_mtime, status.st_mtime_ns)
+            except FileNotFoundError:
+                return None
+
+    def touch(self, key: str, seen: Seen) -> None:
+        os.utime(f"{self._folder}/{key}")
+
+    def remove(self, key: str, seen: Seen) -> bool:
+        path, aside = f"{self._folder}/{key}", f"{self._folder}/.{uuid.uuid4().hex}"
+        with writing(self._root):
+            try:
+                os.rename(path, aside)  # of several who find it stale, one moves it
+            except FileNotFoundError:
+                return True
+            with open(aside, "rb") as stream:
+                fresh = stream.read(4096) != seen.content
+            if fresh:  # another one took it over in between: put it back
+                with contextlib.suppress(FileExistsError):
+                    os.link(aside, path)
+            os.unlink(aside)
+        return not fresh
+
+    def claimed(self) -> list[str]:
+        with writing(self._root):
+            return [name for name in os.listdir(self._folder) if not name.startswith(".")]
 
 
 @functools.cache

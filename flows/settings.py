@@ -45,7 +45,7 @@ def apply(params: T, assignments: Iterable[str]) -> T:
         if not equals or not name:
             raise InputError(f"--set {assignment!r} is not of the form step.param=value.")
         path = find(params, name.strip())
-        params = _replaced(params, path, _parsed(text.strip(), _type_of(params, path), ".".join(path)))
+        params = _replaced(params, path, _parsed(text.strip(), type_of(params, path), ".".join(path)))
     return params
 
 
@@ -87,7 +87,7 @@ def overlaid(params: T, table: Mapping[str, Any]) -> T:
             params = dataclasses.replace(params, **{name: overlaid(getattr(params, name), value)})  # type: ignore[type-var]
         else:
             path = find(params, name)
-            _check(value, _type_of(params, path), ".".join(path))
+            _check(value, type_of(params, path), ".".join(path))
             params = _replaced(params, path, tuple(value) if isinstance(value, list) else value)
     return params
 
@@ -103,7 +103,8 @@ def _replaced(params: Any, path: Path, value: Any) -> Any:
     return dataclasses.replace(params, **{path[0]: inner})
 
 
-def _type_of(params: Any, path: Path) -> Any:
+def type_of(params: Any, path: Path) -> Any:
+    """The declared type of a parameter, with its range."""
     owner = functools.reduce(getattr, path[:-1], params)
     return typing.get_type_hints(type(owner), include_extras=True)[path[-1]]
 

@@ -6,7 +6,7 @@ import contextlib
 import glob
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import psutil
@@ -18,8 +18,9 @@ from ss_flow.events import JsonLines, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
 from ss_flow.graph import Flow, Node
 from ss_flow.keys import Value
+from ss_flow.resolution import Failure
 from ss_flow.runs import PreviousKeys, settled, start_run
-from ss_flow.scheduler import Failure, Listening, Scheduler
+from ss_flow.scheduler import Listening, Scheduler
 from ss_flow.task import Resources
 
 RUN_CLAIM = "run-"
@@ -95,34 +96,42 @@ def run_flows(
 ) -> list[Report]:
     """Run several flows as one graph; what they share is computed once. Earlier flows go first.
 
-    jobs: how many cores to use, 0 = all. memory_mb: how much memory tasks may declare together, 0 = what is free.
+    jobs: how many cores to use, 0 = all. memory_mb: how much memory tasks may declare together, 0 = what is free. Both
+    are this machine's, or those of the cluster that the executor speaks to.
     recorded: whether the run is kept among the store's runs; a question about a result need not be. done: called with
     a flow's position and report as soon as it has ended.
 
-    Raises KeyError when `until` names no output, StoreFailure when the store cannot be used, and KeyboardInterrupt when
-    interrupted: what runs is then told to stop at its next sign of progress, and waited for; a second interrupt does
-    not wait.
+    Raises KeyError when `until` names no output, StoreFailure when the store cannot be used, ExecutorLost when whoever
+    ran the calls is gone, and KeyboardInterrupt when interrupted: what runs is then told to stop at its next sign of
+    progress, and waited for; a second interrupt does not wait.
     """
-    claims = store.open_claims()
-    run = _Run(requests, store, claims, recorded=recorded and not dry, done=done)
-    workers = open_executor(executor, jobs or usable_cores(), store, run.progressed)
-    capacity = Resources(
-        cores=jobs or usable_cores(),
-        memory_mb=memory_mb or psutil.virtual_memory().available >> 20,
+    with contextlib.ExitStack() as stack:
+        claims = store.open_claims()
+        stack.callback(claims.release_all)
+        run = _Run(requests, store, claims, recorded=recorded and not dry, done=done)
+        stack.callback(run.close)
+        workers = open_executor(executor, jobs or usable_cores(), store, run.progressed)
+        try:
+            room = workers.capacity or _this_machine()
+            capacity = replace(room, cores=jobs or room.cores, memory_mb=memory_mb or room.memory_mb)
+            store.sweep_temporaries()
+            claims.sweep()
+            while not run.attempt(workers, capacity, memory_is_strict=memory_mb > 0, dry=dry):
+                pass
+            workers.close()
+        except BaseException as error:
+            _stop(workers, run, patiently=isinstance(error, KeyboardInterrupt))
+            raise
+        return run.reports
+
+
+def _this_machine() -> Resources:
+    """What there is to use here."""
+    return Resources(
+        cores=usable_cores(),
+        memory_mb=psutil.virtual_memory().available >> 20,
         gpus=min(len(glob.glob("/dev/nvidia[0-9]*")), 1),  # tasks use the first one
     )
-    store.sweep_temporaries()
-    try:
-        while not run.attempt(workers, capacity, memory_is_strict=memory_mb > 0, dry=dry):
-            pass
-        workers.close()
-    except BaseException as error:
-        _stop(workers, run, patiently=isinstance(error, KeyboardInterrupt))
-        raise
-    finally:
-        claims.release_all()
-        run.close()
-    return run.reports
 
 
 def _stop(workers: Executor, run: _Run, *, patiently: bool) -> None:
@@ -162,7 +171,8 @@ class _Run:
         self._reported: dict[int, Report] = {}
         self._reporters: list[Reporter] = []
         runs = store.root / "roots" / "runs"
-        self._previous = [PreviousKeys(runs, request.scene) for request in requests]
+        previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
+        self._previous = [previous[request.scene] for request in requests]
         for position, request in enumerate(requests):
             listeners: list[Reporter] = [self._recorders[position], *([request.reporter] if request.reporter else [])]
             if recorded:

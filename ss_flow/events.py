@@ -23,6 +23,9 @@ class Reporter:
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
         """A running node is so far; called from any thread."""
 
+    def pause(self) -> None:
+        """Nothing happens until some step ends."""
+
     def close(self) -> None:
         """The run is over."""
 
@@ -41,6 +44,10 @@ class Reporters(Reporter):
         for reporter in self._reporters:
             reporter.progressed(label, done, total, note)
 
+    def pause(self) -> None:
+        for reporter in self._reporters:
+            reporter.pause()
+
     def close(self) -> None:
         for reporter in self._reporters:
             reporter.close()
@@ -49,20 +56,28 @@ class Reporters(Reporter):
 class JsonLines(Reporter):
     """Appends every event to a file, one JSON document a line; a line is complete or absent.
 
-    Hits come in great numbers and tell nothing new: they are written together with whatever comes next, or at the end.
+    Hits come in great numbers: they are written together, with whatever comes next or before a pause.
     store: the store that holds the file; named when the disk is full.
     """
 
     def __init__(self, path: Path, store: Path) -> None:
         self._store = store
+        self._held_back: list[str] = []
         self._stream: IO[str] = path.open("a", encoding="utf-8", buffering=1 << 16)
 
     def event(self, kind: str, **details: Any) -> None:
-        with writing(self._store):
-            self._stream.write(json.dumps({"time": round(time.time(), 3), "event": kind, **details}) + "\n")
-            if kind != "hit":
+        self._held_back.append(json.dumps({"time": round(time.time(), 3), "event": kind, **details}))
+        if kind != "hit":
+            self.pause()
+
+    def pause(self) -> None:
+        if self._held_back:
+            with writing(self._store):
+                self._stream.write("".join(f"{line}\n" for line in self._held_back))
                 self._stream.flush()
+            self._held_back.clear()
 
     def close(self) -> None:
+        self.pause()
         with writing(self._store):
             self._stream.close()

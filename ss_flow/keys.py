@@ -17,6 +17,7 @@ from ss_flow.task import FileRef, Task
 SCHEMA = 2
 """Raised when the meaning of keys or of stored objects changes: everything is then computed anew."""
 
+_SIMPLE = (str, int, float, bool, type(None))
 Components = dict[str, Any]
 Value = tuple[str, ...] | str
 """What an input resolves to: one digest, or the digests of a list."""
@@ -63,8 +64,10 @@ class Keys:
 
         Raises TypeError when a parameter is of a type that has no canonical form.
         """
-        given = {name: self._digest(name, value) for name, value in parameters.items()}
-        return digest({"recipe": self.recipe(task).digest, "parameters": given, "inputs": inputs})
+        given = [
+            (name, value if type(value) in _SIMPLE else self._digest(name, value)) for name, value in parameters.items()
+        ]
+        return digest((self.recipe(task).digest, given, list(inputs.items())))
 
     def components(
         self, task: Task[..., Any], inputs: Mapping[str, Value], parameters: Mapping[str, Any]

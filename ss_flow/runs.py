@@ -85,7 +85,7 @@ def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
     for file in runs.glob("*/run.json"):
         try:
             header = json.loads(file.read_text())
-        except ValueError:
+        except (FileNotFoundError, ValueError):  # collected just now, or cut short
             continue
         if scene is None or header["scene"] == scene:
             found.append(Run(file.parent, header))

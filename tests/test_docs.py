@@ -83,16 +83,19 @@ def test_the_readme_has_two_command_lines_to_install_run_and_test():
     assert lines[0].endswith("&& .venv/bin/ss-flow demo") and lines[1].endswith("&& .venv/bin/pytest")
 
 
-def test_the_example_of_a_flow_runs_and_reuses_as_the_page_says(tmp_path, monkeypatch, capsys):
-    text = (ROOT / "docs" / "engine.md").read_text(encoding="utf-8")
-    source = re.search(r"```python\n(.*?)```", text, re.DOTALL).group(1)
-    (tmp_path / "ss_flow_growth.py").write_text(source, encoding="utf-8")
+def test_the_examples_from_python_run_and_print_what_the_page_says(tmp_path, monkeypatch, capsys):
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```(python|text)\n(.*?)```", page, re.DOTALL)
+    (_, module), *rest = blocks
+    (tmp_path / "ss_flow_growth.py").write_text(module, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    main = importlib.import_module("ss_flow_growth").main
-    main()
-    assert capsys.readouterr().out.splitlines()[-1] == "[0. 2. 6.]"
-    main(3.0)
-    printed = capsys.readouterr().out.splitlines()
-    promised = re.search(r"```\n(hit growth.*?)```", text, re.DOTALL).group(1).splitlines()
-    assert sorted(line.strip() for line in printed) == sorted(promised)
+    names: dict[str, object] = {}
+    printed = ""
+    for kind, text in rest:
+        if kind == "python":
+            exec(compile(text, "docs/python.md", "exec"), names)
+            printed = capsys.readouterr().out
+        else:
+            assert printed == text
+    assert sum(kind == "text" for kind, _ in rest) == 4

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.file_digests import FileDigests
+from ss_flow.cache.location import is_url, open_store
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.tasks.models import catalogue
@@ -18,31 +20,41 @@ from ss_flow.tasks.models import catalogue
 class StoreOptions:
     """Where results are kept."""
 
-    cache: Path | None = None
-    """Folder of the store; by default SS_FLOW_CACHE, or else ss-flow in the user's cache folder."""
+    cache: str | None = None
+    """Folder of the store, or s3://BUCKET/PREFIX; by default SS_FLOW_CACHE, or else ss-flow in the user's cache
+    folder."""
 
     @property
-    def root(self) -> Path:
-        """The store's folder."""
-        return self.cache or Path(os.environ.get("SS_FLOW_CACHE", "") or default_cache()).expanduser()
+    def location(self) -> str | Path:
+        """The store's folder, or its URL."""
+        location = self.cache or os.environ.get("SS_FLOW_CACHE", "") or default_cache()
+        return str(location) if is_url(location) else Path(location).expanduser()
 
     def existing_store(self) -> Store:
         """The store, to look into. Raises InputError when there is none, or it cannot be used."""
-        if not self.root.exists():
-            raise InputError(f"there is no store {self.root}; `ss-flow run SCENE` makes one, --cache names another.")
+        location = self.location
+        if isinstance(location, Path) and not location.exists():
+            raise InputError(f"there is no store {location}; `ss-flow run SCENE` makes one, --cache names another.")
         return self.open_store()
 
     def open_store(self) -> Store:
-        """The store, made where there is none. Raises InputError when the folder cannot be used."""
-        root = self.root
+        """The store, made where there is none.
+
+        Raises InputError when the folder cannot be used or the URL is not that of a store.
+        """
+        location = self.location
         try:
-            store = Store(root.resolve())
-            if not os.access(root, os.W_OK):
+            store = open_store(location.resolve() if isinstance(location, Path) else location)
+            if not os.access(store.root, os.W_OK):
                 raise PermissionError("no permission to write")
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        except StoreFailure:
+            raise
         except OSError as error:
             reason = error.strerror or str(error)
             raise InputError(
-                f"the store {root} cannot be used: {reason}; name another folder with --cache or SS_FLOW_CACHE."
+                f"the store {location} cannot be used: {reason}; name another folder with --cache or SS_FLOW_CACHE."
             ) from None
         return store
 

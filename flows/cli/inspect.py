@@ -15,10 +15,11 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from ss_flow.cache.store import Store
+from ss_flow.cache.store import Store, write_atomically
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import StoreOptions, console
 from ss_flow.runs import Run, latest_runs
+from ss_flow.telemetry import trace
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 
@@ -31,11 +32,17 @@ class Status:
     """Only runs of this scene."""
     json: bool = False
     """Print one JSON document."""
+    otlp: Path | None = None
+    """Also write the run as an OpenTelemetry trace (OTLP, JSON) to this file."""
     store: Options = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
         run = latest_run(self.store.existing_store(), self.scene)
+        if self.otlp:
+            if self.otlp.is_dir() or not self.otlp.absolute().parent.is_dir():
+                raise InputError(f"{self.otlp} cannot be written; --otlp must name a file in a folder.")
+            write_atomically(self.otlp, json.dumps(trace(run)) + "\n")
         events = list(run.events())
         steps: dict[str, dict[str, Any]] = defaultdict(
             lambda: {"hit": 0, "finished": 0, "failed": 0, "skipped": 0, "running": 0, "seconds": 0.0}
@@ -92,7 +99,7 @@ class Why:
     def run(self) -> int:
         run = latest_run(self.store.existing_store(), self.scene)
         nodes = [e for e in run.events() if e["event"] in ("hit", "finished", "failed", "started")]
-        asked = [n for n in nodes if _is_named(n, self.step)]
+        asked = [n for n in nodes if is_named(n, self.step)]
         if not asked:
             known = sorted({n["step"] for n in nodes})
             raise InputError(f"the latest run of {run.scene} has no step {self.step!r}; it has {', '.join(known)}.")
@@ -111,7 +118,8 @@ class Why:
         return 0
 
 
-def _is_named(node: dict[str, Any], name: str) -> bool:
+def is_named(node: dict[str, Any], name: str) -> bool:
+    """Whether a user may mean this node by a name: propagate, split.propagate, segment[0003]."""
     return (
         name in (node["label"], node["step"]) or node["label"].endswith(f".{name}") or node["step"].endswith(f".{name}")
     )
@@ -177,9 +185,7 @@ class CacheList:
         store = self.store.existing_store()
         rows = []
         for node in latest_run(store, self.scene).nodes():
-            size = sum(
-                f.stat().st_size for d in node["outputs"] for f in store.object_path(d).rglob("*") if f.is_file()
-            )
+            size = sum(store.size(digest) for digest in node["outputs"])
             rows.append({k: node[k] for k in ("label", "key", "outputs", "seconds")} | {"bytes": size})
         if self.json:
             print(json.dumps(rows, indent=1))
@@ -234,7 +240,7 @@ class CacheShow:
 
     def _digests(self, store: Store) -> list[str]:
         try:
-            nodes = [n for n in latest_run(store, self.scene).nodes() if _is_named(n, self.what)]
+            nodes = [n for n in latest_run(store, self.scene).nodes() if is_named(n, self.what)]
         except InputError:
             nodes = []
         if nodes:
@@ -260,5 +266,5 @@ def latest_run(store: Store, scene: Path | None) -> Run:
     run = next(latest_runs(store.root / "roots" / "runs", wanted), None)
     if run is None:
         about = f" of {scene}" if scene else ""
-        raise InputError(f"the store {store.root} knows no run{about}; `ss-flow run SCENE` makes one.")
+        raise InputError(f"the store {store.location} knows no run{about}; `ss-flow run SCENE` makes one.")
     return run

@@ -22,10 +22,15 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 from ss_flow.cache.errors import StoreFailure  # noqa: E402
 from ss_flow.errors import InputError  # noqa: E402
+from ss_flow.executors import ExecutorLost  # noqa: E402
+from ss_flow.flows.cli.batch import Batch  # noqa: E402
+from ss_flow.flows.cli.care import CacheCollect, CacheUsage, CacheVerify  # noqa: E402
 from ss_flow.flows.cli.inspect import CacheList, CacheShow, Graph, Status, Why  # noqa: E402
+from ss_flow.flows.cli.pins import CachePin, CacheUnpin  # noqa: E402
 from ss_flow.flows.cli.query import Query  # noqa: E402
 from ss_flow.flows.cli.run import Demo, Run  # noqa: E402
 from ss_flow.flows.cli.setup import Doctor, ModelsFetch, ModelsList, ModelsVerify  # noqa: E402
+from ss_flow.flows.cli.sweep import Sweep  # noqa: E402
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -34,9 +39,17 @@ _sub = tyro.conf.subcommand
 
 @dataclass(frozen=True)
 class Cache:
-    """Look into the store."""
+    """Look into the store, and take care of it."""
 
-    command: Annotated[CacheList, _sub("ls")] | Annotated[CacheShow, _sub("show")]
+    command: (
+        Annotated[CacheList, _sub("ls")]
+        | Annotated[CacheShow, _sub("show")]
+        | Annotated[CacheUsage, _sub("du")]
+        | Annotated[CachePin, _sub("pin")]
+        | Annotated[CacheUnpin, _sub("unpin")]
+        | Annotated[CacheCollect, _sub("gc")]
+        | Annotated[CacheVerify, _sub("verify")]
+    )
 
     def run(self) -> int:
         return self.command.run()
@@ -60,6 +73,8 @@ Command = tyro.conf.OmitSubcommandPrefixes[
     tyro.conf.FlagCreatePairsOff[
         Annotated[Demo, _sub("demo")]
         | Annotated[Run, _sub("run")]
+        | Annotated[Sweep, _sub("sweep")]
+        | Annotated[Batch, _sub("batch")]
         | Annotated[Status, _sub("status")]
         | Annotated[Why, _sub("why")]
         | Annotated[Graph, _sub("graph")]
@@ -88,7 +103,7 @@ def main(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         errors.print("[yellow]ss-flow: interrupted; what was finished is kept, and the next run goes on from it.[/]")
         return INTERRUPTED
-    except StoreFailure as error:
+    except (StoreFailure, ExecutorLost) as error:
         errors.print(f"[red]ss-flow:[/] {escape(str(error))}")
         return FAILED
     except BrokenPipeError:

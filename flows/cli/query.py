@@ -15,7 +15,7 @@ from ss_flow.engine import run_flow
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import StoreOptions, choose_model, console, file_digests
 from ss_flow.graph import stored
-from ss_flow.scheduler import Failure
+from ss_flow.resolution import Failure
 from ss_flow.tasks.deliver.output import RUN_FILE
 from ss_flow.tasks.semantics.query import query
 
@@ -38,11 +38,13 @@ class Query:
     def run(self) -> int:
         document = read_run(self.result)
         instances = _read_json(self.result / "instances.json")
-        own_store = self.store if self.store.cache else StoreOptions(Path(document["store"]))
+        own_store = self.store if self.store.cache else StoreOptions(document["store"])
         store = own_store.existing_store()
         descriptors = tuple(document["results"]["describe"])
         if not all(value in store for value in descriptors):
-            raise InputError(f"the store {store.root} no longer holds the descriptors of {self.result}; run it again.")
+            raise InputError(
+                f"the store {store.location} no longer holds the descriptors of {self.result}; run it again."
+            )
         tau_corr = document["params"]["semantics.query.tau_corr"] if self.tau_corr is None else self.tau_corr
         if not 0 < tau_corr <= 2:
             raise InputError(f"--tau-corr {tau_corr} is out of range; it must be above 0 and at most 2.")

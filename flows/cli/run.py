@@ -14,48 +14,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.engine import Report, run_flow
-from ss_flow.errors import InputError
-from ss_flow.events import Reporter
 from ss_flow.flows import settings
-from ss_flow.flows.capture import Capture, capture
-from ss_flow.flows.cli.context import StoreOptions, choose_model, console, file_digests
-from ss_flow.flows.deliver import STATUS_EXIT, deliver, run_document
+from ss_flow.flows.cli.context import console, file_digests
+from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare
+from ss_flow.flows.cli.telling import would_run
+from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
-from ss_flow.flows.split_splat import Networks, split_splat
-from ss_flow.scheduler import Failure
-from ss_flow.task import FileRef
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.output import check_place
-
-Assignments = Annotated[
-    tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]],
-    tyro.conf.arg(name="set", metavar="STEP.PARAM=VALUE", help_behavior_hint="may be given several times"),
-]
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """How to run, whatever the scene."""
-
-    preset: str = "default"
-    """default, paper (the paper's values), reference (those of its authors' code), fast (for a quick look) or thorough
-    (for a machine with time)."""
-    assignments: Assignments = ()
-    """Set a parameter, as in --set split.tau_label=0.8."""
-    until: str | None = None
-    """Stop when this step's result is there."""
-    jobs: int = 0
-    """How many tasks may run at once; 0 = one a core."""
-    executor: str = "threads"
-    """threads or processes."""
-    dry_run: bool = False
-    """Tell what would run and why, and run nothing."""
-    verify: bool = False
-    """Read all input files again, instead of trusting their size and time of change."""
-    json: bool = False
-    """Print one JSON document on stdout, and nothing else there."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
-    """Where results are kept."""
 
 
 @dataclass(frozen=True)
@@ -107,77 +73,43 @@ class Demo:
 
 def run_scene(scene_path: Path, masks: Path | None, out: Path, params: Params, options: RunOptions) -> int:
     """Run the DAG on a scene, write the output folder, print what came out. Returns the exit code."""
-    params = settings.apply(params, [text for group in options.assignments for text in group])
-    if options.jobs < 0:
-        raise InputError(f"--jobs {options.jobs} is out of range; it must be 0 (one a core) or more.")
-    scene = open_scene(scene_path, masks).every(params.capture.stride)
-    until = options.until.rpartition(".")[2] if options.until else None  # "split.propagate" is "propagate"
-    whole = until is None and not options.dry_run
-    if whole:
+    params = settings.apply(params, options.texts)
+    engine = options.engine()
+    scene = open_scene(scene_path, masks)
+    if options.delivers:
         check_place(out)
     store = options.store.open_store()
     digests = file_digests(store, verify=options.verify)
-    networks = Networks(
-        segmenter=choose_model("segmenter", params.split.segmenter, digests, wanted=not scene.ready_masks),
-        encoder=choose_model("text-image", params.semantics.encoder, digests),
-        monodepth=choose_model("monodepth", params.capture.monodepth, digests, wanted=params.capture.depth == "mono"),
-    )
-
-    def reference(path: Path) -> FileRef:
-        return FileRef(path, digests(path))
-
-    def build() -> dict[str, Any]:
-        held_out = scene.root / "held_out"
-        extra: Capture | None = None
-        if held_out.is_dir():
-            extra = capture(open_scene(held_out), reference, params.capture, networks.monodepth)
-        results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
-        if until is not None and until not in results:
-            raise InputError(f"--until {options.until!r} names no step; there are {', '.join(results)}.")
-        return results
-
-    out_console = console(json=options.json)
+    prepared = prepare(scene, params, options, digests)
+    console_out = console(json=options.json)
     try:
-        report = run_flow(
-            build,
-            store,
-            scene=str(scene.root.resolve()),
-            header={"preset": options.preset, "params": settings.flat(params)},
-            until=until,
-            jobs=options.jobs,
-            executor=options.executor,
-            reporter=_display(out_console),
-            dry=options.dry_run,
-        )
+        with display(console_out) as screen:
+            report = run_flow(
+                prepared.build,
+                store,
+                scene=prepared.name,
+                header=header(prepared, options),
+                until=options.target,
+                reporter=screen,
+                **engine,
+            )
     finally:
         digests.save()
     if options.dry_run:
-        return _tell_plan(report, out_console, json_wanted=options.json)
-    failed_input = next((f.error for f in report.failures if isinstance(f.error, InputError)), None)
-    if failed_input is not None and any(isinstance(v, Failure) for v in report.values.values()):
-        raise failed_input
-    document = run_document(store, scene, params, networks, report)
-    if whole and document["status"] != "failed":
-        deliver(out, store, document, report)
+        return _tell_plan(report, console_out, json_wanted=options.json)
+    document = finish(prepared, report, store, out if options.delivers else None)
     if options.json:
         print(json.dumps(document))
     else:
-        _tell(document, out if whole else None, out_console)
+        _tell(document, out if options.delivers else None, console_out)
     return STATUS_EXIT[document["status"]]
 
 
-def _display(out: Console) -> Reporter:
-    """A live display on a terminal, plain lines elsewhere."""
-    from ss_flow.terminal import Terminal
-
-    return Terminal(out)
-
-
 def _tell_plan(report: Report, out: Console, *, json_wanted: bool) -> int:
-    would = [n for n in report.nodes if n["event"] == "would run"]
+    would = would_run(report)
     follow = [n for n in report.nodes if n["event"] == "skipped"]
     if json_wanted:
-        print(json.dumps({"would_run": [{k: n[k] for k in ("label", "why")} for n in would]}))
+        print(json.dumps({"would_run": would}))
         return 0
     for node in would:
         out.print(escape(f"would run {node['label']}: {node['why']}"))

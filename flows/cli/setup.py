@@ -94,7 +94,7 @@ class Doctor:
     def run(self) -> int:
         checks: list[tuple[str, Callable[[], str]]] = [
             ("Python", lambda: sys.version.split()[0]),
-            ("store", lambda: str(self.store.open_store().root)),
+            ("store", lambda: _store(self.store)),
             ("rasterizer", _rasterizer),
             ("CUDA", _cuda),
             ("Open3D", lambda: str(_open3d())),
@@ -111,6 +111,12 @@ class Doctor:
                 table.add_row(name, f"[red]{error}[/]")
         console(json=False).print(table)
         return 1 if bad else 0
+
+
+def _store(options: StoreOptions) -> str:
+    store = options.open_store()
+    store.now()  # it can be written, and a bucket can be reached
+    return store.location
 
 
 _LIBRARIES = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Protocol
@@ -9,6 +10,7 @@ from typing import Protocol
 from ss_flow.cache.store import Action, Store
 from ss_flow.errors import InputError
 from ss_flow.execute import Invocation
+from ss_flow.task import Resources
 
 NAMES = ("threads", "processes", "dask", "dask://HOST:PORT")
 
@@ -16,8 +18,17 @@ OnProgress = Callable[[str, int, int, str], None]
 """Called from any thread with the key of a call, how much is done, of how much, and a note."""
 
 
+class ExecutorLost(RuntimeError):
+    """Whoever runs the calls is gone, or must not run them, and the run ends; says why, and what to do."""
+
+
 class Executor(Protocol):
-    """Runs calls concurrently. Whoever submits holds back what the machine has no room for."""
+    """Runs calls concurrently. Whoever submits holds back what there is no room for."""
+
+    @property
+    def capacity(self) -> Resources | None:
+        """What calls may hold together; None = what this machine has."""
+        ...
 
     def submit(self, invocation: Invocation) -> Future[Action]:
         """Start a call; the future holds its action record, or what the task raised."""
@@ -39,14 +50,16 @@ class Executor(Protocol):
 def open_executor(name: str, workers: int, store: Store, on_progress: OnProgress) -> Executor:
     """The executor "threads", "processes", "dask" (a cluster on this machine) or "dask://HOST:PORT".
 
+    workers: how many calls may run at once on this machine; another cluster's `capacity` says it for itself.
+
     Raises InputError for another name, or when Dask is not installed or does not answer.
     """
     if name in ("threads", "processes"):
         from ss_flow.executors.local import LocalPool
 
         return LocalPool(workers, store, on_progress, processes=name == "processes")
-    if name == "dask" or name.startswith("dask://"):
+    if found := re.fullmatch(r"dask(?:://(.+))?", name):
         from ss_flow.executors.dask import open_dask
 
-        return open_dask(name.removeprefix("dask").removeprefix("://"), workers, on_progress)
+        return open_dask(found[1] or "", workers, on_progress)
     raise InputError(f"executor {name!r} is unknown; choose one of: {', '.join(NAMES)}.")

@@ -10,6 +10,7 @@ from ss_flow.cache.store import Action, Store
 from ss_flow.execute import Cancelled, Invocation, execute
 from ss_flow.executors import OnProgress
 from ss_flow.executors.worker import Worker
+from ss_flow.task import Resources
 
 
 class LocalPool:
@@ -17,6 +18,8 @@ class LocalPool:
 
     A task marked `isolate` always gets a process to itself. Other processes are kept for the next call.
     """
+
+    capacity: Resources | None = None
 
     def __init__(self, workers: int, store: Store, on_progress: OnProgress, *, processes: bool) -> None:
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="task")

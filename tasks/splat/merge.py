@@ -78,7 +78,7 @@ class Quality:
 
 @task(
     name="splat.merge_pair",
-    resources=Resources(cores=1, most_cores=8, memory_mb=2000),
+    resources=Resources(cores=1, most_cores=8, memory_mb=2000, gpus=0.25),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=rasterizer,
 )
@@ -183,7 +183,7 @@ def assemble(groups: tuple[Gaussians, ...]) -> Gaussians:
 
 @task(
     name="splat.global_pass",
-    resources=Resources(cores=1, most_cores=8, memory_mb=4000),
+    resources=Resources(cores=1, most_cores=8, memory_mb=4000, gpus=0.5),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=rasterizer,
 )

@@ -65,7 +65,7 @@ class ReconstructParams:
 
 @task(
     name="splat.reconstruct",
-    resources=Resources(cores=1, most_cores=8, memory_mb=1500),
+    resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.25),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=rasterizer,
 )
@@ -98,7 +98,7 @@ def reconstruct(
 
 @task(
     name="splat.retrain",
-    resources=Resources(cores=1, most_cores=8, memory_mb=1500),
+    resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.25),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=rasterizer,
 )

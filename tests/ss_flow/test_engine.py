@@ -11,8 +11,8 @@ from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
 from ss_flow.graph import Flow, each, gather
+from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
-from ss_flow.scheduler import Failure
 
 
 def run(store, build, **kwargs):

@@ -178,6 +178,7 @@ def test_a_task_whose_process_was_killed_is_tried_once_more_alone(store, tmp_pat
 
 PROGRAM = """
 import sys
+{before}
 sys.path.insert(0, {support!r})
 import ss_flow_toy as toy
 from pathlib import Path
@@ -188,9 +189,9 @@ run_flow(lambda: {{"out": {call}}}, Store(Path({store!r})), scene="toy", executo
 """
 
 
-def start(store, call, executor="threads"):
+def start(store, call, executor="threads", before=""):
     support = str(Path(toy.__file__).parent)
-    text = PROGRAM.format(support=support, call=call, store=str(store.root), executor=executor)
+    text = PROGRAM.format(support=support, call=call, store=str(store.root), executor=executor, before=before)
     return subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True)
 
 
@@ -256,6 +257,29 @@ def test_a_run_goes_on_where_a_killed_one_was(store, tmp_path):
     wait_for(lambda: (tmp_path / "pid2").exists(), 5)  # the claim of the dead holds nobody up
     second.kill()
     second.communicate()
+
+
+CLAIMS_EXPIRE_AT_ONCE = """
+import ss_flow.cache.claims as claims
+claims.EXPIRY_SECONDS, claims._lives = 0.0, lambda pid, started: False
+"""
+
+
+@pytest.mark.parametrize("before", ["", CLAIMS_EXPIRE_AT_ONCE], ids=["claims hold", "claims expire"])
+def test_several_processes_at_once_share_the_work_of_one_flow(store, before):
+    many = "toy.total(toy.each(toy.source(values=tuple(map(float, range(40)))), build=lambda x: toy.given_cores(x)))"
+    several = [start(store, many, before=before) for _ in range(4)]
+    assert [process.communicate()[1] for process in several] == [""] * 4
+    finished = [
+        event["key"]
+        for found in latest_runs(store.root / "roots" / "runs")
+        for event in found.events()
+        if event["event"] == "finished"
+    ]
+    assert len(set(finished)) == 42
+    if not before:
+        assert len(finished) == 42
+    assert claims(store) == os.listdir(store.root / "tmp") == []
 
 
 def test_two_threads_may_run_flows_at_once_on_one_store(store):

@@ -147,3 +147,20 @@ def deaf(x: Number, *, pid_file: str) -> Number:
     Path(pid_file).write_text(str(os.getpid()))
     time.sleep(60)
     return x
+
+
+@task()
+def crawl(x: Number, *, seconds: float) -> Number:
+    """Works for so long, and says how far it is."""
+    for i in range(20):
+        progress(i, 20)
+        time.sleep(seconds / 20)
+    return x
+
+
+@task()
+def loud(x: Number) -> Number:
+    """Prints, as libraries do."""
+    print("noise", flush=True)
+    os.write(1, b"noise of native code\n")
+    return x

@@ -1,0 +1,282 @@
+"""`ss-flow batch`: many scenes, each of which ends for itself."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import itertools
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from ss_flow.cache.file_digests import FileDigests
+from ss_flow.cache.store import Store, write_atomically
+from ss_flow.engine import Report, Request, run_flows
+from ss_flow.errors import InputError
+from ss_flow.flows import settings
+from ss_flow.flows.cli.context import console, file_digests
+from ss_flow.flows.cli.prepare import (
+    Prefixed,
+    Prepared,
+    RunOptions,
+    check_writable,
+    display,
+    finish,
+    first_failure,
+    header,
+    prepare,
+)
+from ss_flow.flows.cli.telling import plan_in_words, print_table, would_run
+from ss_flow.flows.deliver import STATUS_EXIT
+from ss_flow.flows.measures import measures
+from ss_flow.flows.params import Params
+from ss_flow.sweep import rows_of
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.deliver.output import check_place
+
+BATCH_FILE = "batch.json"
+COLOURS = {"ok": "green", "degraded": "yellow", "failed": "red"}
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Run many scenes, each into a folder of its own; one that fails leaves the others alone."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Captures, as `run` takes them, or quoted patterns such as 'scans/*/'."""
+    list_file: Annotated[Path | None, tyro.conf.arg(name="list")] = None
+    """A file with more of them, one a line, relative to the file's own folder; lines that begin with # do not count."""
+    out: Path = Path("ss-flow-out")
+    """The folder to write: NAME/ for each scene, and batch.json."""
+    retry_failed: bool = False
+    """Run only those that the folder's batch.json marks as failed, or does not name."""
+    execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
+    """How to run."""
+
+    def run(self) -> int:
+        options = self.execution
+        engine = options.engine()
+        params = settings.apply(settings.preset(Params(), options.preset), options.texts)
+        folders = folder_names(_found(self.scenes, self.list_file))
+        check_writable(self.out)
+        ended = _ended(self.out / BATCH_FILE, folders) if self.retry_failed else {}
+        tell = console(json=options.json)
+        store = options.store.open_store()
+        digests = file_digests(store, verify=options.verify)
+        scenes: dict[Path, Prepared] = {}
+        errors: dict[Path, str] = {}
+        try:
+            for path in (path for path in folders if str(path) not in ended):
+                try:
+                    scenes[path] = self._opened(path, self.out / folders[path], params, digests)
+                except Exception as error:  # whatever is wrong with one scene is no matter of the others
+                    errors[path] = _in_words(error)
+            if errors and not scenes and not ended:
+                first = next(iter(errors.values()))
+                raise InputError(first if len(errors) == 1 else f"no scene can be opened; of the first: {first}")
+            with display(tell) as screen:
+                requests = [
+                    Request(
+                        prepared.build,
+                        prepared.name,
+                        header(prepared, options),
+                        options.target,
+                        Prefixed(screen, folders[path], leading=position == 0),
+                    )
+                    for position, (path, prepared) in enumerate(scenes.items())
+                ]
+                if options.dry_run:
+                    return self._plan(list(scenes), errors, run_flows(requests, store, **engine), tell)
+                book = _Book(self.out / BATCH_FILE, list(map(str, folders)), ended, tell)
+                for path, words in errors.items():
+                    book.add(_row(path, "failed", error=words))
+                places = [self.out / folders[path] if options.delivers else None for path in scenes]
+                with _Finishing(store, book, list(zip(scenes.items(), places, strict=True))) as finishing:
+                    run_flows(requests, store, done=finishing.done, **engine)
+        finally:
+            digests.save()
+        if options.json:
+            print(json.dumps(book.rows))
+        else:
+            print_table(_table(book.rows, folders), tell)
+        return STATUS_EXIT["ok" if all(row["status"] == "ok" for row in book.rows) else "degraded"]
+
+    def _opened(self, path: Path, out: Path, params: Params, digests: FileDigests) -> Prepared:
+        """Raises InputError, among others, when the scene cannot be run."""
+        prepared = prepare(open_scene(path), params, self.execution, digests)
+        prepared.steps()
+        if self.execution.delivers:
+            check_place(out)
+        return prepared
+
+    def _plan(
+        self, scenes: Sequence[Path], errors: Mapping[Path, str], reports: Sequence[Report], tell: Console
+    ) -> int:
+        """Tell what would run."""
+        if self.execution.json:
+            rows: list[dict[str, Any]] = [{"scene": str(path), "error": error} for path, error in errors.items()]
+            for path, report in zip(scenes, reports, strict=True):
+                hits = sum(node["event"] == "hit" for node in report.nodes)
+                rows.append({"scene": str(path), "hits": hits, "would_run": would_run(report)})
+            print(json.dumps(rows))
+            return 0
+        for path, error in errors.items():
+            tell.print(f"[red]cannot run[/] {escape(f'{path}: {error}')}")
+        for path, report in zip(scenes, reports, strict=True):
+            tell.print(escape(f"{path}: {plan_in_words(report)}"))
+        return 0
+
+
+class _Book:
+    """The rows of batch.json, in the order of the scenes; written, and told of, whenever one is added."""
+
+    def __init__(self, file: Path, scenes: Sequence[str], rows: dict[str, dict[str, Any]], tell: Console) -> None:
+        self._file, self._scenes, self._rows, self._tell = file, scenes, rows, tell
+        self._write()
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        return [self._rows[scene] for scene in self._scenes if scene in self._rows]
+
+    def add(self, row: dict[str, Any]) -> None:
+        self._rows[row["scene"]] = row
+        self._write()
+        place = f"see {row['out']}" if row["out"] else None
+        what = "; ".join(filter(None, (row["error"], place))) or f"{row['misses']} results computed"
+        words = escape(f"{row['scene']}: {what}")
+        self._tell.print(f"[{COLOURS[row['status']]}]{row['status']}[/] {words}")
+
+    def _write(self) -> None:
+        write_atomically(self._file, json.dumps(self.rows, indent=1))
+
+
+class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
+    """Finishes scenes in a thread of its own, so that the engine need not wait for files to be written.
+
+    scenes: each with its folder to write, if any. Left, it waits for the scenes that have ended; left by an interrupt
+    or another fault, only for the one that it is at: the others have no row, and are finished by the next batch.
+    """
+
+    def __init__(self, store: Store, book: _Book, scenes: Sequence[tuple[tuple[Path, Prepared], Path | None]]) -> None:
+        self._store, self._book, self._scenes = store, book, scenes
+        self._worker = ThreadPoolExecutor(1)
+        self._ended: list[Future[None]] = []
+
+    def done(self, position: int, report: Report) -> None:
+        """A scene has ended."""
+        self._ended.append(self._worker.submit(self._finish, position, report))
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._worker.shutdown(cancel_futures=kind is not None)
+        if kind is None:
+            for future in self._ended:
+                future.result()  # raises when batch.json could not be written
+
+    def _finish(self, position: int, report: Report) -> None:
+        (path, prepared), out = self._scenes[position]
+        try:
+            document = finish(prepared, report, self._store, out)
+            row = _row(path, document["status"], report, out, first_failure(document), measures(self._store, document))
+        except Exception as error:  # a fault of one scene's result is no matter of the others
+            row = _row(path, "failed", report, error=_in_words(error))
+        self._book.add(row)
+
+
+def _row(
+    path: Path,
+    status: str,
+    report: Report | None = None,
+    out: Path | None = None,
+    error: str | None = None,
+    metrics: dict[str, float] | None = None,
+) -> dict[str, Any]:
+    """A row of batch.json."""
+    counted = rows_of([{}], [report])[0] if report else None
+    return {
+        "scene": str(path),
+        "status": status,
+        "out": str(out) if out and status != "failed" else None,
+        "seconds": round(counted.seconds, 3) if counted else 0.0,
+        "hits": counted.hits if counted else 0,
+        "misses": counted.misses if counted else 0,
+        "error": error,
+        "metrics": metrics or {},
+    }
+
+
+def _in_words(error: BaseException) -> str:
+    return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+
+
+def _found(patterns: Sequence[str], list_file: Path | None) -> list[Path]:
+    """The scenes that are named, in order, each once. Raises InputError when there are none."""
+    named = [(Path(), pattern) for pattern in patterns]
+    if list_file is not None:
+        try:
+            lines = list_file.read_text(encoding="utf-8").splitlines()
+        except (OSError, ValueError) as error:
+            raise InputError(f"--list {list_file} cannot be read: {error}.") from None
+        named += [(list_file.parent, s) for line in lines if (s := line.strip()) and not s.startswith("#")]
+    found: dict[Path, None] = {}
+    for folder, pattern in named:
+        place = folder / Path(pattern).expanduser()
+        matches = [str(place)] if place.exists() or not glob.has_magic(pattern) else sorted(glob.glob(str(place)))
+        if not matches:
+            raise InputError(f"nothing matches {pattern!r}; name scenes, or a pattern that some match.")
+        found |= dict.fromkeys(Path(match).resolve() for match in matches)
+    if not found:
+        raise InputError("there is no scene to run; name some, or a --list of them.")
+    return list(found)
+
+
+def folder_names(scenes: Iterable[Path]) -> dict[Path, str]:
+    """A folder name for each scene: its own; where several have the same, with its ending, its parents' names, or at
+    last a number."""
+    left = list(scenes)
+    names: dict[Path, str] = {}
+    for depth in range(1, max(len(scene.parts) for scene in left) + 1):
+        for last in (lambda scene: scene.stem, lambda scene: scene.name):
+            tried = {scene: "-".join([*scene.parts[1:][-depth:-1], last(scene)]) for scene in left}
+            counts = Counter([*names.values(), *tried.values()])
+            names |= {scene: name for scene, name in tried.items() if counts[name] == 1}
+            left = [scene for scene in left if scene not in names]
+    for scene in left:
+        numbered = (f"{scene.stem}-{number}" for number in itertools.count(2))
+        names[scene] = next(name for name in numbered if name not in names.values())
+    return names
+
+
+def _ended(file: Path, scenes: Iterable[Path]) -> dict[str, dict[str, Any]]:
+    """The rows of an earlier batch about scenes that did not fail. Raises InputError when batch.json is damaged."""
+    try:
+        rows = json.loads(file.read_text(encoding="utf-8"))
+        return {row["scene"]: row for row in rows if row["status"] != "failed" and Path(row["scene"]) in scenes}
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{file} is damaged ({error}); run the batch without --retry-failed.") from None
+
+
+def _table(rows: Sequence[dict[str, Any]], folders: dict[Path, str]) -> Table:
+    metrics = [name for name in ("split.miou", "splat.miou") if any(name in row["metrics"] for row in rows)]
+    table = Table("scene", "", "instances", *metrics, "reused", "computed", "seconds", box=None)
+    for row in rows:
+        found = [row["metrics"].get(name) for name in ("splat.instances", *metrics)]
+        table.add_row(
+            escape(folders[Path(row["scene"])]),
+            f"[{COLOURS[row['status']]}]{row['status']}[/]",
+            *("" if value is None else f"{value:.4g}" for value in found),
+            str(row["hits"]),
+            str(row["misses"]),
+            f"{row['seconds']:.1f}",
+        )
+    return table

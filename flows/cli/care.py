@@ -1,0 +1,243 @@
+"""Care of the store: cache gc, du, verify."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from typing import Literal, TypeVar
+
+import tyro
+from rich.markup import escape
+from rich.progress import Progress
+from rich.table import Table
+
+from ss_flow.cache.collect import Collected, Roots, collect
+from ss_flow.cache.pins import Pin, read_pins
+from ss_flow.cache.store import GRACE_SECONDS, Store
+from ss_flow.cache.survey import Survey, Tally, Usage
+from ss_flow.cache.verify import verify
+from ss_flow.engine import RUN_CLAIM
+from ss_flow.errors import InputError
+from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.pins import tell_pins
+from ss_flow.runs import Run, latest_runs
+from ss_flow.units import parse_bytes, parse_seconds
+
+DEGRADED = 3
+Options = tyro.conf.OmitArgPrefixes[StoreOptions]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class CacheCollect:
+    """Delete results that neither a pin nor a run needs; with limits, also those that were not used for long."""
+
+    keep_runs: int | None = None
+    """Keep only the latest so many runs of each scene, and delete the records of older ones; all, when left out."""
+    max_size: str | None = None
+    """Delete results until they take no more room than this (500MB, 20GB, 1.5TiB), least recently used first; what is
+    pinned or belongs to a living run stays."""
+    older_than: str | None = None
+    """Delete results that were not used for this long (12h, 30d); what is pinned or belongs to a living run stays."""
+    grace: str = f"{GRACE_SECONDS / 3600:g}h"
+    """Nothing that was written or used within this time goes. While a run lives it is an hour at least."""
+    dry_run: bool = False
+    """Tell what would go, and delete nothing."""
+    json: bool = False
+    """Print one JSON document."""
+    store: Options = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        if self.keep_runs is not None and self.keep_runs < 0:
+            raise InputError(f"--keep-runs {self.keep_runs} is out of range; it must be 0 or more.")
+        max_bytes = None if self.max_size is None else _parsed("--max-size", parse_bytes, self.max_size)
+        unused = math.inf if self.older_than is None else _parsed("--older-than", parse_seconds, self.older_than)
+        grace = _parsed("--grace", parse_seconds, self.grace)
+        store = self.store.existing_store()
+        wanted = Wanted(store, self.keep_runs, store.now() - grace)
+        collected = collect(
+            store,
+            wanted,
+            grace_seconds=grace,
+            max_bytes=max_bytes,
+            unused_seconds=unused,
+            dry=self.dry_run,
+        )
+        runs = _delete(store, wanted.outdated, dry=self.dry_run)
+        over = 0 if max_bytes is None else max(0, collected.left.bytes - max_bytes)
+        self._tell(collected, runs, over)
+        return DEGRADED if over else 0
+
+    def _tell(self, collected: Collected, runs: Tally, over: int) -> None:
+        rows = {step or "records that cannot be read": tally for step, tally in collected.results.items()}
+        rows |= collected.others | ({"records of runs": runs} if runs.count else {})
+        total, left = _sum(rows.values()), collected.left
+        if self.json:
+            removed = [{"what": what, **asdict(tally)} for what, tally in rows.items()]
+            document = {"dry_run": self.dry_run, "removed": removed, "total": asdict(total), "left": asdict(left)}
+            print(json.dumps(document | {"over_bytes": over}, indent=1))
+            return
+        out = console(json=False)
+        out.print(_table("would go" if self.dry_run else "deleted", rows, {"total": total}))
+        out.print(f"{left.count} results stay, {size_text(left.bytes)}")
+        if over:
+            out.print(
+                f"[yellow]{size_text(over)} more than --max-size {self.max_size}:[/] the rest is pinned, belongs to a "
+                "living run, or was used within the grace period"
+            )
+
+
+class Wanted:
+    """What pins and runs need; called with the names of the living claims."""
+
+    def __init__(self, store: Store, keep_runs: int | None, quiet_before: float) -> None:
+        self._store, self._keep, self._quiet_before = store, keep_runs, quiet_before
+        self.outdated: list[Run] = []
+        """Runs that are not to be kept."""
+
+    def __call__(self, living: set[str]) -> Roots:
+        roots = Roots()
+        for pinned in read_pins(self._store):
+            roots.held.update(pinned.keys)
+            roots.objects.update(pinned.objects)
+        later: Counter[str] = Counter()
+        unknown = {name for name in living if name.startswith(RUN_CLAIM)}
+        for run in latest_runs(self._store.root / "roots" / "runs"):
+            claim = RUN_CLAIM + run.folder.name
+            later[run.scene] += 1
+            if claim in living:
+                unknown.discard(claim)
+                roots.held.update(node["key"] for node in run.nodes())
+            elif self._keep is not None and later[run.scene] > self._keep and self._is_quiet(run):
+                self.outdated.append(run)
+            else:
+                roots.kept.update(node["key"] for node in run.nodes())
+        if unknown:  # a store in a bucket: each machine keeps its own runs
+            name = min(unknown).removeprefix(RUN_CLAIM)
+            raise InputError(f"the run {name} of another machine is alive, and what it needs is not known here; wait.")
+        return roots
+
+    def _is_quiet(self, run: Run) -> bool:
+        """Whether nothing was written for so long that the run is not just about to claim that it lives."""
+        try:
+            return max(path.stat().st_mtime for path in (run.folder, *run.folder.iterdir())) < self._quiet_before
+        except FileNotFoundError:
+            return False
+
+
+def _delete(store: Store, runs: list[Run], *, dry: bool) -> Tally:
+    """Delete the records of runs, each at once."""
+    deleted = Tally()
+    for run in runs:
+        with contextlib.suppress(FileNotFoundError), store.temporary() as place:  # another collector may be faster
+            size = sum(file.stat().st_size for file in run.folder.iterdir())
+            if not dry:
+                run.folder.rename(place)
+            deleted.add(size)
+    return deleted
+
+
+@dataclass(frozen=True)
+class CacheUsage:
+    """Tell how much room results take, by step and by scene, and what is pinned."""
+
+    by: Literal["step", "scene", "both"] = "both"
+    """Which table."""
+    json: bool = False
+    """Print one JSON document."""
+    store: Options = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        store = self.store.existing_store()
+        survey, pins = Survey.of(store), read_pins(store)
+        usages: dict[str, Usage] = {}
+        if self.by != "scene":
+            usages["step"] = survey.usage(survey.by_step())
+        if self.by != "step":
+            usages["scene"] = survey.usage(_keys_by_scene(store, pins))
+        total = Tally(len(survey.actions), survey.bytes)
+        if self.json:
+            document = {"total": asdict(total), "pins": [asdict(pinned) for pinned in pins]}
+            print(json.dumps(document | {f"by_{name}": asdict(usage) for name, usage in usages.items()}, indent=1))
+            return 0
+        out = console(json=False)
+        for name, usage in usages.items():
+            ends = {"of none of them": usage.unreachable, "total": total}
+            out.print(_table(name, usage.rows, ends))
+            if usage.shared_bytes:
+                out.print(f"of the rows, {size_text(usage.shared_bytes)} are shared and counted more than once")
+            out.print()
+        tell_pins(pins)
+        return 0
+
+
+def _keys_by_scene(store: Store, pins: list[Pin]) -> dict[str, set[str]]:
+    scenes: dict[str, set[str]] = {}
+    for run in latest_runs(store.root / "roots" / "runs"):
+        scenes.setdefault(run.scene, set()).update(node["key"] for node in run.nodes())
+    for pinned in pins:
+        scenes.setdefault(pinned.scene or "(pinned)", set()).update(pinned.keys)
+    return dict(sorted(scenes.items()))
+
+
+@dataclass(frozen=True)
+class CacheVerify:
+    """Read the whole store, and take out what is damaged; the next run makes it again."""
+
+    json: bool = False
+    """Print one JSON document."""
+    store: Options = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        store = self.store.existing_store()
+        err = console(json=True)
+        with Progress(console=err, transient=True, disable=not err.is_terminal) as display:
+            task = display.add_task("reading")
+            seen = verify(store, lambda done, total: display.update(task, completed=done, total=total))
+        if self.json:
+            print(json.dumps(asdict(seen), indent=1))
+        else:
+            out = console(json=False)
+            out.print(_table("read", {"objects": seen.objects, "results": seen.actions, "closures": seen.closures}, {}))
+            for damage in seen.damaged:
+                out.print(escape(f"taken out: {damage.kind} {damage.name[:12]} {damage.reason}"))
+            if seen.incomplete:
+                out.print(f"{seen.incomplete} results lack something, and are made again when they are needed")
+            out.print("[yellow]damaged[/]" if seen.damaged else "all is whole")
+        return DEGRADED if seen.damaged else 0
+
+
+def size_text(size: int) -> str:
+    """A number of bytes for people: "12.3 MB"."""
+    power = min(4, int(math.log10(size) / 3)) if size else 0
+    return f"{size / 1000**power:.1f} {'kMGT'[power - 1]}B" if power else f"{size} B"
+
+
+def _sum(tallies: Iterable[Tally]) -> Tally:
+    total = Tally()
+    for tally in tallies:
+        total.add(tally.bytes, tally.count)
+    return total
+
+
+def _table(what: str, rows: dict[str, Tally], ends: dict[str, Tally]) -> Table:
+    table = Table(what, box=None)
+    table.add_column("number", justify="right")
+    table.add_column("size", justify="right")
+    for name, tally in [*rows.items(), *ends.items()]:
+        table.add_row(escape(name), str(tally.count), size_text(tally.bytes))
+    return table
+
+
+def _parsed(option: str, parse: Callable[[str], T], text: str) -> T:
+    try:
+        return parse(text)
+    except ValueError as error:
+        raise InputError(f"{option}: {error}") from None

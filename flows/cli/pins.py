@@ -1,0 +1,126 @@
+"""Keeping results on purpose: cache pin, cache unpin."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.markup import escape
+from rich.table import Table
+
+from ss_flow.cache.pins import Pin, pin, read_pins, unpin
+from ss_flow.cache.store import Store
+from ss_flow.cache.survey import Survey
+from ss_flow.errors import InputError
+from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.inspect import is_named, latest_run
+from ss_flow.runs import Run, latest_runs
+
+Options = tyro.conf.OmitArgPrefixes[StoreOptions]
+
+
+@dataclass(frozen=True)
+class CachePin:
+    """Keep results whatever `cache gc` deletes; without a name, list what is pinned."""
+
+    what: Annotated[str | None, tyro.conf.Positional] = None
+    """A step of the latest run (propagate, segment[0003]), the first characters of a digest, or a scene: then all of
+    its latest run."""
+    scene: Path | None = None
+    """The scene that the step is of; the one that ran last, when left out."""
+    json: bool = False
+    """Print one JSON document."""
+    store: Options = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        store = self.store.existing_store()
+        if self.what is not None:
+            made = self._pin(store, self.what)
+            console(json=self.json).print(escape(f"pinned {_described(made)}"))
+        if self.json:
+            print(json.dumps([asdict(pinned) for pinned in read_pins(store)], indent=1))
+        elif self.what is None:
+            tell_pins(read_pins(store))
+        return 0
+
+    def _pin(self, store: Store, what: str) -> Pin:
+        run = None
+        with contextlib.suppress(InputError):  # there is none: then it is a digest
+            run = latest_run(store, self.scene)
+        nodes = [node for node in run.nodes() if is_named(node, what)] if run else []
+        if run and nodes:
+            return _pin_results(store, what, run, nodes)
+        found = store.find(what)
+        if len(found) == 1:
+            makers = [key for key, action in Survey.of(store).actions.items() if found[0] in action.outputs]
+            return pin(store, found[0], "", makers, found)
+        if found:
+            raise InputError(f"{what!r} stands for {len(found)} results; give more of the digest.")
+        run = next(latest_runs(store.root / "roots" / "runs", str(Path(what).resolve())), None)
+        if run is None:
+            raise InputError(
+                f"{what!r} is neither a step of the latest run, nor a digest, nor a scene that was run; "
+                "`ss-flow cache ls` lists what there is."
+            )
+        return _pin_results(store, run.scene, run, run.nodes())
+
+
+def _pin_results(store: Store, what: str, run: Run, nodes: list[dict[str, Any]]) -> Pin:
+    # Looking them up counts as a use, so that no collector that is at work already takes them.
+    keys = [key for key in dict.fromkeys(node["key"] for node in nodes) if store.action(key) is not None]
+    if not keys:
+        raise InputError(f"the results of {what!r} are no longer in the store; run {run.scene} again first.")
+    return pin(store, what, run.scene, keys, ())
+
+
+@dataclass(frozen=True)
+class CacheUnpin:
+    """Let go what was pinned; `cache gc` may then delete it."""
+
+    what: Annotated[str, tyro.conf.Positional]
+    """What was pinned, as `cache pin` lists it; the first characters of a digest will do."""
+    scene: Path | None = None
+    """Only what was pinned of this scene."""
+    store: Options = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        store = self.store.existing_store()
+        pins = read_pins(store)
+        asked = [pinned for pinned in pins if self._means(pinned)]
+        if not asked:
+            known = ", ".join(dict.fromkeys(pinned.what for pinned in pins)) or "none"
+            raise InputError(f"{self.what!r} is not pinned; pinned are: {known}.")
+        for pinned in asked:
+            unpin(store, pinned)
+            console(json=False).print(escape(f"unpinned {_described(pinned)}"))
+        return 0
+
+    def _means(self, pinned: Pin) -> bool:
+        if self.scene is not None and pinned.scene != str(self.scene.resolve()):
+            return False
+        of_digest = bool(pinned.objects) and re.fullmatch("[0-9a-f]{2,}", self.what) is not None
+        return pinned.what in (self.what, str(Path(self.what).resolve())) or (
+            of_digest and pinned.what.startswith(self.what)
+        )
+
+
+def _described(pinned: Pin) -> str:
+    about = "" if pinned.scene in ("", pinned.what) else f" of {pinned.scene}"
+    return f"{pinned.what}{about}: {len(pinned.keys)} results"
+
+
+def tell_pins(pins: list[Pin]) -> None:
+    """Print what is pinned, a line a pin."""
+    table = Table("pinned", "scene", "results", "since", box=None)
+    for pinned in pins:
+        since = time.strftime("%F %T", time.localtime(pinned.pinned))
+        table.add_row(escape(pinned.what), escape(pinned.scene), str(len(pinned.keys)), since)
+    console(json=False).print(table if pins else "nothing is pinned")

@@ -1,0 +1,214 @@
+"""What every command that runs the DAG does with a scene: make it ready, run it, finish its result."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from ss_flow.cache.file_digests import FileDigests
+from ss_flow.cache.store import Store
+from ss_flow.engine import Report
+from ss_flow.errors import InputError
+from ss_flow.events import Reporter
+from ss_flow.flows import settings
+from ss_flow.flows.capture import Capture, capture
+from ss_flow.flows.cli.context import StoreOptions, choose_model
+from ss_flow.flows.deliver import deliver, run_document
+from ss_flow.flows.params import Params
+from ss_flow.flows.split_splat import Networks, split_splat
+from ss_flow.graph import Flow
+from ss_flow.resolution import Failure
+from ss_flow.task import FileRef
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.semantics.query import query
+from ss_flow.units import parse_bytes
+
+Assignments = Annotated[
+    tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]],
+    tyro.conf.arg(name="set", metavar="STEP.PARAM=VALUE", help_behavior_hint="may be given several times"),
+]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How to run, whatever the scene."""
+
+    preset: str = "default"
+    """default, paper (the paper's values), reference (those of its authors' code), fast (for a quick look) or thorough
+    (for a machine with time)."""
+    assignments: Assignments = ()
+    """Set a parameter, as in --set split.tau_label=0.8."""
+    until: str | None = None
+    """Stop when this step's result is there."""
+    jobs: int = 0
+    """How many tasks may run at once; 0 = one a core."""
+    memory: str | None = None
+    """How much memory tasks may declare together, such as 8GB; what is free, when left out."""
+    executor: str = "threads"
+    """threads, processes, dask (a cluster on this machine) or dask://HOST:PORT."""
+    dry_run: bool = False
+    """Tell what would run and why, and run nothing."""
+    verify: bool = False
+    """Read all input files again, instead of trusting their size and time of change."""
+    json: bool = False
+    """Print one JSON document on stdout, and nothing else there."""
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    """Where results are kept."""
+
+    @property
+    def texts(self) -> list[str]:
+        """All that --set was given."""
+        return [text for group in self.assignments for text in group]
+
+    @property
+    def target(self) -> str | None:
+        """The step of --until; "split.propagate" is "propagate"."""
+        return self.until.rpartition(".")[2] if self.until else None
+
+    @property
+    def delivers(self) -> bool:
+        """Whether a run ends with an output folder."""
+        return self.until is None and not self.dry_run
+
+    def engine(self) -> dict[str, Any]:
+        """These options as the engine takes them. Raises InputError for one that is out of range."""
+        if self.jobs < 0:
+            raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
+        try:
+            memory_mb = parse_bytes(self.memory) >> 20 if self.memory is not None else 0
+        except ValueError as error:
+            raise InputError(f"--memory {error}") from None
+        if self.memory is not None and memory_mb == 0:
+            raise InputError(f"--memory {self.memory} is out of range; it must be 1 MiB or more.")
+        return {"jobs": self.jobs, "memory_mb": memory_mb, "executor": self.executor, "dry": self.dry_run}
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scene that is ready to run."""
+
+    scene: SceneFiles
+    params: Params
+    networks: Networks
+    build: Callable[[], dict[str, Any]]
+    """Adds the DAG to a flow; returns its results by step. Raises InputError when it cannot be."""
+
+    @property
+    def name(self) -> str:
+        """What its runs are recorded as."""
+        return str(self.scene.root.resolve())
+
+    def steps(self) -> list[str]:
+        """The names of the DAG's results. Raises InputError as `build` does."""
+        with Flow(self.name).building():
+            return list(self.build())
+
+
+def prepare(
+    scene: SceneFiles, params: Params, options: RunOptions, digests: FileDigests, *, text: str | None = None
+) -> Prepared:
+    """Choose the networks of an opened scene and say how its DAG is built.
+
+    text: what to search the result for, as one more step, "query".
+    Raises InputError when a network cannot be used.
+    """
+    scene = scene.every(params.capture.stride)
+    networks = Networks(
+        segmenter=choose_model("segmenter", params.split.segmenter, digests, wanted=not scene.ready_masks),
+        encoder=choose_model("text-image", params.semantics.encoder, digests),
+        monodepth=choose_model("monodepth", params.capture.monodepth, digests, wanted=params.capture.depth == "mono"),
+    )
+
+    def reference(path: Path) -> FileRef:
+        return FileRef(path, digests(path))
+
+    def build() -> dict[str, Any]:
+        held_out = scene.root / "held_out"
+        extra: Capture | None = None
+        if held_out.is_dir():
+            extra = capture(open_scene(held_out), reference, params.capture, networks.monodepth)
+        results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
+        if text is not None:
+            results["query"] = query(
+                results["describe"],
+                text=text,
+                tau_corr=params.semantics.query.tau_corr,
+                encoder=networks.encoder,
+            )
+        if options.target is not None and options.target not in results:
+            raise InputError(f"--until {options.until!r} names no step; there are {', '.join(results)}.")
+        return results
+
+    return Prepared(scene, params, networks, build)
+
+
+def header(prepared: Prepared, options: RunOptions) -> dict[str, Any]:
+    """What the record of a run says of how it was asked for."""
+    return {"preset": options.preset, "params": settings.flat(prepared.params)}
+
+
+def finish(prepared: Prepared, report: Report, store: Store, out: Path | None) -> dict[str, Any]:
+    """Write the output folder, unless `out` is None; return the document run.json.
+
+    Raises InputError when the run failed because of what it was given.
+    """
+    failed_input = next((f.error for f in report.failures if isinstance(f.error, InputError)), None)
+    if failed_input is not None and any(isinstance(v, Failure) for v in report.values.values()):
+        raise failed_input
+    document = run_document(store, prepared.scene, prepared.params, prepared.networks, report)
+    if out is not None and document["status"] != "failed":
+        deliver(out, store, document, report)
+    return document
+
+
+def check_writable(folder: Path) -> None:
+    """Raises InputError unless files can be written into this folder, which need not be there yet."""
+    place = next(p for p in (folder.absolute(), *folder.absolute().parents) if p.exists())
+    if not place.is_dir() or not os.access(place, os.W_OK):
+        raise InputError(
+            f"{folder} cannot be written: {place} is not a writable folder; name another folder with --out."
+        )
+
+
+def first_failure(document: Mapping[str, Any]) -> str | None:
+    """What failed first, by a document run.json."""
+    return next((f"{failure['label']}: {failure['error']}" for failure in document["failures"]), None)
+
+
+class Prefixed(Reporter):
+    """Tells another reporter of one of several flows, with the flow's name before every label.
+
+    leading: whether to pass on what concerns all flows at once; one of them should.
+    """
+
+    def __init__(self, whole: Reporter, prefix: str, *, leading: bool) -> None:
+        self._whole, self._prefix, self._leading = whole, prefix, leading
+
+    def event(self, kind: str, **details: Any) -> None:
+        if "label" in details:
+            self._whole.event(kind, **{**details, "label": f"{self._prefix} {details['label']}"})
+        elif self._leading:
+            self._whole.event(kind, **details)
+
+    def progressed(self, label: str, done: int, total: int, note: str) -> None:
+        self._whole.progressed(f"{self._prefix} {label}", done, total, note)
+
+
+@contextlib.contextmanager
+def display(out: Console) -> Iterator[Reporter]:
+    """A live display on a terminal, plain lines elsewhere; it is gone at the end."""
+    from ss_flow.terminal import Terminal
+
+    terminal = Terminal(out)
+    try:
+        yield terminal
+    finally:
+        terminal.close()

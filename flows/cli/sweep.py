@@ -1,0 +1,226 @@
+"""`ss-flow sweep`: scenes with several values of parameters."""
+
+from __future__ import annotations
+
+import json
+import types
+import typing
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.markup import escape
+
+from ss_flow.cache.store import Store
+from ss_flow.engine import Request, run_flows
+from ss_flow.errors import InputError
+from ss_flow.flows import settings
+from ss_flow.flows.cli.context import console, file_digests
+from ss_flow.flows.cli.prepare import (
+    Prefixed,
+    Prepared,
+    RunOptions,
+    check_writable,
+    display,
+    finish,
+    first_failure,
+    header,
+    prepare,
+)
+from ss_flow.flows.cli.sweep_report import in_short, tell_plan, tell_rows, write_files
+from ss_flow.flows.deliver import STATUS_EXIT
+from ss_flow.flows.measures import measures, names_of
+from ss_flow.flows.params import Params
+from ss_flow.runs import DONE
+from ss_flow.sweep import Row, grid, in_words, recorded_as, rows_of, values_of, zipped
+from ss_flow.tasks.capture.scene import open_scene
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One scene with one value of each swept parameter."""
+
+    prepared: Prepared
+    values: Mapping[str, Any]
+    """The swept parameters by their full name, as they are in `prepared.params`."""
+
+    def label(self, *, scene: bool) -> str:
+        """Its values in words, after the scene's name where there are several scenes."""
+        words = in_words({name.rpartition(".")[2]: in_short(value) for name, value in self.values.items()})
+        return f"{self.prepared.scene.name} {words}" if scene else words
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Run scenes with several values of parameters, as in --set split.tau_depth=0.001,0.02,0.1, and compare them.
+
+    Values have commas between them, values that are lists themselves semicolons; lo:hi:n are n values from lo to hi,
+    lo:hi:nlog the same evenly in the logarithm. What variants share is computed once. No output folders are written:
+    `ss-flow run` with the chosen values gives one at once, since all its results are there.
+    """
+
+    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Captures, as `run` takes them."""
+    out: Path | None = None
+    """The folder for sweep.json, sweep.csv and sweep.png; by default ss-flow-out/NAME-sweep."""
+    zipped: Annotated[bool, tyro.conf.arg(name="zip")] = False
+    """Take the first values together, the second together, and so on, instead of every combination."""
+    metrics: Annotated[
+        tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]],
+        tyro.conf.arg(name="metric", metavar="NAME", help_behavior_hint="may be given several times"),
+    ] = ()
+    """Tell only of these figures, such as split.miou; an unknown one is answered with those there are."""
+    query: str | None = None
+    """Also search every result for this text, so that query.tau_corr can be swept."""
+    masks: Path | None = None
+    """A folder of ready-made instance masks for the only scene, in the place of a segmenter."""
+    execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
+    """How to run."""
+
+    def run(self) -> int:
+        options = self.execution
+        engine = options.engine()
+        settings_of = self._variants(settings.preset(Params(), options.preset), options.texts)
+        self._check()
+        scenes = [open_scene(path, self.masks) for path in self.scenes]
+        out = self.out or Path("ss-flow-out") / (f"{scenes[0].name}-sweep" if len(scenes) == 1 else "sweep")
+        check_writable(out)
+        store = options.store.open_store()
+        digests = file_digests(store, verify=options.verify)
+        tell = console(json=options.json)
+        try:
+            variants = [
+                Variant(prepare(scene, params, options, digests, text=self.query), values)
+                for scene in scenes
+                for params, values in settings_of
+            ]
+            chosen = self._chosen(variants)
+            with display(tell) as screen:
+                requests = [
+                    Request(
+                        variant.prepared.build,
+                        variant.prepared.name,
+                        header(variant.prepared, options) | recorded_as(variant.prepared.name, variant.values),
+                        options.target,
+                        Prefixed(screen, variant.label(scene=len(scenes) > 1), leading=position == 0),
+                    )
+                    for position, variant in enumerate(variants)
+                ]
+                rows = rows_of([v.values for v in variants], run_flows(requests, store, **engine))
+        finally:
+            digests.save()
+        for name in _idle(variants, rows, zipped=self.zipped):
+            hint = "; --query TEXT adds one" if name.startswith("semantics.query.") and self.query is None else ""
+            tell.print(f"[yellow]warning:[/] no step of these runs depends on {name}{hint}.")
+        if options.dry_run:
+            labels = [variant.label(scene=len(scenes) > 1) for variant in variants]
+            return tell_plan(labels, rows, tell, scenes=[v.prepared.name for v in variants] if options.json else None)
+        documents = _documents(variants, rows, store, chosen)
+        if options.json:
+            print(json.dumps(documents))
+        else:
+            tell_rows(documents, tell)
+        written = write_files(out, documents, zipped=self.zipped)
+        tell.print(escape(f"see {out}: {', '.join(written)}"))
+        statuses = {document["status"] for document in documents}
+        return STATUS_EXIT[statuses.pop()] if len(statuses) == 1 else STATUS_EXIT["degraded"]
+
+    def _variants(self, params: Params, texts: Sequence[str]) -> list[tuple[Params, dict[str, Any]]]:
+        """The parameters of every variant, and those of them that are swept, by name."""
+        lists: dict[str, list[str]] = {}
+        for text in texts:
+            name, equals, listed = text.partition("=")
+            if not equals or not name:
+                settings.apply(params, [text])  # says what is wrong with it
+            path = settings.find(params, name.strip())
+            full = ".".join(path)
+            if full in lists:
+                raise InputError(f"parameter {full} is given twice; give all its values in one --set.")
+            lists[full] = values_of(listed, separator=";" if _is_list(settings.type_of(params, path)) else ",")
+        params = settings.apply(params, [f"{name}={v[0]}" for name, v in lists.items() if len(v) == 1])
+        swept = {name: values for name, values in lists.items() if len(values) > 1}
+        if not swept:
+            raise InputError("there is nothing to sweep; give a parameter several values: --set tau_label=0.6,0.8.")
+        found = []
+        for values in zipped(swept) if self.zipped else grid(swept):
+            variant = settings.apply(params, [f"{name}={text}" for name, text in values.items()])
+            found.append((variant, {name: settings.flat(variant)[name] for name in values}))
+        return found
+
+    def _check(self) -> None:
+        if not self.scenes:
+            raise InputError("there is no scene to sweep; name one, or several.")
+        if self.masks and len(self.scenes) != 1:
+            raise InputError("--masks belongs to one scene; sweep scenes with masks of their own one by one.")
+        if self.query is not None and self.execution.target not in (None, "query"):
+            raise InputError("--query is the last step; leave out --until, or stop with --until query.")
+
+    def _chosen(self, variants: Sequence[Variant]) -> list[str]:
+        """The figures that --metric names, [] for all. Raises InputError for one that no scene will have."""
+        chosen = [name for group in self.metrics for name in group]
+        if chosen:
+            target = self.execution.target
+            steps = [[target] if target else variant.prepared.steps() for variant in variants]
+            known = list(dict.fromkeys(name for some in steps for name in names_of(some)))
+            for name in chosen:
+                if name not in known:
+                    there = ", ".join(known) or "none: --until stops before them"
+                    raise InputError(f"there is no metric {name!r} here; there are {there}.")
+        return chosen
+
+
+def _is_list(kind: Any) -> bool:
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
+        return any(_is_list(choice) for choice in typing.get_args(kind))
+    return typing.get_origin(kind) is tuple
+
+
+def _documents(
+    variants: Sequence[Variant], rows: Sequence[Row], store: Store, chosen: Sequence[str]
+) -> list[dict[str, Any]]:
+    """The rows of sweep.json. Raises InputError when every variant failed because of what it was given."""
+    documents, refused = [], []
+    for variant, row in zip(variants, rows, strict=True):
+        status, error, found = "failed", None, {}
+        try:
+            document = finish(variant.prepared, row.report, store, None)
+            status, error, found = document["status"], first_failure(document), measures(store, document)
+        except InputError as bad:
+            refused.append(bad)
+            error = str(bad)
+        documents.append(
+            {
+                "scene": variant.prepared.name,
+                "params": dict(variant.values),
+                "metrics": {name: found[name] for name in chosen or found if name in found},
+                "hits": row.hits,
+                "misses": row.misses,
+                "seconds": round(row.seconds, 3),
+                "status": status,
+                "error": error,
+            }
+        )
+    if len(refused) == len(documents):
+        raise refused[0]
+    return documents
+
+
+def _idle(variants: Sequence[Variant], rows: Sequence[Row], *, zipped: bool) -> list[str]:
+    """Swept parameters that no step depends on: other values of them alone (all together, when zipped) change no key.
+
+    Nothing is said of rows that did not get to their end: what they did not reach may depend on anything.
+    """
+    if any(node["event"] not in DONE for row in rows for node in row.report.nodes):
+        return []
+    idle = []
+    for name in rows[0].values:
+        keys: dict[tuple[str, ...], set[frozenset[str]]] = defaultdict(set)
+        for variant, row in zip(variants, rows, strict=True):
+            others = [] if zipped else [str(value) for other, value in row.values.items() if other != name]
+            keys[variant.prepared.name, *others].add(frozenset(node["key"] for node in row.report.nodes))
+        if all(len(different) == 1 for different in keys.values()):
+            idle.append(name)
+    return idle

@@ -1,0 +1,29 @@
+"""How several commands put things."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from ss_flow.engine import Report
+
+
+def print_table(table: Table, out: Console) -> None:
+    """Print a table; into a file or a pipe at its full width."""
+    if not out.is_terminal:
+        out.width = 1000
+    out.print(table)
+
+
+def would_run(report: Report) -> list[dict[str, str]]:
+    """What a dry run says would be computed first: labels, and why."""
+    return [{"label": n["label"], "why": n["why"]} for n in report.nodes if n["event"] == "would run"]
+
+
+def plan_in_words(report: Report) -> str:
+    """What a dry run says in one line; of what follows from a result that is not there nothing is known."""
+    first = would_run(report)
+    there = f"{sum(node['event'] == 'hit' for node in report.nodes)} results are there"
+    if not first:
+        return f"{there}, all that is needed"
+    return f"{there}, at least {len(first)} would be computed, first {first[0]['label']}: {first[0]['why']}"

@@ -1,0 +1,119 @@
+"""What a Dask worker runs: one call after the other, as many at once as it has threads."""
+
+from __future__ import annotations
+
+import functools
+import os
+import pickle
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+from ss_flow.cache.errors import StoreFailure
+from ss_flow.cache.location import is_url
+from ss_flow.cache.store import Action
+from ss_flow.execute import Cancelled, Invocation, execute_here, find_task
+from ss_flow.executors import ExecutorLost
+from ss_flow.executors.worker import Worker
+from ss_flow.explain import first_difference
+from ss_flow.keys import Components, Recipe
+
+PROGRESS_SECONDS = 0.25
+TOPIC = "ss-flow"
+"""The Dask topic of signs of progress. One for all runs: its scheduler keeps the latest of each topic for ever."""
+
+_running: set[tuple[str, str]] = set()
+"""The calls that this process runs, each after the run that it belongs to."""
+_stopped: set[str] = set()
+"""The runs that were cancelled."""
+
+
+def run_call(packed: bytes, run: str, call: str) -> bytes:
+    """Run a packed call. Returns its action, or what was raised, packed."""
+    outcome: tuple[Action | None, Exception | None]
+    _running.add((run, call))
+    try:
+        outcome = _execute(pickle.loads(packed), run), None
+    except Exception as error:
+        outcome = None, error
+    finally:
+        _running.discard((run, call))
+    try:
+        reply = pickle.dumps(outcome)
+        pickle.loads(reply)
+    except Exception as fault:  # what cannot be pickled travels as its text
+        error = outcome[1]
+        reply = pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error} ({fault})")))
+    return reply
+
+
+def _execute(invocation: Invocation, run: str) -> Action:
+    from distributed import get_worker
+
+    worker = get_worker()
+    process: Worker | None = None
+    told = -PROGRESS_SECONDS
+
+    def listener(done: int, total: int, note: str) -> None:
+        nonlocal told
+        if run in _stopped:
+            if process is None:
+                raise Cancelled(invocation.label)
+            process.cancel()
+        elif time.monotonic() - told >= PROGRESS_SECONDS:
+            told = time.monotonic()
+            worker.log_event(TOPIC, (run, invocation.key, done, total, note))
+
+    if run in _stopped:
+        raise Cancelled(invocation.label)
+    _check_store(invocation.store)
+    _check_sameness(invocation)
+    if not invocation.isolate:
+        return execute_here(invocation, listener)
+    process = Worker()
+    try:
+        return process.run(invocation, listener)
+    finally:
+        process.stop()
+
+
+def _check_store(location: str) -> None:
+    """Raises StoreFailure when this host does not have the store; it must not make an empty one in its place."""
+    if not is_url(location) and not Path(location, "objects").is_dir():
+        raise StoreFailure(
+            f"the host {socket.gethostname()} does not have the store {location}: every worker of a Dask cluster must "
+            "find it in the same place. Put it on a shared file system (--cache DIR), and run again."
+        )
+
+
+def _check_sameness(invocation: Invocation) -> None:
+    """Raises ExecutorLost when this host's code, packages or processor are not those that the key stands for."""
+
+    def named(parts: Components) -> Components:
+        return {**parts, "code": {invocation.task: parts["code"]}}
+
+    wanted = invocation.components
+    if difference := first_difference(named(wanted), named({**wanted, **_recipe(invocation.task)})):
+        raise ExecutorLost(
+            f"a worker on the host {socket.gethostname()} would compute {invocation.label} otherwise: {difference}. "
+            "Every worker needs the same code, packages and kind of processor as the host that starts the run; "
+            "restart the workers after an update."
+        )
+
+
+@functools.cache
+def _recipe(task: str) -> Components:
+    return Recipe.of(find_task(task)).components
+
+
+def stop_calls(run: str) -> list[str]:
+    """Let no call of a run start here any more. Returns those that have started, which stop at their next progress."""
+    _stopped.add(run)
+    return [call for of, call in tuple(_running) if of == run]
+
+
+def dask_setup(worker: Any) -> None:
+    """Called by Dask in each worker process of a cluster on this machine, when it starts."""
+    os.setsid()  # Ctrl-C reaches the whole group; the parent decides
+    os.dup2(2, 1)  # what a library prints must not get between a document on stdout

@@ -1,0 +1,155 @@
+"""Resolving a graph that grows: which nodes are ready, and what each comes to."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ss_flow.graph import Call, Expand, Gather, Item, Node, Stored, sources_of
+from ss_flow.keys import Value
+
+
+@dataclass(frozen=True)
+class Failure:
+    """The value of a node that has none: it failed, or something it needs did."""
+
+    label: str
+    """The node that failed first."""
+    error: BaseException
+
+
+class Resolution:
+    """The values of nodes, as they become known.
+
+    load: gives the artifact of a digest, for what decides how the graph goes on. call: gets a call whose inputs are
+    known; it must be settled sooner or later. skipped: hears of a call that cannot be made, and why.
+    """
+
+    def __init__(
+        self, load: Callable[[str], Any], call: Callable[[Call], None], skipped: Callable[[Call, Failure], None]
+    ) -> None:
+        self._load, self._call, self._skipped = load, call, skipped
+        self.values: dict[Node, Value | Failure] = {}
+        self.known_calls = 0
+        """How many calls are needed, as far as the graph is known."""
+        self._unresolved: dict[Node, int] = {}
+        self._consumers: dict[Node, list[Node]] = defaultdict(list)
+        self._awaited: dict[Node, list[Callable[[], None]]] = defaultdict(list)
+        self._expanded: dict[Node, Node] = {}
+        self._ranks: dict[Node, int] = {}
+        self._ready: deque[Node] = deque()
+
+    def need(self, node: Node, settled: Callable[[], None] | None = None) -> None:
+        """Resolve this node too, and all that it needs. settled: called when it is."""
+        if settled is not None:
+            self._awaited[node].append(settled)
+        pending = [node]
+        while pending:
+            node = pending.pop()
+            if node in self._unresolved:
+                continue
+            self.known_calls += isinstance(node, Call)
+            sources = list(dict.fromkeys(sources_of(node)))
+            self._await(node, sources)
+            pending.extend(sources)
+
+    def resolve_ready(self) -> bool:
+        """Go as far as is possible without another result; False when that was no step."""
+        moved = bool(self._ready)
+        while self._ready:
+            self._resolve(self._ready.popleft())
+        return moved
+
+    def settle(self, node: Node, value: Value | Failure) -> None:
+        """A node has come to this."""
+        self.values[node] = value
+        for consumer in self._consumers.pop(node, ()):
+            self._unresolved[consumer] -= 1
+            if self._unresolved[consumer] == 0:
+                self._ready.append(consumer)
+        for settled in self._awaited.pop(node, ()):
+            settled()
+
+    def rank(self, node: Node) -> int:
+        """The longest path from a node to a target, in nodes, as far as it is known when first asked."""
+        pending = [node]
+        while pending:
+            current = pending[-1]
+            consumers = self._consumers.get(current, [])
+            unranked = [c for c in consumers if c not in self._ranks]
+            if unranked:
+                pending.extend(unranked)
+            else:
+                self._ranks[pending.pop()] = 1 + max((self._ranks[c] for c in consumers), default=0)
+        return self._ranks[node]
+
+    def producer(self, node: Node) -> str:
+        """The step whose result a node's value is (seen through lists and expansions)."""
+        while not isinstance(node, Call):
+            if isinstance(node, Gather) and node.rows:
+                node = node.rows[0][node.position]
+            elif sources := [self._expanded[node]] if node in self._expanded else sources_of(node):
+                node = sources[0]
+            else:
+                return node.step
+        return node.step
+
+    def _await(self, node: Node, sources: Sequence[Node]) -> None:
+        missing = [source for source in sources if source not in self.values]
+        for source in missing:
+            self._consumers[source].append(node)
+        self._unresolved[node] = len(missing)
+        if not missing:
+            self._ready.append(node)
+
+    def _resolve(self, node: Node) -> None:
+        match node:
+            case _ if node in self._expanded:
+                self.settle(node, self.values[self._expanded[node]])
+            case Gather():
+                self.settle(node, self._gathered(node))
+            case Stored():
+                self.settle(node, node.value)
+            case _ if (failed := self._failed_source(node)) is not None:
+                if isinstance(node, Call):
+                    self._skipped(node, failed)
+                self.settle(node, failed)
+            case Call():
+                self._call(node)
+            case Item():
+                value = self.values[node.source]
+                assert isinstance(value, tuple), f"{node.label} is one of a list, but its source is a single artifact"
+                self.settle(node, value[node.index])
+            case Expand():
+                self._expand(node)
+
+    def _failed_source(self, node: Node) -> Failure | None:
+        for source in sources_of(node):
+            if isinstance(value := self.values[source], Failure):
+                return value
+        return None
+
+    def _gathered(self, node: Gather) -> Value | Failure:
+        failed = self._failed_source(node)
+        whole = node.rows
+        if failed is not None:
+            whole = [row for row in node.rows if not any(isinstance(self.values[n], Failure) for n in row)]
+            if node.on_error == "fail" or not whole:
+                return failed
+        return _flattened(self.values[row[node.position]] for row in whole)
+
+    def _expand(self, node: Expand) -> None:
+        values: list[Any] = [self.values[source] for source in node.sources]
+        arguments = [self._load(v) if node.loads and isinstance(v, str) else len(v) for v in values]
+        with node.flow.building(node.item):
+            inner = node.build(*arguments)
+        self._expanded[node] = inner
+        self.need(inner)
+        self._await(node, [inner])
+
+
+def _flattened(values: Iterable[Any]) -> tuple[str, ...]:
+    """Digests of single artifacts and of lists, as one list."""
+    return tuple(d for value in values for d in ((value,) if isinstance(value, str) else value))

@@ -1,0 +1,39 @@
+"""Trivial tasks, so that what is measured is the engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ss_flow.graph import each, gather, labelled
+from ss_flow.task import task
+
+
+@dataclass(frozen=True)
+class Number:
+    value: np.ndarray
+
+
+@task(name="bench.source")
+def source(*, value: float) -> Number:
+    return Number(np.array([value]))
+
+
+@task(name="bench.step")
+def step(x: Number, *, factor: float) -> Number:
+    return Number(factor * x.value)
+
+
+@task(name="bench.total")
+def total(xs: tuple[Number, ...]) -> Number:
+    return Number(np.array([sum(float(x.value[0]) for x in xs)]))
+
+
+def flow(count: int) -> dict[str, Any]:
+    sources = []
+    for i in range(count):
+        with labelled(str(i)):
+            sources.append(source(value=float(i)))
+    return {"total": total(each(gather(sources), build=lambda x: step(x, factor=2.0)))}
