@@ -13,6 +13,7 @@ ORDER = list(FLOORS)
 LATE = {f"ss_flow.tasks.gaussians.{name}" for name in ("autograd", "cuda", "torch_backend")}
 """Modules that cannot be defined without torch, and so are imported inside functions only."""
 HEAVY = {"torch", "cv2", "scipy", "open3d", "onnxruntime", "onnx", "pycolmap", "zarr", "matplotlib", "jinja2"}
+HEAVY |= {"dask", "distributed", "obstore"}
 
 
 def floor_of(module: str) -> str | None:

@@ -128,7 +128,7 @@ def prepare(
     )
 
     def reference(path: Path) -> FileRef:
-        return FileRef(path, digests(path))
+        return FileRef(path.absolute(), digests(path))  # a worker may stand in another folder
 
     def build() -> dict[str, Any]:
         held_out = scene.root / "held_out"

@@ -97,7 +97,7 @@ def _connected(address: str) -> Iterator[Any]:
             "`dask scheduler` prints."
         ) from error
     if there != (here := distributed.__version__):
-        raise InputError(f"the Dask cluster at {address!r} has distributed {there}, and this host {here}; align them.")
+        raise InputError(f"the Dask cluster at {address!r} has distributed {there}, not {here} as this host has.")
     with distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, CONNECT_SECONDS)
@@ -197,9 +197,9 @@ class DaskCluster:
         )
 
     def _heard(self, event: tuple[float, tuple[str, str, int, int, str]]) -> None:
-        run, *sign = event[1]
+        run, key, done, total, note = event[1]
         if run == self._run:
-            self._on_progress(*sign)
+            self._on_progress(key, done, total, note)
 
     def _workers(self) -> list[dict[str, Any]]:
         """What Dask knows of the workers that are there now."""

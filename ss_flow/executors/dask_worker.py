@@ -43,8 +43,8 @@ def run_call(packed: bytes, run: str, call: str) -> bytes:
         reply = pickle.dumps(outcome)
         pickle.loads(reply)
     except Exception as fault:  # what cannot be pickled travels as its text
-        error = outcome[1]
-        reply = pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error} ({fault})")))
+        raised = outcome[1]
+        reply = pickle.dumps((None, RuntimeError(f"{type(raised).__name__}: {raised} ({fault})")))
     return reply
 
 

@@ -127,6 +127,13 @@ def test_what_a_task_raises_comes_back_as_itself(store, executor):
     assert str(error) == "negative"
 
 
+def test_what_cannot_travel_comes_back_as_its_text(store, executor):
+    error = executor.error(call(store, toy.unsayable, 2.0))
+    assert type(error) is (ValueError if executor.name == "threads" else RuntimeError)
+    assert "two is too much" in str(error)
+    assert value(store, executor.run(call(store, toy.square, 3.0)).outputs[0]) == 9.0
+
+
 def test_an_isolated_call_has_a_process_of_its_own_which_ends_with_it(store, executor):
     pids = [int(value(store, executor.run(call(store, toy.own_process, x)).outputs[0])) for x in (1.0, 2.0)]
     assert len({*pids, os.getpid()}) == 3
@@ -415,7 +422,7 @@ def test_an_address_where_nobody_answers_is_refused_in_one_sentence(store, monke
 
 def test_a_cluster_of_another_version_is_refused_in_one_sentence(store, servers, monkeypatch):
     monkeypatch.setattr("distributed.__version__", "2020.1.0")
-    with pytest.raises(InputError, match=r"has distributed 20\d\d\.\d+\.\d+, and this host 2020\.1\.0"):
+    with pytest.raises(InputError, match=r"has distributed 20\d\d\.\d+\.\d+, not 2020\.1\.0"):
         open_executor(f"dask://{servers.address}", 1, store, print)
 
 

@@ -267,7 +267,7 @@ claims.EXPIRY_SECONDS, claims._lives = 0.0, lambda pid, started: False
 
 @pytest.mark.parametrize("before", ["", CLAIMS_EXPIRE_AT_ONCE], ids=["claims hold", "claims expire"])
 def test_several_processes_at_once_share_the_work_of_one_flow(store, before):
-    many = "toy.total(toy.each(toy.source(values=tuple(map(float, range(40)))), build=lambda x: toy.given_cores(x)))"
+    many = "toy.total(toy.each(toy.source(values=tuple(map(float, range(40)))), build=toy.nap))"
     several = [start(store, many, before=before) for _ in range(4)]
     assert [process.communicate()[1] for process in several] == [""] * 4
     finished = [

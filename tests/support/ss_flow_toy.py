@@ -164,3 +164,15 @@ def loud(x: Number) -> Number:
     print("noise", flush=True)
     os.write(1, b"noise of native code\n")
     return x
+
+
+@task()
+def unsayable(x: Number) -> Number:
+    """Raises what cannot be pickled."""
+    raise ValueError("two is too much", lambda: x)
+
+
+@task()
+def nap(x: Number) -> Number:
+    time.sleep(0.05)
+    return x
