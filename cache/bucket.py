@@ -71,7 +71,7 @@ class Bucket:
         """A file's content; None when it is not there."""
         with self._reaching(), contextlib.suppress(FileNotFoundError):
             found = self._store.get(name)
-            return bytes(found.bytes()), _meta(found.meta)
+            return bytes(found.bytes()), _meta(name, found.meta)
         return None
 
     def blocks(self, name: str) -> Iterator[bytes]:
@@ -82,14 +82,14 @@ class Bucket:
     def head(self, name: str) -> Meta | None:
         """What is said of a file; None when it is not there."""
         with self._reaching(), contextlib.suppress(FileNotFoundError):
-            return _meta(self._store.head(name))
+            return _meta(name, self._store.head(name))
         return None
 
     def files(self, folder: str) -> Iterator[Meta]:
         """All files below a folder."""
         with self._reaching():
             for some in self._store.list(folder, chunk_size=1000):
-                yield from map(_meta, some)
+                yield from (_meta(said["path"], said) for said in some)
 
     def folders(self, folder: str) -> list[str]:
         """The names of the folders in a folder."""
@@ -149,9 +149,9 @@ class Bucket:
             ) from error
 
 
-def _meta(said: Any) -> Meta:
-    version = {name: said[name] for name in ("e_tag", "version") if said[name]}
-    return Meta(said["path"], said["size"], said["last_modified"].timestamp(), version)
+def _meta(name: str, said: Any) -> Meta:
+    version = {part: said[part] for part in ("e_tag", "version") if said[part]}
+    return Meta(name, said["size"], said["last_modified"].timestamp(), version)
 
 
 def _reason(error: Exception) -> str:

@@ -103,18 +103,18 @@ class Claims:
         return False
 
     def release(self, key: str) -> None:
-        """Give a claim back. One that cannot be reached is stale after a while."""
+        """Give a claim back. Raises StoreFailure."""
         with self._lock:
             self._held.discard(key)
-        with contextlib.suppress(OSError):
-            if (seen := self._ours(key)) is not None:
-                self._place.remove(key, seen)
+        if (seen := self._ours(key)) is not None:
+            self._place.remove(key, seen)
 
     def release_all(self) -> None:
         """Give every claim back, and stop the heartbeat."""
         self._stop.set()
         for key in list(self._held):
-            self.release(key)
+            with contextlib.suppress(OSError):
+                self.release(key)
 
     def living(self) -> set[str]:
         """The keys that are claimed by processes that may be alive."""
@@ -152,6 +152,8 @@ class Claims:
         return self._place.remove(key, seen)
 
     def _is_stale(self, key: str, seen: Seen) -> bool:
+        if seen.content == self._token and key not in self._held:
+            return True  # the answer to making or removing it was lost
         try:
             holder = json.loads(seen.content)
             if holder["host"] == _this_process()["host"] and not _lives(holder["pid"], holder["started"]):

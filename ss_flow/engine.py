@@ -225,6 +225,7 @@ class _Run:
             if gone.digest in self._healed:
                 raise StoreFailure(f"{gone}, and this run does not make it; run its scene again.") from None
             self._healed.add(gone.digest)
+            self._store.restore(gone.digest)
             self.tell("restarted", because=str(gone))
             return False
         return True

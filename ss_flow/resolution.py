@@ -55,12 +55,15 @@ class Resolution:
             self._await(node, sources)
             pending.extend(sources)
 
-    def resolve_ready(self) -> bool:
-        """Go as far as is possible without another result; False when that was no step."""
-        moved = bool(self._ready)
+    @property
+    def ready(self) -> bool:
+        """Whether there is a node whose sources are settled."""
+        return bool(self._ready)
+
+    def resolve_ready(self) -> None:
+        """Go as far as is possible without another result."""
         while self._ready:
             self._resolve(self._ready.popleft())
-        return moved
 
     def settle(self, node: Node, value: Value | Failure) -> None:
         """A node has come to this."""

@@ -102,11 +102,11 @@ class Scheduler:
             for node in nodes:
                 self._graph.need(node, functools.partial(count_down, flow, missing))
         while left:
-            moved = self._graph.resolve_ready()
+            self._graph.resolve_ready()
             self._submit()
             if self._running or self._claimed_elsewhere:
                 self._collect()
-            elif left and not moved:
+            elif left and not self._graph.ready:
                 raise RuntimeError("the flow waits for itself: a node depends on what it expands to")
 
     def drain(self) -> None:

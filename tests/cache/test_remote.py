@@ -536,6 +536,15 @@ def test_the_claim_of_a_dead_process_of_this_machine_is_taken_over_at_once(two, 
     assert first.take("k")
 
 
+def test_a_claim_of_ours_whose_making_was_never_confirmed_is_in_nobodys_way(two, bucket):
+    first, second = two
+    bucket.put("claims/k", first._token)
+    assert not second.take("k")
+    assert first.take("k")
+    first.release("k")
+    assert names(bucket, "claims") == []
+
+
 def test_of_several_that_find_a_stale_claim_one_gets_it(opened, bucket, two):
     bucket.put("claims/k", json.dumps({**json.loads(two[0]._token), "pid": 2**22 + 1}).encode())
     several = [opened(f"m{i}").open_claims() for i in range(4)]
