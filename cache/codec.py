@@ -15,6 +15,7 @@ import math
 import os
 import stat
 import typing
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ MOST_COMPRESSION = 256
 """More than lz4 can gain: an array that claims to hold more than so many times its files is refused."""
 TRUSTED_PREFIXES = ("ss_flow.", "ss_flow_")
 FORMAT = 2
+READERS = 2
+"""Threads that unpack one array; more wait for memory."""
 MOST_HEADER_BYTES = 64 << 20
 DTYPES = frozenset(
     ["bool", "complex64", "complex128", *(f"float{n}" for n in (16, 32, 64))]
@@ -155,7 +158,7 @@ def _read_array(folder: Path) -> np.ndarray:
         stored = sum(f.stat().st_size for f in (folder / "c").rglob("*") if f.is_file())
         if declared > MOST_COMPRESSION * stored:
             raise ValueError(f"{folder}: damaged; {declared} bytes are declared, but {stored} stored")
-        return _read_zarr(folder)
+        return _read_chunks(folder, shape, chunk, dtype)
     if not declared:
         return np.zeros(shape, dtype)
     content = _read_file(folder / _only_chunk(shape), declared)
@@ -164,10 +167,29 @@ def _read_array(folder: Path) -> np.ndarray:
     return np.frombuffer(content, dtype.newbyteorder("<")).reshape(shape)
 
 
-def _read_zarr(folder: Path) -> np.ndarray:
-    import zarr
+def _read_chunks(folder: Path, shape: tuple[int, ...], chunk: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Chunks that lie one after the other along the first axis, in a third of the time that Zarr takes."""
+    from numcodecs import blosc
 
-    return np.asarray(zarr.open_array(store=folder, mode="r", zarr_format=3)[...])
+    if chunk[1:] != shape[1:]:
+        raise ValueError(f"{folder}: damaged; chunks of {chunk} do not lie along the first axis of {shape}")
+    content = np.empty(shape, dtype.newbyteorder("<"))
+    chunk_bytes = math.prod(chunk) * dtype.itemsize
+
+    def read(number: int) -> None:
+        rows = content[number * chunk[0] : (number + 1) * chunk[0]]
+        packed = _read_file(folder.joinpath("c", str(number), *("0" for _ in shape[1:])), 2 * chunk_bytes)
+        size = int.from_bytes(packed[4:8], "little")  # Blosc's header: how much memory unpacking takes
+        if size != chunk_bytes:
+            raise ValueError(f"{folder}: damaged; chunk {number} holds {size} bytes, not {chunk_bytes}")
+        if len(rows) == chunk[0]:
+            blosc.decompress(packed, rows)
+        else:  # the last chunk is as large as the others
+            rows[...] = np.frombuffer(blosc.decompress(packed), content.dtype, rows.size).reshape(rows.shape)
+
+    with ThreadPoolExecutor(READERS) as pool:
+        list(pool.map(read, range(-(-shape[0] // chunk[0]))))
+    return content
 
 
 def _read_file(path: Path, most: int) -> bytes:

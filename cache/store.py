@@ -236,7 +236,7 @@ class Store:
         path = f"{self._actions}/{key[:2]}/{key}.json"
         try:
             content, modified = _read(path)
-            action = _action_of(json.loads(content), key)
+            action = _action_of(json.loads(content.decode()), key)
         except (FileNotFoundError, ValueError, TypeError, KeyError):  # not there, or not one of ours
             return None
         if not whole:

@@ -12,6 +12,8 @@ from typing import IO, Any
 
 from ss_flow.cache.errors import writing
 
+_as_json = json.JSONEncoder(check_circular=False).encode
+
 
 class Reporter:
     """Hears what the scheduler does; this one is silent."""
@@ -66,7 +68,7 @@ class JsonLines(Reporter):
         self._stream: IO[str] = path.open("a", encoding="utf-8", buffering=1 << 16)
 
     def event(self, kind: str, **details: Any) -> None:
-        self._held_back.append(json.dumps({"time": round(time.time(), 3), "event": kind, **details}))
+        self._held_back.append(_as_json({"time": round(time.time(), 3), "event": kind, **details}))
         if kind != "hit":
             self.pause()
 

@@ -118,13 +118,9 @@ class Flow:
 
         Raises TypeError when the arguments do not fit the task, or an input is not a node.
         """
-        bound = task.signature.bind(*args, **kwargs)
-        bound.apply_defaults()
-        inputs: dict[str, Node] = {}
-        for name in task.inputs:
-            value = bound.arguments.pop(name)
-            inputs[name] = value if isinstance(value, Node) else gather(value)
-        return self.attach(Call(self, task.name, _item.get(), task, inputs, dict(bound.arguments)))
+        given = task.arguments(args, kwargs)
+        inputs = {name: value if isinstance(value, Node) else gather(value) for name, value in given[0].items()}
+        return self.attach(Call(self, task.name, _item.get(), task, inputs, given[1]))
 
     def graph(self) -> nx.DiGraph:
         """What feeds what, over all the nodes known so far."""
@@ -186,10 +182,11 @@ def each(
     def build_rows(lengths: tuple[int, ...]) -> None:
         if len(set(lengths)) != 1:
             raise ValueError(f"lists of different lengths side by side: {lengths}")
-        for index in range(lengths[0]):
-            with flow.building(names[index] if names else str(index)):
+        with flow.building():
+            for index in range(lengths[0]):
+                _item.set(names[index] if names else str(index))
                 result = build(*(source[index] for source in lists))
-            rows.append(result if isinstance(result, tuple) else (result,))
+                rows.append(result if isinstance(result, tuple) else (result,))
 
     def build_list(position: int, *lengths: int) -> Node:
         if not rows:

@@ -109,24 +109,27 @@ class Resolution:
 
     def _resolve(self, node: Node) -> None:
         match node:
-            case _ if node in self._expanded:
-                self.settle(node, self.values[self._expanded[node]])
-            case Gather():
-                self.settle(node, self._gathered(node))
-            case Stored():
-                self.settle(node, node.value)
-            case _ if (failed := self._failed_source(node)) is not None:
-                if isinstance(node, Call):
-                    self._skipped(node, failed)
-                self.settle(node, failed)
             case Call():
-                self._call(node)
+                if (failed := self._failed_source(node)) is None:
+                    self._call(node)
+                else:
+                    self._skipped(node, failed)
+                    self.settle(node, failed)
             case Item():
                 value = self.values[node.source]
-                assert isinstance(value, tuple), f"{node.label} is one of a list, but its source is a single artifact"
-                self.settle(node, value[node.index])
+                assert not isinstance(value, str), f"{node.label} is one of a list, but its source is a single artifact"
+                self.settle(node, value if isinstance(value, Failure) else value[node.index])
+            case Gather():
+                self.settle(node, self._gathered(node))
             case Expand():
-                self._expand(node)
+                if node in self._expanded:
+                    self.settle(node, self.values[self._expanded[node]])
+                elif (failed := self._failed_source(node)) is not None:
+                    self.settle(node, failed)
+                else:
+                    self._expand(node)
+            case Stored():
+                self.settle(node, node.value)
 
     def _failed_source(self, node: Node) -> Failure | None:
         for source in sources_of(node):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
@@ -59,6 +59,25 @@ class Task(Generic[P, R]):
     @functools.cached_property
     def signature(self) -> inspect.Signature:
         return inspect.signature(self.function)
+
+    def arguments(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What a call was given: its inputs and its parameters by name, each in the order of their declaration.
+
+        Raises TypeError when that does not fit the task.
+        """
+        defaults = self._defaults
+        if len(args) == len(self.inputs) and kwargs.keys() <= defaults.keys():
+            parameters = {name: kwargs.get(name, default) for name, default in defaults.items()}
+            if not any(value is inspect.Parameter.empty for value in parameters.values()):
+                return dict(zip(self.inputs, args, strict=True)), parameters
+        bound = self.signature.bind(*args, **kwargs)  # slower; says what is wrong
+        bound.apply_defaults()
+        return {name: bound.arguments.pop(name) for name in self.inputs}, dict(bound.arguments)
+
+    @functools.cached_property
+    def _defaults(self) -> dict[str, Any]:
+        """The parameters by name; `Parameter.empty` for one that has no default."""
+        return {p.name: p.default for p in self.signature.parameters.values() if p.kind == p.KEYWORD_ONLY}
 
     @functools.cached_property
     def inputs(self) -> dict[str, bool]:
