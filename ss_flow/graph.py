@@ -34,7 +34,7 @@ class Node:
     def label(self) -> str:
         return f"{self.step}[{self.item}]" if self.item else self.step
 
-    def __getitem__(self, index: int) -> Item:
+    def __getitem__(self, index: int) -> Node:
         """One artifact of a list."""
         return self.flow.attach(Item(self.flow, self.step, str(index), self, index))
 
@@ -64,6 +64,15 @@ class Gather(Node):
     position: int
     on_error: OnError
     """With "skip", a row in which anything failed is left out."""
+
+    def __getitem__(self, index: int) -> Node:
+        """One artifact of the list: where each row is one call's single result, that call."""
+        return self.rows[index][self.position] if self._is_of_calls else super().__getitem__(index)
+
+    @functools.cached_property
+    def _is_of_calls(self) -> bool:
+        column = [row[self.position] for row in self.rows]
+        return self.on_error == "fail" and all(isinstance(n, Call) and not n.task.returns_list for n in column)
 
 
 @dataclass(eq=False)
