@@ -117,11 +117,7 @@ def read(folder: Path) -> Any:
     Raises ValueError when it is damaged, of a type that is not one of this package's dataclasses, or was written by
     another format.
     """
-    try:
-        header: dict[str, Any] = json.loads(_read_file(folder / "zarr.json", MOST_HEADER_BYTES))["attributes"]
-        form, name, content = header.get("format"), header["type"], header["values"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{folder}: not a stored object ({error})") from None
+    form, name, content = _header(folder)
     if form != FORMAT:
         raise ValueError(f"{folder}: object format {form}, this version reads format {FORMAT}")
     kind = type_named(name)
@@ -131,6 +127,23 @@ def read(folder: Path) -> Any:
         return kind(**values)
     except (OSError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError) as error:
         raise ValueError(f"{folder}: damaged; {type(error).__name__}: {error}") from None
+
+
+def is_current(folder: Path) -> bool:
+    """Whether an object was written in the format that `read` reads."""
+    try:
+        return _header(folder)[0] == FORMAT
+    except ValueError:
+        return False
+
+
+def _header(folder: Path) -> tuple[Any, Any, Any]:
+    """Format, type and plain values. Raises ValueError when they cannot be read."""
+    try:
+        header: dict[str, Any] = json.loads(_read_file(folder / "zarr.json", MOST_HEADER_BYTES))["attributes"]
+        return header.get("format"), header["type"], header["values"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{folder}: not a stored object ({error})") from None
 
 
 def _field(folder: Path, name: str, content: dict[str, Any], hints: dict[str, Any]) -> Any:

@@ -134,6 +134,8 @@ class Store:
         """
         object_digest = digest(value)
         target = self.object_path(object_digest)
+        if target.is_dir() and not codec.is_current(target):
+            self._take_out(target, math.inf)
         with writing(self.root):
             try:
                 os.utime(target)  # used again: it must not be collected before its action is recorded

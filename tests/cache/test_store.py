@@ -53,6 +53,14 @@ def test_storing_the_same_twice_writes_once(store):
     assert {f: f.stat().st_mtime_ns for f in store.object_path(first).rglob("*")} == files
 
 
+def test_an_object_in_the_format_of_another_version_is_written_anew(store):
+    value = LabelMap("x", np.ones((2, 2), np.uint16))
+    header = store.object_path(store.put(value)) / "zarr.json"
+    header.write_text(header.read_text().replace(f'"format": {codec.FORMAT}', '"format": 0'))
+    again = Store(store.root)
+    assert again.get(again.put(value)).ids.sum() == 4
+
+
 def test_a_writer_that_loses_the_race_takes_it_as_a_hit(store, monkeypatch):
     value = LabelMap("x", np.ones((2, 2), np.uint16))
     write = codec.write
