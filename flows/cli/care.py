@@ -31,6 +31,9 @@ DEGRADED = 3
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 T = TypeVar("T")
 
+SHOWN = 10
+"""Damaged things that are named one by one."""
+
 
 @dataclass(frozen=True)
 class CacheCollect:
@@ -206,8 +209,10 @@ class CacheVerify:
         else:
             out = console(json=False)
             out.print(_table("read", {"objects": seen.objects, "results": seen.actions, "closures": seen.closures}, {}))
-            for damage in seen.damaged:
+            for damage in seen.damaged[:SHOWN]:
                 out.print(escape(f"taken out: {damage.kind} {damage.name[:12]} {damage.reason}"))
+            if len(seen.damaged) > SHOWN:
+                out.print(f"... and {len(seen.damaged) - SHOWN} more; --json lists them all")
             if seen.incomplete:
                 out.print(f"{seen.incomplete} results lack something, and are made again when they are needed")
             out.print("[yellow]damaged[/]" if seen.damaged else "all is whole")
