@@ -54,8 +54,8 @@ class Terminal(Reporter):
         elif kind in ("retried", "restarted"):
             self._console.print(f"[yellow]again[/]  {label}: {escape(details['because'])}", highlight=False)
         elif kind == "stopping" and details["running"]:
-            waiting = f"{len(details['running'])} running steps finish, or keep what they have"
-            self._console.print(f"[yellow]stopping[/] when {waiting}; Ctrl-C again stops at once", highlight=False)
+            words = f"waiting for what runs ({len(details['running'])}) to finish, or to keep what it has"
+            self._console.print(f"[yellow]stopping[/] {words}; Ctrl-C again stops at once", highlight=False)
 
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
         if (label := escape(label)) in self._rows:
