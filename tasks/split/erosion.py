@@ -48,9 +48,10 @@ def interiors(masks: MaskSet, params: ErosionParams, *, nested: bool) -> list[In
     dense = masks.dense()
     if not len(dense):
         return []
-    on_top = None if nested else exclusive(masks)
+    order = canonical_order(dense)
+    on_top = None if nested else exclusive(dense, order)
     found = []
-    for index in canonical_order(dense):
+    for index in order:
         mask = dense[index] if on_top is None else on_top == index
         pixels = np.flatnonzero(erode(mask, params)).astype(np.int32)
         if pixels.size:

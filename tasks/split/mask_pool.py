@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, MaskSet
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
 
 
 def canonical_order(masks: Bool) -> Int32:
@@ -15,24 +15,24 @@ def canonical_order(masks: Bool) -> Int32:
     """
     if not len(masks):
         return np.zeros(0, np.int32)
-    count, height, width = masks.shape
-    areas = masks.sum(axis=(1, 2), dtype=np.int64)
-    row_sums = masks.sum(axis=2, dtype=np.int64) @ np.arange(height)
-    column_sums = masks.sum(axis=1, dtype=np.int64) @ np.arange(width)
+    count, width = len(masks), masks.shape[2]
     packed = pack(masks)
-    keys = [(-int(areas[i]), int(row_sums[i]), int(column_sums[i]), packed[i].tobytes()) for i in range(count)]
+    keys = []
+    for index in range(count):
+        row, column = np.divmod(np.flatnonzero(masks[index]), width)
+        keys.append((-len(row), int(row.sum()), int(column.sum()), packed[index].tobytes()))
     return np.array(sorted(range(count), key=keys.__getitem__), np.int32)
 
 
-def exclusive(masks: MaskSet) -> Int32:
+def exclusive(masks: Bool, order: Int32) -> Int32:
     """One mask a pixel: large masks painted first, smaller ones on top (spec S1).
 
-    Returns [H, W] the index of the mask that owns each pixel, -1 where there is none.
+    masks: [N, H, W]; order: their canonical order. Returns [H, W] the index of the mask that owns each pixel, -1 where
+    there is none.
     """
-    dense = masks.dense()
-    owner = np.full((masks.height, masks.width), -1, np.int32)
-    for index in canonical_order(dense):
-        owner[dense[index]] = index
+    owner = np.full(masks.shape[1:], -1, np.int32)
+    for index in order:
+        owner[masks[index]] = index
     return owner
 
 

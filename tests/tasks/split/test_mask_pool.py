@@ -4,7 +4,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ss_flow.tasks.artifacts import MaskSet
 from ss_flow.tasks.split.mask_pool import (
     canonical_order,
     drop_duplicates,
@@ -12,17 +11,12 @@ from ss_flow.tasks.split.mask_pool import (
     intersections,
     mask_tree,
     merge_union,
-    pack,
     suppress,
 )
 
 
-def mask_set(dense: np.ndarray) -> MaskSet:
-    n, height, width = dense.shape
-    ones = np.ones(n, np.float32)
-    return MaskSet(
-        "view", height, width, pack(dense), ones, ones, np.zeros(n, np.int32), np.full(n, -1, np.int32), "test"
-    )
+def on_top(dense: np.ndarray) -> np.ndarray:
+    return exclusive(dense, canonical_order(dense))
 
 
 def test_exclusive_map_puts_the_smaller_mask_on_top_whatever_the_order():
@@ -31,14 +25,14 @@ def test_exclusive_map_puts_the_smaller_mask_on_top_whatever_the_order():
     dense[1, 3, 4] = True  # 1 pixel, outside
     dense[2, 0:3, 0:4] = True  # 12 pixels
     expected = np.array([[2, 2, 2, 2, -1], [2, 0, 0, 2, -1], [2, 0, 0, 2, -1], [-1, -1, -1, -1, 1]])
-    np.testing.assert_array_equal(exclusive(mask_set(dense)), expected)
+    np.testing.assert_array_equal(on_top(dense), expected)
     back = np.array([1, 2, 0])  # new position -> old index
-    swapped = exclusive(mask_set(dense[back]))
+    swapped = on_top(dense[back])
     np.testing.assert_array_equal(np.where(swapped < 0, -1, back[swapped]), expected)
 
 
 def test_exclusive_map_of_no_masks_is_empty():
-    np.testing.assert_array_equal(exclusive(mask_set(np.zeros((0, 2, 3), bool))), np.full((2, 3), -1))
+    np.testing.assert_array_equal(on_top(np.zeros((0, 2, 3), bool)), np.full((2, 3), -1))
 
 
 def test_canonical_order_breaks_ties_of_area_by_row_then_column_of_the_centroid():
@@ -92,7 +86,7 @@ def test_tree_and_exclusive_map_do_not_depend_on_the_order_of_the_masks(seed, co
     first, second = dense[canonical_order(dense)], shuffled[canonical_order(shuffled)]
     np.testing.assert_array_equal(first, second)
     np.testing.assert_array_equal(mask_tree(first, 0.9), mask_tree(second, 0.9))
-    np.testing.assert_array_equal(exclusive(mask_set(first)), exclusive(mask_set(second)))
+    np.testing.assert_array_equal(on_top(first), on_top(second))
 
 
 @given(st.integers(0, 2**32 - 1))
