@@ -119,8 +119,8 @@ def cluster_masks(views: list[list[MaskPoints]], num_points: int, params: Consen
     state = Opinions(asked.say[clean], asked.held[clean])
     cluster = np.arange(len(clean), dtype=np.int32)
     counts = (state.say @ state.say.T).data
-    for percentile in range(95, -1, -5):
-        united = _components(state.agree(params.rate, max(1.0, float(np.percentile(counts, percentile)))))
+    for needed in np.percentile(counts, range(95, -1, -5)).tolist():
+        united = _components(state.agree(params.rate, max(1.0, needed)))
         state, cluster = state.merged(united), united[cluster]
     labels[clean] = cluster + 1
     return np.split(labels, bounds)
