@@ -8,6 +8,7 @@ than encoded by accident.
 from __future__ import annotations
 
 import dataclasses
+import re
 import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,6 +18,8 @@ import numpy as np
 from blake3 import blake3
 
 CHUNK_BYTES = 1 << 20
+DIGEST = re.compile(r"[0-9a-f]{64}")
+"""What a digest looks like."""
 _LENGTH = struct.Struct("<Q").pack
 _FLOAT = struct.Struct("<d").pack
 

@@ -24,7 +24,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ss_flow.cache.errors import writing
-from ss_flow.cache.store import GRACE_SECONDS, Entry, Store, remove
+from ss_flow.cache.files import remove
+from ss_flow.cache.store import GRACE_SECONDS, Entry, Store
 from ss_flow.cache.survey import Survey, Tally
 
 THREADS = 8

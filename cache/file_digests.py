@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ss_flow.cache.canonical import digest, digest_file
-from ss_flow.cache.store import write_atomically
+from ss_flow.cache.files import write_atomically
 
 T = TypeVar("T")
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import StoreFailure, writing
-from ss_flow.cache.store import Store, write_atomically
+from ss_flow.cache.files import write_atomically
+from ss_flow.cache.store import Store
 
 
 @dataclass(frozen=True)

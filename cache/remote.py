@@ -30,17 +30,17 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.cache.bucket import Bucket
-from ss_flow.cache.canonical import digest
+from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims, Seen
 from ss_flow.cache.errors import Gone, writing
-from ss_flow.cache.store import GRACE_SECONDS, MEMORY_BYTES, Action, Entry, Store, rename_folder, verified
+from ss_flow.cache.files import rename_folder, user_cache
+from ss_flow.cache.store import GRACE_SECONDS, MEMORY_BYTES, Action, Entry, Store, verified
 
 MANIFEST = "zarr.json"
 """The file of an object that is written last, and deleted first."""
 CLOCK = "clock"
 """An empty file that is written to learn the time by the bucket's clock."""
-_DIGEST = re.compile("[0-9a-f]{64}")
-_OF_OBJECT = re.compile(rf"objects/../(?P<digest>{_DIGEST.pattern})/(?P<file>.+)")
+_OF_OBJECT = re.compile(rf"objects/../(?P<digest>{DIGEST.pattern})/(?P<file>.+)")
 _FILE = re.compile(r"\w[\w.]*(/\w[\w.]*)*")
 
 
@@ -93,17 +93,23 @@ class RemoteStore(Store):
         self._known.add(object_digest)
 
     def _load(self, object_digest: str) -> Any:
-        target = self.object_path(object_digest)
-        if super().__contains__(object_digest):
-            with contextlib.suppress(ValueError):
-                return verified(target, object_digest)
-            super()._take_out(target, math.inf)
+        if (copy := self._copy(object_digest)) is not None:
+            return copy
         with self.temporary() as place:
             value = self._download(object_digest, place)
+            target = self.object_path(object_digest)
             with writing(self.root):
                 target.parent.mkdir(exist_ok=True)
                 rename_folder(place, target)
         return value
+
+    def _copy(self, object_digest: str) -> Any:
+        """The copy here, if there is one and it is whole; a damaged one is taken out."""
+        if super().__contains__(object_digest):
+            with contextlib.suppress(ValueError):
+                return verified(self.object_path(object_digest), object_digest)
+            super()._take_out(self.object_path(object_digest), math.inf)
+        return None
 
     def read(self, object_digest: str) -> Any:
         """The same, from the bucket, where it is there: the copy here may be whole when that one is damaged."""
@@ -138,13 +144,8 @@ class RemoteStore(Store):
 
     def restore(self, object_digest: str) -> None:
         self._known.discard(object_digest)
-        if super().__contains__(object_digest):
-            try:
-                verified(self.object_path(object_digest), object_digest)
-            except ValueError:
-                super()._take_out(self.object_path(object_digest), math.inf)
-            else:
-                self._upload(object_digest)
+        if self._copy(object_digest) is not None:
+            self._upload(object_digest)
 
     def size(self, object_digest: str) -> int:
         return super().size(object_digest) or sum(m.bytes for m in self._bucket.files(self._folder(object_digest)))
@@ -195,7 +196,7 @@ class RemoteStore(Store):
         found = dict(here)
         for meta in self._bucket.files(folder):
             name = Path(meta.name).stem
-            if _DIGEST.fullmatch(name):
+            if DIGEST.fullmatch(name):
                 used = here[name].used if name in here else 0.0
                 found[name] = Entry(name, max(used, meta.written), meta.bytes)
         return found
@@ -229,11 +230,8 @@ class RemoteStore(Store):
         self._bucket.put(self._name(path), text.encode())  # first: what is here is not looked for there
         super()._write(path, text)
 
-    def find(self, prefix: str) -> list[str]:
-        if len(prefix) < 2 or not re.fullmatch("[0-9a-f]+", prefix):
-            return []
-        there = self._bucket.folders(f"objects/{prefix[:2]}")
-        return sorted({*super().find(prefix), *(name for name in there if name.startswith(prefix))})
+    def _beginning(self, two: str) -> set[str]:
+        return {*super()._beginning(two), *self._bucket.folders(f"objects/{two}")}
 
     def now(self) -> float:
         self._bucket.put(CLOCK, b"")
@@ -282,10 +280,9 @@ class _BucketClaims:
 
 def default_folder(location: str) -> Path:
     """Where this machine keeps its copies of what a bucket holds: one folder for every location and endpoint."""
-    base = Path(os.environ.get("XDG_CACHE_HOME", "") or "~/.cache").expanduser()
     endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or ""
     readable = re.sub(r"\W+", "-", location)
-    return base / "ss-flow" / "buckets" / f"{readable}-{digest([location, endpoint])[:8]}"
+    return user_cache() / "buckets" / f"{readable}-{digest([location, endpoint])[:8]}"
 
 
 def _stamp(path: Path, used: float) -> None:

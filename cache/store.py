@@ -29,7 +29,6 @@ import json
 import math
 import os
 import re
-import shutil
 import socket
 import threading
 import time
@@ -43,15 +42,15 @@ from typing import Any
 import numpy as np
 
 from ss_flow.cache import codec
-from ss_flow.cache.canonical import digest
+from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, writing
+from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder
 
 MEMORY_BYTES = 2 << 30
 """How much of what was read lately a process keeps in memory."""
 GRACE_SECONDS = 3600.0
 """What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -107,6 +106,11 @@ class Store:
 
     def action_path(self, key: str) -> Path:
         return self.root / "actions" / key[:2] / f"{key}.json"
+
+    @property
+    def runs(self) -> Path:
+        """The folder of the runs, one folder each."""
+        return self.root / "roots" / "runs"
 
     @property
     def location(self) -> str:
@@ -177,7 +181,7 @@ class Store:
 
     def size(self, object_digest: str) -> int:
         """How many bytes an object takes; 0 when it is not there."""
-        return _folder_bytes(self.object_path(object_digest))
+        return folder_bytes(self.object_path(object_digest))
 
     def discard(self, object_digest: str, *, unused_since: float = math.inf) -> bool:
         """Take an object out, at once for all readers; False when it is not there, or was used since."""
@@ -207,18 +211,15 @@ class Store:
 
     def objects(self) -> Iterator[Entry]:
         """Every object."""
-        for folder in _entries(self._objects):
-            for entry in _entries(folder.path):
+        for folder in entries(self._objects):
+            for entry in entries(folder.path):
                 with contextlib.suppress(FileNotFoundError):
-                    yield Entry(entry.name, entry.stat().st_mtime, _folder_bytes(Path(entry.path)))
+                    yield Entry(entry.name, entry.stat().st_mtime, folder_bytes(Path(entry.path)))
 
     def actions(self) -> Iterator[Entry]:
         """Every action."""
-        for folder in _entries(self._actions):
-            for entry in _entries(folder.path):
-                with contextlib.suppress(FileNotFoundError):
-                    status = entry.stat()
-                    yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)
+        for folder in entries(self._actions):
+            yield from _records(folder.path)
 
     def _remember(self, object_digest: str, value: Any) -> None:
         size = _array_bytes(value)
@@ -237,7 +238,7 @@ class Store:
         """
         path = f"{self._actions}/{key[:2]}/{key}.json"
         try:
-            content, modified = _read(path)
+            content, modified = read_stamped(path)
             action = _action_of(json.loads(content.decode()), key)
         except (FileNotFoundError, ValueError, TypeError, KeyError):  # not there, or not one of ours
             return None
@@ -275,7 +276,11 @@ class Store:
         """Digests of the stored objects that begin with `prefix` (at least two characters)."""
         if len(prefix) < 2 or not re.fullmatch("[0-9a-f]+", prefix):
             return []
-        return sorted(path.name for path in (self.root / "objects" / prefix[:2]).glob(f"{prefix}*"))
+        return sorted(name for name in self._beginning(prefix[:2]) if name.startswith(prefix))
+
+    def _beginning(self, two: str) -> set[str]:
+        """Digests of the stored objects that begin with two characters."""
+        return {entry.name for entry in entries(f"{self._objects}/{two}")}
 
     @contextlib.contextmanager
     def temporary(self) -> Iterator[Path]:
@@ -298,11 +303,11 @@ class Store:
             place.touch()
             return place.stat().st_mtime
 
-    def sweep_temporaries(self, older_than_seconds: float = GRACE_SECONDS) -> int:
+    def sweep_temporaries(self) -> int:
         """Delete what killed processes left half-written; return how many. A writer at work is left alone by age."""
-        before = self.now() - older_than_seconds
+        before = self.now() - GRACE_SECONDS
         stale = 0
-        for entry in _entries(f"{self.root}/tmp"):
+        for entry in entries(f"{self.root}/tmp"):
             with contextlib.suppress(FileNotFoundError):  # its writer has just finished
                 if entry.stat().st_mtime < before:
                     remove(Path(entry.path))
@@ -311,63 +316,26 @@ class Store:
 
     def closures(self) -> Iterator[Entry]:
         """Every closure, by the digest of code."""
-        for entry in _entries(f"{self.root}/closures"):
-            with contextlib.suppress(FileNotFoundError):
-                status = entry.stat()
-                yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)
+        return _records(f"{self.root}/closures")
 
     def drop_closure(self, code: str, *, unused_since: float = math.inf) -> bool:
         """Take a closure out; False when it is not there, or was written since."""
         return self._take_out(self._closure_path(code), unused_since)
 
 
-def _entries(folder: str) -> list[os.DirEntry[str]]:
-    try:
-        with os.scandir(folder) as found:
-            return sorted(found, key=lambda entry: entry.name)
-    except FileNotFoundError:
-        return []
-
-
-def remove(path: Path) -> None:
-    """Delete a file or a folder, if it is there."""
-    try:
-        path.unlink()
-    except FileNotFoundError:
-        pass
-    except (IsADirectoryError, PermissionError):
-        shutil.rmtree(path, ignore_errors=True)
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that a reader, and a crash, sees the old content or the new, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f".{path.name}.{uuid.uuid4().hex}"
-    try:
-        with temporary.open("w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _read(path: str) -> tuple[bytes, float]:
-    """A small file's content, and when it was last changed: half the time of `open`, for what every hit does."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        status = os.fstat(handle)
-        return os.read(handle, status.st_size), status.st_mtime
-    finally:
-        os.close(handle)
+def _records(folder: str) -> Iterator[Entry]:
+    """The JSON files of a folder."""
+    for entry in entries(folder):
+        with contextlib.suppress(FileNotFoundError):
+            status = entry.stat()
+            yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)
 
 
 def _action_of(record: dict[str, Any], key: str) -> Action:
     """Raises ValueError, TypeError or KeyError for what is not the record of this key."""
     record["outputs"], record["warnings"] = tuple(record["outputs"]), tuple(record["warnings"])
     action = Action(**record)
-    if action.key != key or not isinstance(action.components, dict) or not all(map(_DIGEST.fullmatch, action.outputs)):
+    if action.key != key or not isinstance(action.components, dict) or not all(map(DIGEST.fullmatch, action.outputs)):
         raise ValueError(f"not the record of {key}")
     if not action.is_list and len(action.outputs) != 1:
         raise ValueError(f"one output is due, not {len(action.outputs)}")
@@ -380,20 +348,6 @@ def verified(folder: Path, object_digest: str) -> Any:
     if digest(value) != object_digest:
         raise ValueError("its content is not what its name says")
     return value
-
-
-def rename_folder(source: Path, target: Path) -> None:
-    """Give a complete folder its name, unless another writer was first."""
-    try:
-        source.rename(target)
-    except OSError:
-        # A folder cannot be renamed onto one that is not empty: another writer was first, with the same bytes.
-        if not target.is_dir():
-            raise
-
-
-def _folder_bytes(folder: Path) -> int:
-    return sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
 
 
 def _array_bytes(value: Any) -> int:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.cache.canonical import digest
-from ss_flow.cache.store import Store, write_atomically
+from ss_flow.cache.files import write_atomically
+from ss_flow.cache.store import Store
 from ss_flow.closure import code_closure
 from ss_flow.engine import Report
 from ss_flow.flows import settings

@@ -19,7 +19,7 @@ from ss_flow.executors import Executor, open_executor
 from ss_flow.graph import Flow, Node
 from ss_flow.keys import Value
 from ss_flow.resolution import Failure
-from ss_flow.runs import PreviousKeys, settled, start_run
+from ss_flow.runs import ENDS, PreviousKeys, settled, start_run
 from ss_flow.scheduler import Listening, Scheduler
 from ss_flow.task import Resources
 
@@ -60,7 +60,7 @@ class _Recorder(Reporter):
         self.events: list[dict[str, Any]] = []
 
     def event(self, kind: str, **details: Any) -> None:
-        if kind in ("hit", "finished", "failed", "skipped", "would run", "restarted"):
+        if kind in ENDS:
             self.events.append({"event": kind, **details})
 
 
@@ -170,7 +170,7 @@ class _Run:
         self.scheduler: Scheduler | None = None
         self._reported: dict[int, Report] = {}
         self._reporters: list[Reporter] = []
-        runs = store.root / "roots" / "runs"
+        runs = store.runs
         previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
         self._previous = [previous[request.scene] for request in requests]
         for position, request in enumerate(requests):

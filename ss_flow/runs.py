@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ss_flow.cache.store import write_atomically
+from ss_flow.cache.files import write_atomically
 
 DONE = ("hit", "finished")
 RUNS_BACK = 5

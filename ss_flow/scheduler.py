@@ -80,7 +80,7 @@ class Scheduler:
         self.failures: dict[Flow, list[Failure]] = {flow: [] for flow in flows}
         """Nodes that failed of themselves, in order."""
 
-    def run(self, targets: Mapping[Flow, Sequence[Node]], done: Callable[[Flow], None] = lambda flow: None) -> None:
+    def run(self, targets: Mapping[Flow, Sequence[Node]], done: Callable[[Flow], None]) -> None:
         """Resolve the targets and all they need, and nothing else. done: called when all those of a flow are settled.
 
         Raises Gone when an object turned out to be missing or damaged: what made it must run again, so start anew.

@@ -19,7 +19,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.cache.file_digests import FileDigests
-from ss_flow.cache.store import Store, write_atomically
+from ss_flow.cache.files import write_atomically
+from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import settings
@@ -28,20 +29,19 @@ from ss_flow.flows.cli.prepare import (
     Prefixed,
     Prepared,
     RunOptions,
-    check_writable,
     display,
     finish,
     first_failure,
     header,
     prepare,
 )
-from ss_flow.flows.cli.telling import plan_in_words, print_table, would_run
+from ss_flow.flows.cli.telling import hits_of, plan_in_words, print_table, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.measures import measures
 from ss_flow.flows.params import Params
 from ss_flow.sweep import rows_of
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.deliver.output import check_place
+from ss_flow.tasks.deliver.output import check_place, check_writable
 
 BATCH_FILE = "batch.json"
 COLOURS = {"ok": "green", "degraded": "yellow", "failed": "red"}
@@ -125,8 +125,7 @@ class Batch:
         if self.execution.json:
             rows: list[dict[str, Any]] = [{"scene": str(path), "error": error} for path, error in errors.items()]
             for path, report in zip(scenes, reports, strict=True):
-                hits = sum(node["event"] == "hit" for node in report.nodes)
-                rows.append({"scene": str(path), "hits": hits, "would_run": would_run(report)})
+                rows.append({"scene": str(path), "hits": hits_of(report), "would_run": would_run(report)})
             print(json.dumps(rows))
             return 0
         for path, error in errors.items():

@@ -24,10 +24,10 @@ from ss_flow.engine import RUN_CLAIM
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import StoreOptions, console
 from ss_flow.flows.cli.pins import tell_pins
+from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.runs import Run, latest_runs
 from ss_flow.units import parse_bytes, parse_seconds
 
-DEGRADED = 3
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 T = TypeVar("T")
 
@@ -74,7 +74,7 @@ class CacheCollect:
         runs = _delete(store, wanted.outdated, dry=self.dry_run)
         over = 0 if max_bytes is None else max(0, collected.left.bytes - max_bytes)
         self._tell(collected, runs, over)
-        return DEGRADED if over else 0
+        return STATUS_EXIT["degraded" if over else "ok"]
 
     def _tell(self, collected: Collected, runs: Tally, over: int) -> None:
         rows = {step or "records that cannot be read": tally for step, tally in collected.results.items()}
@@ -110,7 +110,7 @@ class Wanted:
             roots.objects.update(pinned.objects)
         later: Counter[str] = Counter()
         unknown = {name for name in living if name.startswith(RUN_CLAIM)}
-        for run in latest_runs(self._store.root / "roots" / "runs"):
+        for run in latest_runs(self._store.runs):
             claim = RUN_CLAIM + run.folder.name
             later[run.scene] += 1
             if claim in living:
@@ -182,7 +182,7 @@ class CacheUsage:
 
 def _keys_by_scene(store: Store, pins: list[Pin]) -> dict[str, set[str]]:
     scenes: dict[str, set[str]] = {}
-    for run in latest_runs(store.root / "roots" / "runs"):
+    for run in latest_runs(store.runs):
         scenes.setdefault(run.scene, set()).update(node["key"] for node in run.nodes())
     for pinned in pins:
         scenes.setdefault(pinned.scene or "(pinned)", set()).update(pinned.keys)
@@ -216,7 +216,7 @@ class CacheVerify:
             if seen.incomplete:
                 out.print(f"{seen.incomplete} results lack something, and are made again when they are needed")
             out.print("[yellow]damaged[/]" if seen.damaged else "all is whole")
-        return DEGRADED if seen.damaged else 0
+        return STATUS_EXIT["degraded" if seen.damaged else "ok"]
 
 
 def size_text(size: int) -> str:

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.file_digests import FileDigests
+from ss_flow.cache.files import user_cache
 from ss_flow.cache.location import is_url, open_store
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
@@ -61,7 +62,7 @@ class StoreOptions:
 
 def default_cache() -> Path:
     """The user's cache folder for ss-flow."""
-    return Path(os.environ.get("XDG_CACHE_HOME", "") or "~/.cache").expanduser() / "ss-flow" / "store"
+    return user_cache() / "store"
 
 
 def file_digests(store: Store, *, verify: bool = False) -> FileDigests:

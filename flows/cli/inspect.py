@@ -15,7 +15,8 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from ss_flow.cache.store import Store, write_atomically
+from ss_flow.cache.files import write_atomically
+from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import StoreOptions, console
 from ss_flow.runs import Run, latest_runs
@@ -263,7 +264,7 @@ def _described(value: Any) -> str:
 def latest_run(store: Store, scene: Path | None) -> Run:
     """The latest run of a scene, or of any. Raises InputError when there is none."""
     wanted = str(scene.resolve()) if scene else None
-    run = next(latest_runs(store.root / "roots" / "runs", wanted), None)
+    run = next(latest_runs(store.runs, wanted), None)
     if run is None:
         about = f" of {scene}" if scene else ""
         raise InputError(f"the store {store.location} knows no run{about}; `ss-flow run SCENE` makes one.")

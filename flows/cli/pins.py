@@ -63,7 +63,7 @@ class CachePin:
             return pin(store, found[0], "", makers, found)
         if found:
             raise InputError(f"{what!r} stands for {len(found)} results; give more of the digest.")
-        run = next(latest_runs(store.root / "roots" / "runs", str(Path(what).resolve())), None)
+        run = next(latest_runs(store.runs, str(Path(what).resolve())), None)
         if run is None:
             raise InputError(
                 f"{what!r} is neither a step of the latest run, nor a digest, nor a scene that was run; "

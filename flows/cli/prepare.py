@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -167,15 +166,6 @@ def finish(prepared: Prepared, report: Report, store: Store, out: Path | None) -
     if out is not None and document["status"] != "failed":
         deliver(out, store, document, report)
     return document
-
-
-def check_writable(folder: Path) -> None:
-    """Raises InputError unless files can be written into this folder, which need not be there yet."""
-    place = next(p for p in (folder.absolute(), *folder.absolute().parents) if p.exists())
-    if not place.is_dir() or not os.access(place, os.W_OK):
-        raise InputError(
-            f"{folder} cannot be written: {place} is not a writable folder; name another folder with --out."
-        )
 
 
 def first_failure(document: Mapping[str, Any]) -> str | None:

@@ -17,7 +17,7 @@ from ss_flow.engine import Report, run_flow
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import console, file_digests
 from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare
-from ss_flow.flows.cli.telling import would_run
+from ss_flow.flows.cli.telling import hits_of, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
 from ss_flow.tasks.capture.scene import open_scene
@@ -115,8 +115,9 @@ def _tell_plan(report: Report, out: Console, *, json_wanted: bool) -> int:
         out.print(escape(f"would run {node['label']}: {node['why']}"))
     for label in dict.fromkeys(n["step"] for n in follow):
         out.print(f"would follow {label}")
-    hits = sum(n["event"] == "hit" for n in report.nodes)
-    out.print(f"{hits} results are there, {len(would)} would be computed first, {len(follow)} or more would follow")
+    out.print(
+        f"{hits_of(report)} results are there, {len(would)} would be computed first, {len(follow)} or more would follow"
+    )
     return 0
 
 

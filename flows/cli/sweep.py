@@ -23,7 +23,6 @@ from ss_flow.flows.cli.prepare import (
     Prefixed,
     Prepared,
     RunOptions,
-    check_writable,
     display,
     finish,
     first_failure,
@@ -37,6 +36,7 @@ from ss_flow.flows.params import Params
 from ss_flow.runs import DONE
 from ss_flow.sweep import Row, grid, in_words, recorded_as, rows_of, values_of, zipped
 from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.deliver.output import check_writable
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ss_flow.cache.store import write_atomically
+from ss_flow.cache.files import write_atomically
 from ss_flow.flows.cli.telling import plan_in_words, print_table, would_run
 from ss_flow.flows.measures import HEADLINE
 from ss_flow.sweep import Row
@@ -105,9 +105,7 @@ def write_files(out: Path, rows: Sequence[Document], *, zipped: bool) -> list[st
     if picture is None:
         (out / "sweep.png").unlink(missing_ok=True)  # of an earlier sweep
         return ["sweep.json", "sweep.csv"]
-    filling = out / ".sweep.png.partial"
-    filling.write_bytes(picture)
-    filling.replace(out / "sweep.png")
+    write_atomically(out / "sweep.png", picture)
     return ["sweep.json", "sweep.csv", "sweep.png"]
 
 

@@ -20,10 +20,15 @@ def would_run(report: Report) -> list[dict[str, str]]:
     return [{"label": n["label"], "why": n["why"]} for n in report.nodes if n["event"] == "would run"]
 
 
+def hits_of(report: Report) -> int:
+    """How many results were there."""
+    return sum(node["event"] == "hit" for node in report.nodes)
+
+
 def plan_in_words(report: Report) -> str:
     """What a dry run says in one line; of what follows from a result that is not there nothing is known."""
     first = would_run(report)
-    there = f"{sum(node['event'] == 'hit' for node in report.nodes)} results are there"
+    there = f"{hits_of(report)} results are there"
     if not first:
         return f"{there}, all that is needed"
     return f"{there}, at least {len(first)} would be computed, first {first[0]['label']}: {first[0]['why']}"

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,10 +27,20 @@ def check_place(folder: Path) -> None:
         raise InputError(f"{folder} is a file; --out must name a folder.")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / RUN_FILE).is_file():
         raise InputError(f"{folder} holds something else than an earlier result; name another folder with --out.")
-    parent = next(p for p in folder.absolute().parents if p.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
+    _check_nearest(folder, folder.absolute().parents)
+
+
+def check_writable(folder: Path) -> None:
+    """Raises InputError unless files can be written into this folder, which need not be there yet."""
+    _check_nearest(folder, (folder.absolute(), *folder.absolute().parents))
+
+
+def _check_nearest(folder: Path, places: Iterable[Path]) -> None:
+    """Check the first of these places that is there."""
+    place = next(p for p in places if p.exists())
+    if not place.is_dir() or not os.access(place, os.W_OK):
         raise InputError(
-            f"{folder} cannot be written: {parent} is not a writable folder; name another folder with --out."
+            f"{folder} cannot be written: {place} is not a writable folder; name another folder with --out."
         )
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ss_flow.cache.files import user_cache
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 
@@ -138,7 +139,7 @@ def default_folders() -> tuple[Path, ...]:
 
 def cache_folder() -> Path:
     """Where `fetch` puts models."""
-    return Path(os.environ.get("XDG_CACHE_HOME", "") or "~/.cache").expanduser() / "ss-flow" / "models"
+    return user_cache() / "models"
 
 
 def blake3_of(path: Path) -> str:

@@ -14,7 +14,8 @@ from ss_flow.cache import codec
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.file_digests import FileDigests
-from ss_flow.cache.store import GRACE_SECONDS, Action, Store, write_atomically
+from ss_flow.cache.files import write_atomically
+from ss_flow.cache.store import GRACE_SECONDS, Action, Store
 from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, Metrics, PointCloud
 
 arrays = st.integers(0, 5).flatmap(lambda rows: hnp.arrays(np.float32, (rows, 3)))
