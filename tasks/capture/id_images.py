@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef, task
@@ -27,28 +28,25 @@ def ready_masks(
 
     Raises InputError when an image is damaged, holds no ids, or has not its photo's size.
     """
-    result = []
-    for frame, ids in _id_images(frames, names, files, lenses):
-        present = np.unique(ids)
-        present = present[present > 0]
-        count = len(present)
-        packed = np.zeros((0, -(-ids.size // 8)), np.uint8)
-        if count:
-            packed = pack_masks(ids[None] == present[:, None, None])
-        result.append(
-            MaskSet(
-                name=frame.name,
-                height=frame.height,
-                width=frame.width,
-                packed=packed,
-                predicted_iou=np.ones(count, np.float32),
-                stability=np.ones(count, np.float32),
-                grid=np.zeros(count, np.int32),
-                parent=np.full(count, -1, np.int32),
-                source="ready-made",
-            )
-        )
-    return tuple(result)
+    return tuple(masks_of(ids, frame.name) for frame, ids in _id_images(frames, names, files, lenses))
+
+
+def masks_of(ids: NDArray[np.integer], name: str) -> MaskSet:
+    """The masks of an id image [H, W], one for each id above 0, by rising id."""
+    present = np.unique(ids)
+    present = present[present > 0]
+    count = len(present)
+    return MaskSet(
+        name=name,
+        height=ids.shape[0],
+        width=ids.shape[1],
+        packed=pack_masks(ids[None] == present[:, None, None]),
+        predicted_iou=np.ones(count, np.float32),
+        stability=np.ones(count, np.float32),
+        grid=np.zeros(count, np.int32),
+        parent=np.full(count, -1, np.int32),
+        source="ready-made",
+    )
 
 
 @task(name="capture.ground_truth", uses=_USES)

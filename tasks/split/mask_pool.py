@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
+from ss_flow.tasks.geometry.images import pack_masks
 
 
 def canonical_order(masks: Bool) -> Int32:
@@ -16,7 +17,7 @@ def canonical_order(masks: Bool) -> Int32:
     if not len(masks):
         return np.zeros(0, np.int32)
     count, width = len(masks), masks.shape[2]
-    packed = pack(masks)
+    packed = pack_masks(masks)
     keys = []
     for index in range(count):
         row, column = np.divmod(np.flatnonzero(masks[index]), width)
@@ -34,12 +35,6 @@ def exclusive(masks: Bool, order: Int32) -> Int32:
     for index in order:
         owner[masks[index]] = index
     return owner
-
-
-def pack(masks: Bool) -> np.ndarray:
-    """[N, H, W] booleans as [N, ceil(H * W / 8)] bits, also where N is 0."""
-    count, height, width = masks.shape
-    return np.packbits(masks.reshape(count, height * width), axis=1)
 
 
 def intersections(masks: Bool, others: Bool | None = None) -> Float32:

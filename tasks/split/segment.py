@@ -12,7 +12,7 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, MaskSet
-from ss_flow.tasks.geometry.images import decode_valid
+from ss_flow.tasks.geometry.images import decode_valid, pack_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
@@ -21,7 +21,6 @@ from ss_flow.tasks.split.mask_pool import (
     drop_duplicates,
     mask_tree,
     merge_union,
-    pack,
     suppress,
 )
 
@@ -142,7 +141,7 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
         frame.name,
         frame.height,
         frame.width,
-        pack(masks),
+        pack_masks(masks),
         found.predicted_iou,
         found.stability,
         found.grid,

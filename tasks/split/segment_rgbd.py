@@ -10,7 +10,7 @@ from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Int32, MaskSet
 from ss_flow.tasks.geometry.cameras import camera_of
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size, pack_masks
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, NonNegative, Positive
 from ss_flow.tasks.split.graph_segmentation import (
     RegionGraph,
@@ -19,7 +19,7 @@ from ss_flow.tasks.split.graph_segmentation import (
     superpixels,
     surface_of,
 )
-from ss_flow.tasks.split.mask_pool import canonical_order, drop_duplicates, mask_tree, pack
+from ss_flow.tasks.split.mask_pool import canonical_order, drop_duplicates, mask_tree
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def _finish(frame: Frame, valid: Bool, found: _Masks, params: SegmentRgbdParams)
         frame.name,
         frame.height,
         frame.width,
-        pack(full),
+        pack_masks(full),
         found.quality,
         found.stability,
         found.grid,

@@ -19,7 +19,8 @@ import numpy as np
 
 from ss_flow.flows.generated import RoomParams, generate
 from ss_flow.flows.generated_masks import DegradeParams, degrade
-from ss_flow.tasks.artifacts import DepthMap, MaskSet, PointCloud
+from ss_flow.tasks.artifacts import DepthMap, PointCloud
+from ss_flow.tasks.capture.id_images import masks_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
 from ss_flow.tasks.split.visibility import visibility
@@ -35,14 +36,6 @@ def reset_peak() -> None:
     Path("/proc/self/clear_refs").write_text("5")
 
 
-def masks_of(ids: np.ndarray, name: str) -> MaskSet:
-    """An image of ids as one mask for each id."""
-    numbers = np.unique(ids[ids > 0])
-    packed = np.stack([np.packbits(ids == number) for number in numbers])
-    ones, none = np.ones(len(numbers), np.float32), np.full(len(numbers), -1, np.int32)
-    return MaskSet(name, *ids.shape, packed, ones, ones, np.zeros(len(numbers), np.int32), none, "generated")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=100)
@@ -56,7 +49,7 @@ def main() -> None:
     points = room.points[chosen]
     cloud = PointCloud(points, room.point_colors[chosen], 1.0, nearest_spacing(points))
     depths = [DepthMap(name, d, "sensor") for name, d in zip(room.cameras.names, room.depth, strict=True)]
-    masks: list[MaskSet] = [
+    masks = [
         masks_of(ids, name)
         for ids, name in zip(degrade(room.ids, DegradeParams(), seed=0), room.cameras.names, strict=True)
     ]
