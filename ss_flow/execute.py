@@ -9,10 +9,10 @@ import functools
 import importlib
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, overload
 
 import psutil
 
@@ -52,10 +52,7 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     Raises Gone when an input is no longer in the store.
     """
     task = find_task(invocation.task)
-    arguments = {
-        name: store.get(value) if isinstance(value, str) else tuple(store.get(item) for item in value)
-        for name, value in invocation.inputs.items()
-    }
+    arguments = {name: _read(value, store, name in task.streamed) for name, value in invocation.inputs.items()}
     checkpoint = store.checkpoint(invocation.key)
     warned: list[str] = []
     surroundings = Surroundings(listener, max(1, invocation.resources.cores), checkpoint, warned)
@@ -77,6 +74,35 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     store.record(action)
     remove_checkpoint(checkpoint)
     return action
+
+
+def _read(value: Value, store: Store, streamed: bool) -> Any:
+    if isinstance(value, str):
+        return store.get(value)
+    return Stream(store, value) if streamed else tuple(store.get(item) for item in value)
+
+
+class Stream(Sequence[Any]):
+    """Artifacts that are read from the store when they are looked at, and forgotten with the last reference to them.
+
+    Reading raises Gone when the store no longer holds the item.
+    """
+
+    def __init__(self, store: Store, digests: Sequence[str]) -> None:
+        self._store = store
+        self._digests = digests
+
+    def __len__(self) -> int:
+        return len(self._digests)
+
+    @overload
+    def __getitem__(self, index: int) -> Any: ...
+    @overload
+    def __getitem__(self, index: slice) -> Stream: ...
+    def __getitem__(self, index: int | slice) -> Any:
+        if isinstance(index, slice):
+            return Stream(self._store, self._digests[index])
+        return self._store.get(self._digests[index])
 
 
 def execute_here(invocation: Invocation, listener: Listener) -> Action:

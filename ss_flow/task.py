@@ -1,7 +1,8 @@
 """Tasks: plain functions with declared inputs, parameters and output.
 
-A task's positional parameters are artifacts (one `X`, or a list `tuple[X, ...]`); its keyword-only parameters are
-hashed into its key. It reads nothing else. Called in a flow, a task returns a `Node`; called anywhere else, it runs.
+A task's positional parameters are artifacts: one `X`, a list `tuple[X, ...]`, or a list `Sequence[X]` that may be
+larger than memory, whose items are read when they are looked at. Its keyword-only parameters are hashed into its key.
+It reads nothing else. Called in a flow, a task returns a `Node`; called anywhere else, it runs.
 """
 
 from __future__ import annotations
@@ -82,12 +83,19 @@ class Task(Generic[P, R]):
     @functools.cached_property
     def inputs(self) -> dict[str, bool]:
         """Names of the artifact parameters, and whether each takes a list."""
+        return {name: kind in (tuple, Sequence) for name, kind in self._kinds.items()}
+
+    @functools.cached_property
+    def streamed(self) -> frozenset[str]:
+        """The parameters that take a list whose items are read one by one."""
+        return frozenset(name for name, kind in self._kinds.items() if kind is Sequence)
+
+    @functools.cached_property
+    def _kinds(self) -> dict[str, Any]:
         hints = typing.get_type_hints(self.function)
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         return {
-            p.name: typing.get_origin(hints[p.name]) is tuple
-            for p in self.signature.parameters.values()
-            if p.kind in positional
+            p.name: typing.get_origin(hints[p.name]) for p in self.signature.parameters.values() if p.kind in positional
         }
 
     @functools.cached_property

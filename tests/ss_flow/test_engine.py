@@ -34,6 +34,24 @@ def test_a_flow_gives_the_same_result_on_every_executor(store, executor):
     assert [value(store, d) for d in report.values["squares"]] == [1.0, 4.0, 9.0]
 
 
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_a_sequence_is_read_item_by_item(store, executor):
+    def flow():
+        return {"total": toy.streamed_total(toy.source(values=(1.0, 2.0, 3.0)))}
+
+    report = run(store, flow, executor=executor)
+    assert value(store, report.values["total"]) == (1 + 2 + 3) + (1 + 3) + 3
+
+
+def test_an_item_that_is_lost_while_a_sequence_is_read_is_computed_again(store):
+    first = run(store, lambda: {"xs": toy.source(values=(1.0, 2.0, 3.0))})
+    path = store.object_path(first.values["xs"][1])
+    damaged = next(path.rglob("c.*"), None) or next(p for p in path.rglob("*") if p.is_file())
+    damaged.write_bytes(b"")
+    report = run(Store(store.root), lambda: {"total": toy.streamed_total(toy.source(values=(1.0, 2.0, 3.0)))})
+    assert value(store, report.values["total"]) == 13.0
+
+
 def test_a_second_run_computes_nothing(store):
     run(store, toy.flow)
     again = run(store, toy.flow)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,6 +48,13 @@ def clip(x: Number, *, limit: float) -> Number:
 def total(xs: tuple[Number, ...]) -> Number:
     progress(1, 1, "adding")
     return number(sum(float(x.value[0]) for x in xs))
+
+
+@task()
+def streamed_total(xs: Sequence[Number]) -> Number:
+    """The total again, of items that are read one by one; the even ones twice."""
+    assert not isinstance(xs, tuple)
+    return number(sum(float(x.value[0]) for x in xs) + sum(float(x.value[0]) for x in xs[::2]) + len(xs))
 
 
 @task()
