@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,11 @@ COLORS: dict[str, tuple[int, int, int]] = {
 }
 """sRGB of the colour words that small things go by."""
 
-MAX_OBJECTS = len(SHAPES) * len(COLORS)
+_PATTERNS = {"checked": "checks", "striped": "stripes", "mottled": "noise"}
+"""Words for the patterns; they tell things apart when the names of colour and shape are used up."""
+
+_PLAIN_NAMES = len(SHAPES) * len(COLORS)
+MAX_OBJECTS = _PLAIN_NAMES * (1 + len(_PATTERNS))
 """Every small thing is the only one with its name."""
 
 _FLOOR, _TABLE, _SHELF_TOP, _SHELF_MIDDLE, _SOFA = range(5)
@@ -93,7 +97,12 @@ def furnish(objects: int, rng: np.random.Generator) -> tuple[Thing, ...]:
     for i in sorted(range(objects), key=lambda i: names[i][0] not in _FLOOR_ONLY):
         meshes[i] = _place(meshes[i], _choices(names[i][0], i), surfaces, taken, rng)
     for i, (shape, color) in enumerate(names):
-        things.append(Thing(len(furniture) + 1 + i, f"{color} {shape}", color, meshes[i], _painted(color, rng)))
+        material = _painted(color, rng)
+        name = f"{color} {shape}"
+        if i >= _PLAIN_NAMES:
+            word = list(_PATTERNS)[i // _PLAIN_NAMES - 1]
+            name, material = f"{color} {word} {shape}", replace(material, pattern=_PATTERNS[word])
+        things.append(Thing(len(furniture) + 1 + i, name, color, meshes[i], material))
     return tuple(things)
 
 
