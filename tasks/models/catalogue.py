@@ -54,6 +54,7 @@ class ModelEntry:
     files: tuple[FileEntry, ...]
     parameters: tuple[tuple[str, float], ...]
     texts: tuple[tuple[str, str], ...]
+    wires: tuple[tuple[str, str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,8 @@ class Model:
     """Numbers that hold for this model alone, such as its stability threshold."""
     texts: tuple[tuple[str, str], ...]
     """Names inside its networks."""
+    wires: tuple[tuple[str, str, str], ...] = ()
+    """Nodes of its networks that shall read another tensor than the file says: node, tensor, the other."""
 
     def file(self, role: str) -> FileRef:
         """The file of a role. Raises KeyError when the model has none."""
@@ -120,6 +123,7 @@ def _entry(name: str, table: dict[str, Any]) -> ModelEntry:
         files,
         tuple(table.get("parameters", {}).items()),
         tuple(table.get("texts", {}).items()),
+        tuple((node, old, new) for node, old, new in table.get("wires", [])),
     )
 
 
@@ -165,7 +169,7 @@ def find(
     files = tuple(
         ModelFile(file.role, FileRef(place / file.name, digest_file(place / file.name))) for file in entry.files
     )
-    return Model(entry.name, entry.kind, files, entry.parameters, entry.texts)
+    return Model(entry.name, entry.kind, files, entry.parameters, entry.texts, entry.wires)
 
 
 def _place(entry: ModelEntry, folders: Sequence[Path]) -> Path | None:

@@ -23,16 +23,17 @@ def open_session(
     threads: int = 1,
     outputs: tuple[str, ...] = (),
     batched: tuple[str, ...] = (),
+    wires: tuple[tuple[str, str, str], ...] = (),
     inputs: tuple[str, ...] = (),
 ) -> onnxruntime.InferenceSession:
     """The session of a network on the CPU, one a process for each file content, thread count and cut.
 
     file: an ONNX file. threads: cores that one run may use; nodes run one after the other in a fixed order, so the
-    count does not change what a node is given. outputs, batched: how to cut the graph (see `expose`); no outputs keeps
-    the graph as it is. inputs: names that the network has to take.
+    count does not change what a node is given. outputs, batched, wires: how to cut the graph (see `expose`); no outputs
+    keeps the graph as it is. inputs: names that the network has to take.
     Raises InputError when the file is missing, is damaged, is no ONNX graph, or lacks one of the names.
     """
-    session = _open(str(file.path), file.digest, threads, outputs, batched)
+    session = _open(str(file.path), file.digest, threads, outputs, batched, wires)
     taken = [node.name for node in session.get_inputs()]
     missing = [name for name in inputs if name not in taken]
     if missing:
@@ -45,7 +46,12 @@ def open_session(
 
 @functools.lru_cache(maxsize=8)
 def _open(
-    path: str, digest: str, threads: int, outputs: tuple[str, ...], batched: tuple[str, ...]
+    path: str,
+    digest: str,
+    threads: int,
+    outputs: tuple[str, ...],
+    batched: tuple[str, ...],
+    wires: tuple[tuple[str, str, str], ...],
 ) -> onnxruntime.InferenceSession:
     import onnxruntime
 
@@ -57,7 +63,7 @@ def _open(
     options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
     options.log_severity_level = 3
-    source: str | bytes = expose(Path(path), outputs, batched) if outputs else path
+    source: str | bytes = expose(Path(path), outputs, batched, wires) if outputs else path
     try:
         return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has a class for every cause, with no common base
@@ -79,12 +85,18 @@ def run(session: onnxruntime.InferenceSession, inputs: Mapping[str, np.ndarray])
         ) from error
 
 
-def expose(path: Path, outputs: tuple[str, ...], batched: tuple[str, ...] = ()) -> bytes:
+def expose(
+    path: Path,
+    outputs: tuple[str, ...],
+    batched: tuple[str, ...] = (),
+    wires: tuple[tuple[str, str, str], ...] = (),
+) -> bytes:
     """An ONNX graph cut so that inner tensors become its outputs, in memory; nothing is written.
 
     path: the file. outputs: names of the float32 tensors wanted, in this order; nodes and inputs that they do not need
-    are dropped. batched: inputs whose first size, fixed by the export, is set free.
-    Raises InputError when the file is damaged or has no such tensor.
+    are dropped. batched: inputs whose first size, fixed by the export, is set free. wires: (node, tensor,
+    other): the node reads the other tensor instead.
+    Raises InputError when the file is damaged or has no such tensor or wire.
     """
     import onnx
 
@@ -93,6 +105,14 @@ def expose(path: Path, outputs: tuple[str, ...], batched: tuple[str, ...] = ()) 
     except Exception as error:  # protobuf's own exceptions, which depend on its backend
         raise InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.") from error
     graph = model.graph
+    for name, old, new in wires:
+        readers = [node for node in graph.node if node.name == name and old in node.input]
+        if not readers:
+            raise InputError(
+                f"{path} has no node {name} that reads {old}: it is another network than the catalogue describes."
+            )
+        for node in readers:
+            node.input[list(node.input).index(old)] = new
     produced = {name for node in graph.node for name in node.output}
     missing = [name for name in outputs if name not in produced]
     if missing:

@@ -54,6 +54,7 @@ class Sam:
             threads=threads,
             outputs=(model.text("masks_tensor"), model.text("scores_tensor")),
             batched=("point_coords", "point_labels"),
+            wires=model.wires,
             inputs=("image_embeddings", "point_coords", "point_labels", "mask_input", "has_mask_input"),
         )
 

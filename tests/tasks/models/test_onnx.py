@@ -63,6 +63,11 @@ def test_unknown_inner_tensor_is_refused(network):
         expose(network.path, ("nowhere",))
 
 
+def test_a_wire_of_another_network_is_refused(network):
+    with pytest.raises(InputError, match="has no node nobody that reads x"):
+        expose(network.path, ("y",), wires=(("nobody", "x", "z"),))
+
+
 def test_missing_input_names_both_sides(network):
     with pytest.raises(InputError, match="takes the inputs x, unused but not pixels"):
         open_session(network, inputs=("pixels",))

