@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, MaskSet
 from ss_flow.tasks.geometry.images import pack_masks
+
+_AT_ONCE = 1 << 18
+"""Pixels that are multiplied at once: floats of whole masks would take many times their memory."""
 
 
 def canonical_order(masks: Bool) -> Int32:
@@ -37,11 +40,14 @@ def exclusive(masks: Bool, order: Int32) -> Int32:
     return owner
 
 
-def intersections(masks: Bool, others: Bool | None = None) -> Float32:
-    """Pixels that masks share: [N, H, W] and [M, H, W] (the same masks when None) -> [N, M], exact below 2^24."""
-    left = masks.reshape(len(masks), masks.shape[1] * masks.shape[2]).astype(np.float32)
-    right = left if others is None else others.reshape(len(others), left.shape[1]).astype(np.float32)
-    return left @ right.T
+def intersections(masks: Bool) -> Float32:
+    """Pixels that masks [N, H, W] share, two by two: [N, N], exact below 2^24."""
+    flat = masks.reshape(len(masks), masks.shape[1] * masks.shape[2])
+    shared = np.zeros((len(flat), len(flat)), np.float32)
+    for start in range(0, flat.shape[1], _AT_ONCE):
+        part = flat[:, start : start + _AT_ONCE].astype(np.float32)
+        shared += part @ part.T
+    return shared
 
 
 def drop_duplicates(masks: Bool, scores: Float32, max_iou: float) -> Int32:
@@ -84,6 +90,27 @@ def mask_tree(masks: Bool, contained: float) -> Int32:
     return parent
 
 
+def mask_set(name: str, masks: Bool, predicted_iou: Float32, source: str, *, contained: float = 0.9) -> MaskSet:
+    """Masks that came from elsewhere than the grids as the masks of a view: in canonical order, without empty ones.
+
+    masks: [N, H, W]. predicted_iou: [N]. source: who made them. contained: as `mask_tree` takes it.
+    """
+    order = canonical_order(masks)
+    order = order[masks[order].any(axis=(1, 2))]
+    kept = masks[order]
+    return MaskSet(
+        name=name,
+        height=masks.shape[1],
+        width=masks.shape[2],
+        packed=pack_masks(kept),
+        predicted_iou=predicted_iou[order].astype(np.float32),
+        stability=np.ones(len(kept), np.float32),
+        grid=np.zeros(len(kept), np.int32),
+        parent=mask_tree(kept, contained),
+        source=source,
+    )
+
+
 def merge_union(masks: Bool, grid: Int32, duplicate: float, overlap: float) -> tuple[Bool, Int32]:
     """Promote larger masks: a mask of a finer grid is united with every coarser one that it overlaps (Split&Splat,
     Sec. 3.1; spec S1 with rows 8 and 9 of its table).
@@ -93,8 +120,7 @@ def merge_union(masks: Bool, grid: Int32, duplicate: float, overlap: float) -> t
     grids are united.
     Returns masks [K, H, W] and, for each, the row it grew from.
     """
-    height, width = masks.shape[1:]
-    pool = np.zeros((0, height, width), bool)
+    pool: list[Bool] = []
     origin: list[int] = []
     for level in np.unique(grid):
         rows = np.flatnonzero(grid == level)
@@ -106,12 +132,15 @@ def merge_union(masks: Bool, grid: Int32, duplicate: float, overlap: float) -> t
         rows = rows[suppress(share, -np.arange(len(rows), dtype=np.float32), duplicate)]
         for row in rows:
             mask = masks[row]
-            common = intersections(pool, mask[None])[:, 0]
-            smaller = np.minimum(pool.sum(axis=(1, 2)), mask.sum())
-            hit = common > overlap * smaller
-            if hit.any() and level > grid.min():
-                pool[hit] |= mask
+            hit = [p for p in pool if _pixels(p & mask) > overlap * min(_pixels(p), _pixels(mask))]
+            if hit and level > grid.min():
+                for promoted in hit:
+                    promoted |= mask
             else:
-                pool = np.concatenate([pool, mask[None]])
+                pool.append(mask.copy())
                 origin.append(int(row))
-    return pool, np.array(origin, np.int32)
+    return np.array(pool, bool).reshape(-1, *masks.shape[1:]), np.array(origin, np.int32)
+
+
+def _pixels(mask: Bool) -> int:
+    return int(np.count_nonzero(mask))

@@ -3,6 +3,7 @@ Sec. 3.1; spec S1)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -32,9 +33,9 @@ class SegmentParams:
     grids: tuple[Count, ...] = (1, 4, 8, 16)
     """Prompt points a side of each grid, coarse to fine (row 2)."""
     adaptive: bool = True
-    """Whether a finer grid leaves out the points that a small accepted mask already covers."""
-    settled_area: Fraction = 0.1
-    """Largest share of the image of a mask that keeps finer prompts away; under larger ones parts may hide."""
+    """Whether the finest grid leaves out the points where the coarser ones agree."""
+    settled_by: Count = 3
+    """So many prompts whose smallest mask holds a point agree there: a prompt at the point would hardly find more."""
     pred_iou: Fraction = 0.8
     """Least quality that the segmenter itself predicts (row 3)."""
     stability: tuple[Fraction, ...] | None = None
@@ -87,13 +88,14 @@ class _Candidates:
             self.logits[rows], self.masks[rows], self.predicted_iou[rows], self.stability[rows], self.grid[rows]
         )
 
-    def __add__(self, other: _Candidates) -> _Candidates:
+    @staticmethod
+    def joined(parts: Sequence[_Candidates]) -> _Candidates:
         return _Candidates(
-            np.concatenate([self.logits, other.logits]),
-            np.concatenate([self.masks, other.masks]),
-            np.concatenate([self.predicted_iou, other.predicted_iou]),
-            np.concatenate([self.stability, other.stability]),
-            np.concatenate([self.grid, other.grid]),
+            np.concatenate([part.logits for part in parts]),
+            np.concatenate([part.masks for part in parts]),
+            np.concatenate([part.predicted_iou for part in parts]),
+            np.concatenate([part.stability for part in parts]),
+            np.concatenate([part.grid for part in parts]),
         )
 
 
@@ -113,23 +115,25 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
     valid = decode_valid(frame)
     valid_low = _low_resolution(valid)
 
-    found: _Candidates | None = None
+    grids: list[_Candidates] = []
+    agreed: Int32 = np.zeros(valid_low.shape, np.int32)
     for level, side in enumerate(params.grids):
         points = grid_points(side, frame.width, frame.height)
         points = points[valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
-        if params.adaptive and found is not None:
-            points = points[~_settled(points, found, params, frame)]
-        logits, scores = sam.predict(embedding, points)
-        accepted = _accept(logits, scores, level, valid_low, params, model)
-        found = accepted if found is None else found + accepted
-        progress(level + 1, len(params.grids), f"{side} x {side} points")
-    assert found is not None
+        if params.adaptive and level == len(params.grids) - 1:
+            points = points[_at(points, agreed, frame) < params.settled_by]
+        accepted, held = _ask(sam, embedding, points, level, valid_low, params, model)
+        grids.append(accepted)
+        agreed += held
+        progress(level + 1, len(params.grids), f"{side} x {side}: {len(points)} prompts")
+    found = _Candidates.joined(grids)
 
     if params.merge == "child":
         found = found[drop_duplicates(found.masks, found.predicted_iou, params.duplicate_iou)]
     thresholds = np.array(params.mask_threshold, np.float32)[found.grid]
-    masks = sam.upsample(embedding, found.logits) > thresholds[:, None, None]
-    masks &= valid
+    masks = np.empty((len(thresholds), frame.height, frame.width), bool)
+    for mask, logits, threshold in zip(masks, found.logits, thresholds, strict=True):
+        mask[:] = (sam.upsample(embedding, logits[None])[0] > threshold) & valid
     if params.merge == "union":
         large = np.flatnonzero(_large_enough(masks, params)).astype(np.int32)
         masks, origin = merge_union(masks[large], found.grid[large], params.duplicate_overlap, params.union_overlap)
@@ -157,36 +161,53 @@ def grid_points(side: int, width: int, height: int) -> Float64:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def _accept(
+def _ask(
+    sam: Sam, embedding: Embedding, points: Float64, level: int, valid: Bool, params: SegmentParams, model: Model
+) -> tuple[_Candidates, Int32]:
+    """The masks that the points of one grid find.
+
+    Returns the accepted masks, and for each pixel [h, w] how many of the points have it in the smallest mask that they
+    found.
+    """
+    parts: list[_Candidates] = []
+    held: Int32 = np.zeros(valid.shape, np.int32)
+    for start in range(0, max(1, len(points)), sam.BATCH):
+        logits, scores = sam.predict(embedding, points[start : start + sam.BATCH])
+        passed, prompt = _filter(logits, scores, level, valid, params, model)
+        parts.append(passed)
+        smallest = np.full(len(scores), -1)
+        largest_first = np.argsort(-passed.masks.sum(axis=(1, 2)), kind="stable")
+        smallest[prompt[largest_first]] = largest_first
+        held += passed.masks[smallest[smallest >= 0]].sum(axis=0, dtype=np.int32)
+    found = _Candidates.joined(parts)
+    return found[suppress(_box_iou(found.masks), found.predicted_iou, params.box_nms[level])], held
+
+
+def _filter(
     logits: Float32, scores: Float32, level: int, valid: Bool, params: SegmentParams, model: Model
-) -> _Candidates:
-    """The masks of one grid that pass the filters: logits [M, 4, 256, 256], scores [M, 4], valid [h, w]."""
+) -> tuple[_Candidates, Int32]:
+    """The masks that are good enough, and the prompt of each: logits [M, 4, 256, 256], scores [M, 4], valid [h, w]."""
     h, w = valid.shape
     # The first of the four answers a prompt of several points; for a single point it is the worst.
-    flat, quality = logits[:, 1:].reshape(-1, *logits.shape[2:]), scores[:, 1:].ravel()
-    good = quality >= params.pred_iou
-    flat, quality = flat[good], quality[good]
+    good = scores[:, 1:] >= params.pred_iou
+    flat, quality, prompt = logits[:, 1:][good], scores[:, 1:][good], np.nonzero(good)[0]
     cropped = flat[:, :h, :w]
     threshold, offset = params.mask_threshold[level], params.stability_offset[level]
-    inner = (cropped > threshold + offset).sum(axis=(1, 2), dtype=np.int64)
-    outer = (cropped > threshold - offset).sum(axis=(1, 2), dtype=np.int64)
+    inner = np.count_nonzero(cropped > threshold + offset, axis=(1, 2))
+    outer = np.count_nonzero(cropped > threshold - offset, axis=(1, 2))
     stability = (inner / np.maximum(outer, 1)).astype(np.float32)
     masks = (cropped > threshold) & valid
+    area = np.count_nonzero(masks, axis=(1, 2))
     least = model.parameter("stability") if params.stability is None else params.stability[level]
-    passed = np.flatnonzero((stability >= least) & (masks.sum(axis=(1, 2)) >= max(1, params.min_area * h * w)))
-    level_of = np.full(len(flat), level, np.int32)
-    found = _Candidates(flat, masks, quality, stability, level_of)[passed.astype(np.int32)]
-    return found[suppress(_box_iou(found.masks), found.predicted_iou, params.box_nms[level])]
+    passed = np.flatnonzero((stability >= least) & (area >= max(1, params.min_area * h * w))).astype(np.int32)
+    grid = np.full(len(flat), level, np.int32)
+    return _Candidates(flat, masks, quality, stability, grid)[passed], prompt[passed].astype(np.int32)
 
 
-def _settled(points: Float64, found: _Candidates, params: SegmentParams, frame: Frame) -> Bool:
-    """Which points [M, 2] an accepted mask already covers that is too small to hide parts: [M]."""
-    _, h, w = found.masks.shape
-    small = found.masks.sum(axis=(1, 2)) <= params.settled_area * h * w
-    covered = found.masks[small].any(axis=0)
-    columns = (points[:, 0] * w / frame.width).astype(int)
-    rows = (points[:, 1] * h / frame.height).astype(int)
-    return covered[rows, columns]
+def _at(points: Float64, image: Int32, frame: Frame) -> Int32:
+    """The pixels of an image of any size [h, w] at points [M, 2] of the frame: [M]."""
+    h, w = image.shape
+    return image[(points[:, 1] * h / frame.height).astype(int), (points[:, 0] * w / frame.width).astype(int)]
 
 
 def _box_iou(masks: Bool) -> Float32:

@@ -101,14 +101,31 @@ def test_pixels_that_do_not_count_are_in_no_mask_and_get_no_prompt(scripted):
     assert all((points[:, 0] >= 32).all() for points in scripted.prompts)
 
 
-def test_adaptive_prompts_leave_out_what_small_masks_cover_and_lose_nothing(scripted):
-    full = segment(frame(), embed(frame(), model=MODEL), params=LOOSE, model=MODEL)
-    asked = sum(map(len, scripted.prompts))
-    adaptive = segment(
-        frame(), embed(frame(), model=MODEL), params=replace(LOOSE, adaptive=True, settled_area=0.2), model=MODEL
-    )
-    assert sum(map(len, scripted.prompts)) < asked == 81
+FOUR_GRIDS = replace(LOOSE, grids=(1, 4, 8, 16))
+
+
+def test_adaptive_prompts_are_fewer_and_lose_nothing(scripted):
+    full = segment(frame(), embed(frame(), model=MODEL), params=FOUR_GRIDS, model=MODEL)
+    assert sum(map(len, scripted.prompts)) == 337
+    adaptive = segment(frame(), embed(frame(), model=MODEL), params=replace(FOUR_GRIDS, adaptive=True), model=MODEL)
+    assert sum(map(len, scripted.prompts)) < 337 / 2
     np.testing.assert_array_equal(adaptive.packed, full.packed)
+
+
+@pytest.mark.parametrize("settled_by", [1, 60, 62, 1000])
+def test_the_finest_grid_leaves_out_points_that_the_smallest_masks_of_so_many_prompts_hold(scripted, settled_by):
+    params = replace(FOUR_GRIDS, adaptive=True, settled_by=settled_by)
+    segment(frame(), embed(frame(), model=MODEL), params=params, model=MODEL)
+    asked = np.concatenate(scripted.prompts)
+    assert len(asked) >= 81
+    on = {name: lambda x, y, mask=rectangle(name): mask[int(y), int(x)] for name in RECTANGLES}
+    smallest = [next((on[name] for name in ("cup", "plate", "table") if on[name](x, y)), None) for x, y in asked[:81]]
+    expected = [
+        (x, y)
+        for x, y in grid_points(16, SIDE, SIDE)
+        if sum(holds is not None and holds(x, y) for holds in smallest) < settled_by
+    ]
+    assert [tuple(point) for point in asked[81:]] == expected
 
 
 @pytest.mark.parametrize(
