@@ -47,12 +47,32 @@ def dense(
     Raises InputError when no depth is known in any view, or no two views agree.
     """
     unit = scene_unit(cameras, depths)
-    voxel = min(params.voxel * unit, params.voxel_pixels * _pixel_footprint(cameras, depths))
+    voxel = voxel_side(cameras, depths, unit, params)
     views = []
     for view, (frame, depth) in enumerate(zip(frames, depths, strict=True)):
         progress(view, len(frames), frame.name)
-        views.append(sum_by_voxel([_samples(frame, cameras, view, depth)], voxel))
-    cloud = sum_by_voxel(views, voxel)
+        views.append(sum_by_voxel([depth_samples(frame, cameras, view, depth)], voxel))
+    cloud = consistent_cloud(sum_by_voxel(views, voxel), cameras, depths, voxel=voxel, unit=unit, params=params)
+    if not len(cloud.points):
+        raise InputError(
+            "The depth maps of this scene agree in no point; they should be z-depths in the unit of the camera poses."
+        )
+    return cloud
+
+
+def consistent_cloud(
+    cloud: VoxelSums,
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    *,
+    voxel: float,
+    unit: float,
+    params: DenseParams,
+) -> PointCloud:
+    """The voxels whose means the views' depth confirms, in cubes large enough that no more than `max_points` remain.
+
+    cloud: samples summed in cubes of side `voxel`. Returns no points where nothing is confirmed.
+    """
     while True:
         means, colors = cloud.means()
         kept = consistent_points(
@@ -68,13 +88,14 @@ def dense(
         # On surfaces the count falls with the square of the side; a little more ends the loop soon.
         voxel *= 1.05 * float(np.sqrt(kept.sum() / params.max_points))
         cloud = sum_by_voxel([cloud.take(kept)], voxel)
-    if not kept.any():
-        raise InputError(
-            "The depth maps of this scene agree in no point; they should be z-depths in the unit of the camera poses."
-        )
     points = means[kept].astype(np.float32)
     rounded = np.rint(colors[kept]).astype(np.uint8)
     return PointCloud(points=points, colors=rounded, unit=unit, spacing=nearest_spacing(points))
+
+
+def voxel_side(cameras: Cameras, depths: tuple[DepthMap, ...], unit: float, params: DenseParams) -> float:
+    """Side of the sampling cube, in world units."""
+    return min(params.voxel * unit, params.voxel_pixels * _pixel_footprint(cameras, depths))
 
 
 def scene_unit(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
@@ -99,7 +120,7 @@ def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
     return float(np.median(sides))
 
 
-def _samples(frame: Frame, cameras: Cameras, view: int, depth: DepthMap) -> VoxelSums:
+def depth_samples(frame: Frame, cameras: Cameras, view: int, depth: DepthMap) -> VoxelSums:
     """The known depth pixels of one view as points with the colours of its photo."""
     height, width = depth.depth.shape
     row = ((np.arange(height) + 0.5) * frame.height / height).astype(np.intp)

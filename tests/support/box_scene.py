@@ -75,6 +75,13 @@ def depths(scale: float = 1.0) -> tuple[DepthMap, ...]:
     return tuple(DepthMap(f"{k}", cast(k, scale)[0], "sensor") for k in range(VIEWS))
 
 
+def distance_to_scene(points: np.ndarray) -> np.ndarray:
+    """Distance of each point [N, 3] to the nearest surface of the boxes and the floor: [N]."""
+    outside = np.maximum(BOXES[:, 0] - points[:, None], points[:, None] - BOXES[:, 1])
+    boxes = np.abs(np.where(outside.max(axis=-1) <= 0, outside.max(axis=-1), np.linalg.norm(outside.clip(0), axis=-1)))
+    return np.minimum(np.abs(points[:, 2]), boxes.min(axis=1))
+
+
 def mask_set(masks: np.ndarray, name: str = "0") -> MaskSet:
     """A MaskSet of [N, H, W] booleans."""
     count, height, width = masks.shape

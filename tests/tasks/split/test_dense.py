@@ -14,18 +14,11 @@ def fuse(**changes):
     return dense(box_scene.frames(), box_scene.cameras(), box_scene.depths(), params=DenseParams(**changes))
 
 
-def distance_to_scene(points):
-    """Distance of each point to the nearest surface of the boxes and the floor."""
-    outside = np.maximum(box_scene.BOXES[:, 0] - points[:, None], points[:, None] - box_scene.BOXES[:, 1])
-    boxes = np.abs(np.where(outside.max(axis=-1) <= 0, outside.max(axis=-1), np.linalg.norm(outside.clip(0), axis=-1)))
-    return np.minimum(np.abs(points[:, 2]), boxes.min(axis=1))
-
-
 def test_dense_points_lie_on_the_surfaces_with_their_colours():
     cloud = fuse()
     assert len(cloud.points) > 2000
     # Two samples of one voxel average to a point inside a convex edge, at most half a voxel deep.
-    assert distance_to_scene(cloud.points).max() < 0.02
+    assert box_scene.distance_to_scene(cloud.points).max() < 0.02
     top = np.abs(cloud.points[:, 2] - 0.7) < 0.004
     assert top.sum() > 50
     np.testing.assert_array_equal(np.median(cloud.colors[top], axis=0), box_scene.COLORS[2])
@@ -51,7 +44,7 @@ def test_flying_pixels_of_one_view_are_dropped():
     wrong[30:40, 40:50] *= 0.6
     depths[0] = DepthMap("0", wrong, "sensor")
     cloud = dense(box_scene.frames(), box_scene.cameras(), tuple(depths), params=DenseParams())
-    assert (distance_to_scene(cloud.points) > 0.1).mean() < 0.002
+    assert (box_scene.distance_to_scene(cloud.points) > 0.1).mean() < 0.002
 
 
 def test_pixels_that_a_frame_masks_out_give_no_points():
