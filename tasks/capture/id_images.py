@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef, task
-from ss_flow.tasks.artifacts import Frame, LabelMap, MaskSet
-from ss_flow.tasks.capture.lens import Lens, undistortion_map
+from ss_flow.tasks.artifacts import Cameras, Frame, LabelMap, MaskSet
+from ss_flow.tasks.capture.lens import Lens, photo_lens, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
 from ss_flow.tasks.capture.sensor_depth import resampled
 from ss_flow.tasks.geometry.images import pack_masks
@@ -19,6 +19,7 @@ _USES = ("opencv-contrib-python-headless",)
 @task(name="capture.ready_masks", uses=_USES)
 def ready_masks(
     frames: tuple[Frame, ...],
+    cameras: Cameras,
     *,
     names: tuple[str, ...],
     files: tuple[FileRef, ...],
@@ -28,7 +29,7 @@ def ready_masks(
 
     Raises InputError when an image is damaged, holds no ids, or has not its photo's size.
     """
-    return tuple(masks_of(ids, frame.name) for frame, ids in _id_images(frames, names, files, lenses))
+    return tuple(masks_of(ids, frame.name) for frame, ids in _id_images(frames, cameras, names, files, lenses))
 
 
 def masks_of(ids: NDArray[np.integer], name: str) -> MaskSet:
@@ -52,6 +53,7 @@ def masks_of(ids: NDArray[np.integer], name: str) -> MaskSet:
 @task(name="capture.ground_truth", uses=_USES)
 def ground_truth(
     frames: tuple[Frame, ...],
+    cameras: Cameras,
     *,
     names: tuple[str, ...],
     files: tuple[FileRef | None, ...],
@@ -61,17 +63,16 @@ def ground_truth(
 
     Raises InputError when an image is damaged, holds no ids, or has not its photo's size.
     """
-    return tuple(LabelMap(frame.name, ids) for frame, ids in _id_images(frames, names, files, lenses))
+    return tuple(LabelMap(frame.name, ids) for frame, ids in _id_images(frames, cameras, names, files, lenses))
 
 
 def _id_images(
     frames: tuple[Frame, ...],
+    cameras: Cameras,
     names: tuple[str, ...],
     files: tuple[FileRef | None, ...],
     lenses: tuple[Lens, ...] | None,
 ) -> list[tuple[Frame, np.ndarray]]:
-    import cv2
-
     row = {name: i for i, name in enumerate(names)}
     result = []
     for frame in frames:
@@ -87,8 +88,21 @@ def _id_images(
                 f"{ref.path} is {width}x{height} pixels, but its photo is {frame.source_width}x{frame.source_height}; "
                 "an image of instance ids must have its photo's size."
             )
-        lens = lenses[row[frame.name]] if lenses else None
-        if lens is not None and not lens.pinhole:
-            ids = cv2.remap(ids, undistortion_map(lens.scaled(width, height)), None, cv2.INTER_NEAREST)
-        result.append((frame, np.ascontiguousarray(resampled(ids, frame.height, frame.width), np.uint16)))
+        pixels = frame_pixels(frame, lenses[row[frame.name]] if lenses else None, cameras)
+        result.append((frame, np.where(pixels >= 0, ids.ravel()[pixels], 0).astype(np.uint16)))
     return result
+
+
+def frame_pixels(frame: Frame, stated: Lens | None, cameras: Cameras) -> NDArray[np.intp]:
+    """The pixel of the input photo that each pixel of a frame shows: [H, W] flat indices, -1 beyond the lens's reach.
+
+    stated, cameras: as `photo_lens` takes them.
+    """
+    import cv2
+
+    shape = frame.source_height, frame.source_width
+    pixels = np.arange(shape[0] * shape[1], dtype=np.float64).reshape(shape)
+    lens = photo_lens(frame, stated, cameras)
+    if lens is not None:
+        pixels = cv2.remap(pixels, undistortion_map(lens), None, cv2.INTER_NEAREST, borderValue=-1)
+    return resampled(pixels, frame.height, frame.width).astype(np.intp)

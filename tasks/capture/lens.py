@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,36 @@ def undistortion_map(lens: Lens) -> Float32:
     else:
         u, v = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, (lens.width, lens.height), cv2.CV_32FC1)
     return np.stack([u, v], axis=-1).astype(np.float32)
+
+
+def photo_lens(frame: Frame, stated: Lens | None, cameras: Cameras) -> Lens | None:
+    """The lens whose distortion was taken out of a frame, for the size of its input photo; None for a pinhole.
+
+    stated: what the capture says, if anything; otherwise structure from motion may have found the distortion
+    (`Cameras.radial`). cameras: those of all frames.
+    """
+    lens = stated
+    if stated is None and cameras.radial.size:
+        row = cameras.names.index(frame.name)
+        fx, fy, cx, cy = cameras.intrinsics[row].tolist()
+        lens = Lens(frame.width, frame.height, fx, fy, cx, cy, (float(cameras.radial[row]), 0.0, 0.0, 0.0))
+    if lens is None or lens.pinhole:
+        return None
+    return lens.scaled(frame.source_width, frame.source_height)
+
+
+def undistorted(points: Float64, lens: Lens) -> Float64:
+    """Where points of the photo lie in the undistorted image: [N, 2] x, y in pixels -> [N, 2]."""
+    import cv2
+
+    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]], np.float64)
+    coefficients = np.array(lens.distortion or (0.0,) * 4)
+    closely = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    if lens.fisheye:
+        moved = cv2.fisheye.undistortPoints(points[:, None], matrix, coefficients, P=matrix, criteria=closely)
+    else:
+        moved = cv2.undistortPoints(points[:, None], matrix, coefficients, P=matrix, criteria=closely)
+    return moved[:, 0]
 
 
 def inside_source(source_map: Float32) -> Bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ss_flow.errors import InputError
+from ss_flow.tasks.capture.hints import read_hints
 from ss_flow.tasks.capture.layout_colmap import is_colmap, open_colmap
 from ss_flow.tasks.capture.layout_nerfstudio import open_nerfstudio
 from ss_flow.tasks.capture.layout_scannet import is_scannet, open_scannet, open_sens
@@ -20,27 +21,41 @@ ACCEPTED = (
 _MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff"})
 
 
-def open_scene(path: Path, masks: Path | None = None) -> SceneFiles:
+def open_scene(path: Path, masks: Path | None = None, hints: Path | None = None) -> SceneFiles:
     """The files of a capture, whatever its layout.
 
     path: a folder, a video, a `.sens` file or a `transforms.json`.
-    masks: a folder of ready-made instance masks, one image of ids a view, named by the view's stem; by default
-        `instance_masks/` in the scene's folder, where that exists. Likewise `instance/` is ground truth, and `valid/`
-        (or what the layout itself lists) holds masks that are 0 where a pixel is to be ignored.
-    Raises InputError when nothing is recognised, or a file that the layout needs is missing or makes no sense.
+    masks: a folder of ready-made instance masks, one image of ids a view, named by the view's stem, or a COCO file.
+    hints: a file of points clicked on objects, in the place of masks.
+        By default, `instance_masks/`, `instance_masks.json` or `hints.json` in the scene's folder, where one exists.
+        Likewise `instance/` is ground truth, and `valid/` (or what the layout itself lists) holds masks that are 0
+        where a pixel is to be ignored.
+    Raises InputError when nothing is recognised, or a file that the layout needs is missing or makes no sense, or masks
+    are given in two ways.
     """
     scene = _open_layout(path)
     if scene.kind != "video":
         _check_files(scene)
-    if masks is not None and not masks.is_dir():
-        raise InputError(f"{masks} is no folder; ready-made instance masks come as a folder of images named by view.")
-    if scene.kind == "video" and masks is not None:
-        raise InputError(f"{masks} cannot go with a video, whose frames have no names yet; extract the frames first.")
     in_folder = path.is_dir() and scene.kind != "video"
-    if masks is None and in_folder and (path / "instance_masks").is_dir():
-        masks = path / "instance_masks"
-    if masks is not None:
+    if masks is not None and hints is not None:
+        raise InputError(f"{masks} and {hints} cannot be used together; give masks or hints.")
+    if masks is None and hints is None and in_folder:
+        masks, hints = _found_masks(path)
+    if scene.kind == "video" and (masks or hints):
+        raise InputError(
+            f"{masks or hints} cannot go with a video, whose frames have no names yet; extract the frames first."
+        )
+    if hints is not None:
+        scene = replace(scene, hints=read_hints(hints, scene.names))
+    elif masks is not None and masks.is_dir():
         scene = replace(scene, ready_masks=_all_by_name(masks, scene.names))
+    elif masks is not None and masks.is_file() and masks.suffix.lower() == ".json":
+        scene = replace(scene, coco_masks=masks)
+    elif masks is not None:
+        raise InputError(
+            f"{masks} is no folder and no .json file; ready-made instance masks come as a folder of images named by "
+            "view, or as a COCO file."
+        )
     if in_folder and (path / "instance").is_dir():
         scene = replace(scene, ground_truth=_some_by_name(path / "instance", scene.names))
     if in_folder and (path / "valid").is_dir() and not any(scene.valid):
@@ -48,6 +63,18 @@ def open_scene(path: Path, masks: Path | None = None) -> SceneFiles:
     if not scene.valid:
         scene = replace(scene, valid=(None,) * len(scene.names))
     return scene
+
+
+def _found_masks(folder: Path) -> tuple[Path | None, Path | None]:
+    """The masks and the hints, one of them at most, that lie in a scene's folder."""
+    masks = [place for place in (folder / "instance_masks", folder / "instance_masks.json") if place.exists()]
+    hints = [place for place in (folder / "hints.json",) if place.exists()]
+    if len(masks + hints) > 1:
+        raise InputError(
+            f"{folder} holds {' and '.join(place.name for place in masks + hints)}; name the one to use, with --masks "
+            "or --hints."
+        )
+    return next(iter(masks), None), next(iter(hints), None)
 
 
 def _open_layout(path: Path) -> SceneFiles:

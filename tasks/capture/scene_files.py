@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,31 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 
 Pose = tuple[float, ...]
 """World-to-camera, 16 numbers row by row (plain numbers, so that a step's key can hold it)."""
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Hint:
+    """The points that were clicked for one object in one view, in pixels of the input photo."""
+
+    view: str
+    label: int
+    """The object's place among `Hints.objects`, from 1 on."""
+    inside: tuple[Point, ...]
+    """Points on the object; one at least."""
+    outside: tuple[Point, ...]
+    """Points that are not."""
+
+
+@dataclass(frozen=True)
+class Hints:
+    """All that was clicked in a scene."""
+
+    path: Path = field(metadata={"key": False})
+    """The file, to be named in messages."""
+    objects: tuple[str, ...]
+    """The objects' names, in the order in which the file first gives them."""
+    hints: tuple[Hint, ...]
 
 
 @dataclass(frozen=True)
@@ -54,10 +80,19 @@ class SceneFiles:
     """COLMAP's points3D file."""
     ready_masks: tuple[Path, ...] | None = None
     """Instance masks that stand in for a segmenter: uint16 images of ids, 0 = none."""
+    coco_masks: Path | None = None
+    """The same for all views in one COCO file."""
+    hints: Hints | None = None
+    """Points clicked on objects, at which the segmenter is to be prompted."""
     ground_truth: tuple[Path | None, ...] | None = None
     """Annotated instances: uint16 images of ids, 0 = not annotated or background."""
     skipped: tuple[str, ...] = ()
     """Views of the capture that are left out, for lack of a pose or a depth map."""
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether it brings masks that stand in for a segmenter."""
+        return self.ready_masks is not None or self.coco_masks is not None
 
     @property
     def world_to_camera(self) -> Float64 | None:
@@ -74,9 +109,9 @@ class SceneFiles:
         """Only these views, in this order."""
         per_view = ("names", "photos", "entries", "valid", "depths", "lenses", "poses", "ready_masks", "ground_truth")
         kept: dict[str, Any] = {}
-        for field in per_view:
-            values = getattr(self, field)
-            kept[field] = tuple(values[i] for i in views) if values else values
+        for name in per_view:
+            values = getattr(self, name)
+            kept[name] = tuple(values[i] for i in views) if values else values
         return replace(self, **kept)
 
 
@@ -119,6 +154,30 @@ def read_text(path: Path) -> str:
         raise InputError(f"{path} is missing; the capture needs it.") from error
     except (UnicodeDecodeError, OSError) as error:
         raise InputError(f"{path} cannot be read as text ({error}); a plain text file is expected.") from error
+
+
+def read_json(path: Path) -> Any:
+    """The value that a JSON file holds.
+
+    Raises InputError when it is absent or no JSON, or names something twice in one object.
+    """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+            raise ValueError(f"{twice!r} stands twice in one object")
+        return found
+
+    try:
+        return json.loads(read_text(path), object_pairs_hook=unique)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid JSON ({error}).") from error
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value read from JSON is a number that may count pixels: neither NaN nor endless."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
 
 
 def read_matrix(path: Path) -> Float64:

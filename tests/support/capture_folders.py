@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Cameras, Frame
 
 WIDTH, HEIGHT = 32, 24
 NAMES = ("2", "10", "11")
@@ -37,6 +38,18 @@ def write(path: Path, image: np.ndarray) -> Path:
 
 def depth_image(millimetres: int = 2000, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     return np.full((height, width), millimetres, np.uint16)
+
+
+def cameras_of(frames: tuple[Frame, ...], radial: float = 0.0) -> Cameras:
+    """Cameras of frames as structure from motion finds them, with this radial distortion of their photos."""
+    return Cameras(
+        names=tuple(frame.name for frame in frames),
+        sizes=np.array([(frame.width, frame.height) for frame in frames], np.int32),
+        intrinsics=np.array([(frame.width, frame.width, frame.width / 2, frame.height / 2) for frame in frames], float),
+        world_to_camera=np.tile(np.eye(4), (len(frames), 1, 1)),
+        metric=False,
+        radial=np.full(len(frames), radial) if radial else np.zeros(0),
+    )
 
 
 def pose(x: float) -> np.ndarray:

@@ -43,9 +43,9 @@ def read_all(path: Path) -> None:
             depth_lens=scene.depth_lens,
         )
     if scene.ready_masks:
-        ready_masks(views, names=names, files=refs(scene.ready_masks), lenses=lenses)
+        ready_masks(views, made.cameras_of(views), names=names, files=refs(scene.ready_masks), lenses=lenses)
     if scene.ground_truth:
-        ground_truth(views, names=names, files=refs(scene.ground_truth), lenses=lenses)
+        ground_truth(views, made.cameras_of(views), names=names, files=refs(scene.ground_truth), lenses=lenses)
 
 
 CASES = {}
