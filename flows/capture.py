@@ -13,6 +13,8 @@ from ss_flow.graph import each
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture import depth as depth_steps
 from ss_flow.tasks.capture import ingest, recordings, sensor_depth
+from ss_flow.tasks.capture.coco_masks import coco_masks
+from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.scene_files import SceneFiles
@@ -37,6 +39,10 @@ class Capture:
     """tuple[LabelMap, ...] where it is annotated."""
     names: tuple[str, ...] | None
     """Names of the views where they are known beforehand."""
+    clicks: Any | None = None
+    """tuple[Clicks, ...] where its user pointed at objects."""
+    objects: tuple[str, ...] = ()
+    """What the user calls these objects."""
 
 
 def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, monodepth: Model | None) -> Capture:
@@ -59,13 +65,19 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         cameras = sfm(frames, params=params.sfm)
         frames = registered(frames, cameras)
     names = scene.names if scene.poses is not None else None
-    masks = truth = None
+    views: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
+    masks = truth = pointed = None
     if scene.ready_masks is not None:
-        masks = ready_masks(frames, names=scene.names, files=_all(reference, scene.ready_masks), lenses=scene.lenses)
+        masks = ready_masks(frames, cameras, files=_all(reference, scene.ready_masks), **views)
+    elif scene.coco_masks is not None:
+        masks = coco_masks(frames, cameras, file=reference(scene.coco_masks), **views)
+    elif scene.hints is not None:
+        pointed = clicks(frames, cameras, hints=scene.hints, **views)
     if scene.ground_truth is not None:
-        truth = ground_truth(frames, names=scene.names, files=_all(reference, scene.ground_truth), lenses=scene.lenses)
+        truth = ground_truth(frames, cameras, files=_all(reference, scene.ground_truth), **views)
     depths = _depths(scene, reference, params, monodepth, frames, cameras, names)
-    return Capture(frames, cameras, depths, masks, truth, names)
+    objects = scene.hints.objects if scene.hints is not None else ()
+    return Capture(frames, cameras, depths, masks, truth, names, pointed, objects)
 
 
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> Any:

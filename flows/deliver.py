@@ -35,7 +35,7 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
     models = {
         role: model.name if (model := getattr(networks, role)) else fallback for role, fallback in FALLBACKS.items()
     }
-    if scene.ready_masks:
+    if scene.has_masks:
         models["segmenter"] = "ready-made masks"
     return {
         "status": status,
@@ -100,7 +100,7 @@ def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
     split_maps, maps = several("masks_split"), several("masks")
     instances = instances_document(several("refine"), scene, one("names"), frames)
     write_scene(folder, scene, instances)
-    write_cloud(folder, one("dense"), one("propagate"))
+    write_cloud(folder, one("dense"), one("propagate"), one("parts"))
     write_masks(folder / "masks_split", frames, split_maps)
     write_masks(folder / "masks", frames, maps)
     pictures = report_pictures(frames, cameras, several("depth"), split_maps, maps, scene)

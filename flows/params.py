@@ -18,6 +18,9 @@ from ss_flow.tasks.splat.plan import PlanParams
 from ss_flow.tasks.splat.reconstruct import ReconstructParams
 from ss_flow.tasks.splat.refine import RefineParams
 from ss_flow.tasks.split.dense import DenseParams
+from ss_flow.tasks.split.dense_splatting import DenseSplattingParams
+from ss_flow.tasks.split.observe import ObserveParams
+from ss_flow.tasks.split.parts import PartsParams
 from ss_flow.tasks.split.propagate import PropagateParams
 from ss_flow.tasks.split.reproject import ReprojectParams
 from ss_flow.tasks.split.reprompt import RepromptParams
@@ -61,9 +64,14 @@ class SplitParams:
     """The network that makes the masks: a name of the catalogue, "auto", or "none" for colour, depth and normals."""
     segment: SegmentParams = field(default_factory=SegmentParams)
     rgbd: SegmentRgbdParams = field(default_factory=SegmentRgbdParams)
+    dense_source: Literal["depth", "splatting"] = "depth"
+    """Where the dense points come from: all depth maps, or a short splatting of the whole scene, as in the paper."""
     dense: DenseParams = field(default_factory=DenseParams)
+    splatting: DenseSplattingParams = field(default_factory=DenseSplattingParams)
     visibility: VisibilityParams = field(default_factory=VisibilityParams)
+    observe: ObserveParams = field(default_factory=ObserveParams)
     propagate: PropagateParams = field(default_factory=PropagateParams)
+    parts: PartsParams = field(default_factory=PartsParams)
     reprompt: RepromptParams = field(default_factory=RepromptParams)
     reproject: ReprojectParams = field(default_factory=ReprojectParams)
 

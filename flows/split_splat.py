@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from ss_flow.errors import InputError
 from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import Params, SplitParams
 from ss_flow.graph import each, expand, gather, labelled
@@ -12,15 +13,19 @@ from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.evaluate.novel_view import novel_view
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.semantics.describe import describe
-from ss_flow.tasks.semantics.name import name
+from ss_flow.tasks.semantics.name import given_names, name
 from ss_flow.tasks.splat.collisions import MergePlan
 from ss_flow.tasks.splat.merge import assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import plan
 from ss_flow.tasks.splat.reconstruct import reconstruct, retrain
 from ss_flow.tasks.splat.refine import refine
 from ss_flow.tasks.splat.resolve import exclusive, resolve
+from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.dense import dense
+from ss_flow.tasks.split.dense_splatting import dense_splatting
 from ss_flow.tasks.split.embed import embed
+from ss_flow.tasks.split.observe import observe
+from ss_flow.tasks.split.parts import find_parts
 from ss_flow.tasks.split.propagate import propagate
 from ss_flow.tasks.split.reproject import reproject
 from ss_flow.tasks.split.reprompt import reprompt
@@ -46,10 +51,13 @@ class Split:
     visibility: Any
     masks: Any
     labels: Any
+    parts: Any
     instances: Any
     """tuple[InstanceMasks, ...], the background first."""
     embeddings: Any
     """tuple[Embedding, ...], one a view; () without a segmenter."""
+    hinted: Any | None
+    """PointLabels by the objects that were clicked, where some were."""
 
 
 def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Any]:
@@ -64,6 +72,7 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         "dense": halved.points,
         "segment": halved.masks,
         "propagate": halved.labels,
+        "parts": halved.parts,
         "reproject": halved.instances,
         "masks_split": masks_split,
     }
@@ -87,18 +96,38 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         ),
     )
     results["names"] = name(results["describe"], encoder=networks.encoder)
+    if halved.hinted is not None:
+        results["names"] = given_names(results["names"], halved.hinted, halved.labels, objects=capture.objects)
     return results
 
 
 def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     """Photos and depth -> view-consistent instances (Split&Splat, Sec. 3.1)."""
-    points = dense(capture.frames, capture.cameras, capture.depths, params=params.dense)
+    views = (capture.frames, capture.cameras, capture.depths)
+    if params.dense_source == "splatting":
+        points = dense_splatting(*views, params=params.dense, splatting=params.splatting)
+    else:
+        points = dense(*views, params=params.dense)
     segmenter = networks.segmenter
     embeddings: Any = ()
     if segmenter is not None:
         embeddings = each(capture.frames, names=capture.names, build=lambda frame: embed(frame, model=segmenter))
+    seen = each(
+        capture.depths,
+        names=capture.names,
+        build=lambda depth: visibility(
+            points,
+            capture.cameras,
+            depth,
+            view=depth.index,
+            **vars(params.visibility),
+        ),
+    )
+    hinted: Any | None = None
     if capture.masks is not None:
         masks = capture.masks
+    elif capture.clicks is not None:
+        masks, hinted = _masks_of_hints(capture, embeddings, points, seen, segmenter, params)
     elif segmenter is not None:
         masks = each(
             capture.frames,
@@ -113,18 +142,16 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
             names=capture.names,
             build=lambda frame, depth: segment_rgbd(frame, depth, capture.cameras, params=params.rgbd),
         )
-    seen = each(
-        capture.depths,
+    observed = each(
+        seen,
+        masks,
         names=capture.names,
-        build=lambda depth: visibility(
-            points,
-            capture.cameras,
-            depth,
-            view=depth.index,
-            **vars(params.visibility),
-        ),
+        build=lambda visible, pool: observe(points, visible, pool, params=params.observe),
     )
-    labels = propagate(points, seen, masks, params=params.propagate)
+    # What was clicked as two objects stays two.
+    propagating = replace(params.propagate, touching_merge=False) if capture.clicks is not None else params.propagate
+    labels = propagate(points, seen, observed, params=propagating)
+    parts = find_parts(observed, masks, labels, params=params.parts)
     prompted: Any = ()
     if segmenter is not None and capture.masks is None:
         prompted = each(
@@ -144,8 +171,44 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
                 selection=params.reproject.selection,
             ),
         )
-    instances = reproject(points, seen, masks, labels, prompted, params=params.reproject)
-    return Split(points, seen, masks, labels, instances, embeddings)
+    instances = reproject(points, seen, masks, labels, parts, prompted, params=params.reproject)
+    return Split(points, seen, masks, labels, parts, instances, embeddings, hinted)
+
+
+def _masks_of_hints(
+    capture: Capture, embeddings: Any, points: Any, seen: Any, segmenter: Model | None, params: SplitParams
+) -> tuple[Any, Any]:
+    """The masks of all views from points clicked in a few, and the points labelled by the clicked objects."""
+    if segmenter is None:
+        raise InputError(
+            "hints need a segmenter to be prompted with, and there is none; `ss-flow models list` names some."
+        )
+    clicked = each(
+        capture.frames,
+        embeddings,
+        capture.clicks,
+        names=capture.names,
+        build=lambda frame, embedding, clicks: hints.clicked(frame, embedding, clicks, model=segmenter),
+    )
+    hinted = hints.label(points, seen, clicked, erosion=params.observe.erosion, tau_label=params.propagate.tau_label)
+    masks = each(
+        capture.frames,
+        embeddings,
+        seen,
+        clicked,
+        names=capture.names,
+        build=lambda frame, embedding, visible, own: hints.spread(
+            frame,
+            embedding,
+            visible,
+            own,
+            hinted,
+            params=params.reprompt,
+            contained=params.segment.contained,
+            model=segmenter,
+        ),
+    )
+    return masks, hinted
 
 
 def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -> dict[str, Any]:

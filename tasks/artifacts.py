@@ -137,6 +137,32 @@ class Visibility:
 
 
 @dataclass(frozen=True)
+class Observation:
+    """What the masks of one view say about the points that it sees (Split&Splat, Eq. 3: P_{k,j} for every mask j)."""
+
+    name: str
+    point_index: Int32
+    """[M] rows of the point cloud that the view sees, ascending."""
+    mask: Int32
+    """[J] index of each mask in the view's MaskSet, in canonical order."""
+    first: Int32
+    """[J + 1] where the points of each mask begin: mask j has entries first[j] .. first[j + 1]."""
+    row: Int32
+    """[A] which of the view's points lie under the masks, as rows of `point_index`; ascending within each mask."""
+    standing: UInt8
+    """[A] how each of them stands under its mask: 0 at its border, 1 inside but strayed from the rest, 2 inside."""
+
+    def inside(self, j: int) -> Int32:
+        """Points of the cloud that lie inside the j-th mask, ascending."""
+        part = slice(self.first[j], self.first[j + 1])
+        return self.point_index[self.row[part][self.standing[part] == INSIDE]]
+
+
+BORDER, STRAY, INSIDE = 0, 1, 2
+"""How a point stands under a mask."""
+
+
+@dataclass(frozen=True)
 class PointLabels:
     """The labelled dense points (Split&Splat, P_labeled) and how each mask was matched."""
 
@@ -153,12 +179,33 @@ class PointLabels:
     match_label: Int32
     """[A] id that the mask votes for."""
     match_purity: Float32
-    """[A] share of the painted pixels under the mask that carry that id."""
+    """[A] share of what the mask holds, of all that is labelled, that carries that id."""
+
+
+@dataclass(frozen=True)
+class PointParts:
+    """Which part of its object each dense point belongs to."""
+
+    part: Int32
+    """[N] 0 = the whole object; 1.. within each label, from the largest part on."""
+
+
+@dataclass(frozen=True)
+class Clicks:
+    """The points that a user clicked in one view to say where objects are; none in most views."""
+
+    name: str
+    label: Int32
+    """[N] the object that each point is about, numbered from 1 on over all views."""
+    points: Float64
+    """[N, 2] x, y in pixels of the frame."""
+    inside: Int32
+    """[N] 1 = on the object, 0 = outside of it."""
 
 
 @dataclass(frozen=True)
 class PromptedMasks:
-    """Masks that the segmenter gave in one view when asked where labels are that it had not found by itself."""
+    """Masks that the segmenter gave in one view when asked for certain labels."""
 
     name: str
     height: int
@@ -167,6 +214,8 @@ class PromptedMasks:
     """[N] instance id of each mask, ascending."""
     packed: UInt8
     """[N, ceil(H * W / 8)] one bit a pixel, row-major (`np.packbits`)."""
+    predicted_iou: Float32
+    """[N] the segmenter's own estimate of each mask's quality."""
 
     def dense(self) -> Bool:
         """The masks as [N, H, W] booleans."""
@@ -185,6 +234,8 @@ class InstanceMasks:
     """[N, 3] RGB."""
     point_confidence: Float32
     """[N] share of votes."""
+    point_part: Int32
+    """[N] part of the instance, 0 = the whole."""
     confidence: float
     """Mean vote share, less what other labels contradict."""
     height: int
@@ -194,7 +245,7 @@ class InstanceMasks:
     packed: UInt8
     """[V, ceil(H * W / 8)] one bit a pixel (`np.packbits`), exclusive between instances."""
     prompted: UInt8
-    """[V] where the mask came from: 0 Split, 1 Split by re-prompting the segmenter, 2 refinement in Splat."""
+    """[V] where the mask came from: FOUND, PROMPTED, REFINED or DRAWN."""
     weak: bool
     """Seen in too few views to be reconstructed: kept as points only."""
 
@@ -202,6 +253,11 @@ class InstanceMasks:
         """The masks as [V, H, W] booleans."""
         bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
         return bits.reshape(-1, self.height, self.width).astype(bool)
+
+
+FOUND, PROMPTED, REFINED, DRAWN = 0, 1, 2, 3
+"""Where an instance's mask came from: the view's own masks, the segmenter when asked again, refinement in Splat, or the
+instance's points in the view."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +279,7 @@ class Gaussians:
     instance_conf: Float32
     """[N] 0..1."""
     part_id: Int32
-    """[N] 0 = the whole object."""
+    """[N] part of the instance, 0 = the whole."""
 
     def __len__(self) -> int:
         return len(self.means)

@@ -121,7 +121,7 @@ def prepare(
     """
     scene = scene.every(params.capture.stride)
     networks = Networks(
-        segmenter=choose_model("segmenter", params.split.segmenter, digests, wanted=not scene.ready_masks),
+        segmenter=choose_model("segmenter", params.split.segmenter, digests, wanted=not scene.has_masks),
         encoder=choose_model("text-image", params.semantics.encoder, digests),
         monodepth=choose_model("monodepth", params.capture.monodepth, digests, wanted=params.capture.depth == "mono"),
     )

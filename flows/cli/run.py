@@ -21,6 +21,7 @@ from ss_flow.flows.cli.telling import hits_of, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
 from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import check_place
 
 
@@ -34,14 +35,17 @@ class Run:
     out: Path | None = None
     """The folder to write; by default ss-flow-out/NAME of the scene."""
     masks: Path | None = None
-    """A folder of ready-made instance masks (uint16 PNG files named like the photos), in the place of a segmenter."""
+    """Ready-made instance masks in the place of a segmenter: a folder of uint16 PNG files named like the photos, or a
+    COCO file (.json)."""
+    hints: Path | None = None
+    """A file (.json) of a few points clicked on objects in a few views; the segmenter looks for these objects only."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
     """How to run."""
 
     def run(self) -> int:
         params = settings.preset(Params(), self.execution.preset)
         out = self.out or Path("ss-flow-out") / self.scene.resolve().stem
-        return run_scene(self.scene, self.masks, out, params, self.execution)
+        return run_scene(open_scene(self.scene, self.masks, self.hints), out, params, self.execution)
 
 
 @dataclass(frozen=True)
@@ -68,14 +72,13 @@ class Demo:
         scene = demo_scene(self.out, self.masks, self.objects, self.views, self.seed)
         params = settings.preset(Params(), self.execution.preset)
         params = dataclasses.replace(params, evaluate=dataclasses.replace(params.evaluate, zero_is_void=False))
-        return run_scene(scene, None, self.out / "result", params, self.execution)
+        return run_scene(open_scene(scene), self.out / "result", params, self.execution)
 
 
-def run_scene(scene_path: Path, masks: Path | None, out: Path, params: Params, options: RunOptions) -> int:
+def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions) -> int:
     """Run the DAG on a scene, write the output folder, print what came out. Returns the exit code."""
     params = settings.apply(params, options.texts)
     engine = options.engine()
-    scene = open_scene(scene_path, masks)
     if options.delivers:
         check_place(out)
     store = options.store.open_store()

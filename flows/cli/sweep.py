@@ -76,7 +76,9 @@ class Sweep:
     query: str | None = None
     """Also search every result for this text, so that query.tau_corr can be swept."""
     masks: Path | None = None
-    """A folder of ready-made instance masks for the only scene, in the place of a segmenter."""
+    """Ready-made instance masks for the only scene, as `run` takes them."""
+    hints: Path | None = None
+    """A file of points clicked on objects of the only scene, as `run` takes it."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
     """How to run."""
 
@@ -85,7 +87,7 @@ class Sweep:
         engine = options.engine()
         settings_of = self._variants(settings.preset(Params(), options.preset), options.texts)
         self._check()
-        scenes = [open_scene(path, self.masks) for path in self.scenes]
+        scenes = [open_scene(path, self.masks, self.hints) for path in self.scenes]
         out = self.out or Path("ss-flow-out") / (f"{scenes[0].name}-sweep" if len(scenes) == 1 else "sweep")
         check_writable(out)
         store = options.store.open_store()
@@ -153,8 +155,9 @@ class Sweep:
     def _check(self) -> None:
         if not self.scenes:
             raise InputError("there is no scene to sweep; name one, or several.")
-        if self.masks and len(self.scenes) != 1:
-            raise InputError("--masks belongs to one scene; sweep scenes with masks of their own one by one.")
+        if (self.masks or self.hints) and len(self.scenes) != 1:
+            given = "--masks" if self.masks else "--hints"
+            raise InputError(f"{given} belongs to one scene; sweep scenes with masks of their own one by one.")
         if self.query is not None and self.execution.target not in (None, "query"):
             raise InputError("--query is the last step; leave out --until, or stop with --until query.")
 

@@ -9,6 +9,10 @@ from functools import singledispatch
 import numpy as np
 
 from ss_flow.tasks.artifacts import (
+    DRAWN,
+    FOUND,
+    PROMPTED,
+    REFINED,
     Cameras,
     DepthMap,
     Descriptors,
@@ -16,11 +20,13 @@ from ss_flow.tasks.artifacts import (
     Frame,
     Gaussians,
     InstanceMasks,
+    Int32,
     LabelMap,
     MaskSet,
     Metrics,
     PointCloud,
     PointLabels,
+    PointParts,
     UInt8,
     Visibility,
 )
@@ -33,6 +39,7 @@ from ss_flow.tasks.models.colour_words import TERMS, ColourWords
 from ss_flow.tasks.semantics.query import QueryResult
 
 _MOST_ON_A_SHEET = 24
+_ORIGINS = {FOUND: "", PROMPTED: " (re-prompted)", REFINED: " (refined)", DRAWN: " (from points)"}
 _TERM_COLORS = dict(grey="#8a8a8a", white="#e8e8e4", green="#2e8b45", yellow="#eac520", brown="#7b4a21", pink="#f08cb4")
 
 
@@ -157,7 +164,7 @@ def _(value: InstanceMasks, context: Context) -> UInt8:
         view = int(value.view[row])
         pictures.append(paint_ids(ids, context.photo(value.height, value.width, view), 0.45))
         name = context.frames[view].name if view < len(context.frames) else f"view {view}"
-        captions.append(name + (" (re-prompted)" if value.prompted[row] else ""))
+        captions.append(name + _ORIGINS[int(value.prompted[row])])
     if pictures:
         return contact_sheet(pictures, captions)
     if len(value.points):
@@ -172,13 +179,26 @@ def _(value: PointCloud, context: Context) -> UInt8:
 
 @_draw.register
 def _(value: PointLabels, context: Context) -> UInt8:
-    if context.points is None or len(context.points.points) != len(value.label):
-        counts = np.bincount(value.label)
-        rows = [(f"label {i}" if i else "unlabelled", f"{counts[i]} points") for i in np.flatnonzero(counts)]
-        return table_picture("PointLabels", rows)
-    colors = instance_colors(int(value.label.max(initial=0)) + 1)
+    return _numbered_points("PointLabels", value.label, ("unlabelled", "label"), context)
+
+
+@_draw.register
+def _(value: PointParts, context: Context) -> UInt8:
+    return _numbered_points("PointParts", value.part, ("whole objects", "part"), context)
+
+
+def _numbered_points(title: str, number: Int32, words: tuple[str, str], context: Context) -> UInt8:
+    """The dense points in the colours of their numbers, 0 grey; without the points, how many have each number.
+
+    words: what 0 means, and what comes before another number.
+    """
+    if context.points is None or len(context.points.points) != len(number):
+        counts = np.bincount(number)
+        rows = [(f"{words[1]} {i}" if i else words[0], f"{counts[i]} points") for i in np.flatnonzero(counts)]
+        return table_picture(title, rows)
+    colors = instance_colors(int(number.max(initial=0)) + 1)
     colors[0] = (190, 190, 190)
-    return _points_picture(context.points.points, colors[value.label], context.points.spacing, context)
+    return _points_picture(context.points.points, colors[number], context.points.spacing, context)
 
 
 def _points_picture(points: Float32, colors: UInt8, spacing: float, context: Context) -> UInt8:

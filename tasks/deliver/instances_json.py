@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,10 +27,10 @@ def instances_document(
     instance is "object 7" by its id. frames: of all views, in the scene's order. parents: id of a part -> id of the
     whole.
 
-    Each instance has: id, name, named_by (the encoder, or null), color [r, g, b], parent (id or null), bbox {min, max}
-    and centroid in world units (null without points and Gaussians), views (names), confidence, num_points,
-    num_gaussians, weak, and file ("instances/0007.ply", null where it has no Gaussians). Names are unique: of several
-    "red object" the later ones, by id, are "red object 2" and so on.
+    Each instance has: id, name, named_by (the encoder, "hints" for a name of the user's own, or null), color [r, g, b],
+    parent (id or null), bbox {min, max} and centroid in world units (null without points and Gaussians), views (names),
+    confidence, num_parts, num_points, num_gaussians, weak, and file ("instances/0007.ply", null without Gaussians).
+    Names are unique: of several "red object" the later ones, by id, are "red object 2" and so on; the user's own stay.
     """
     known = sorted((i for i in instances if i.instance_id != 0), key=lambda i: i.instance_id)
     called = _unique_names([i.instance_id for i in known], names)
@@ -43,12 +42,13 @@ def instances_document(
         entry = {
             "id": instance.instance_id,
             "name": called[instance.instance_id],
-            "named_by": names.encoder if names is not None and instance.instance_id in names.instance_id else None,
+            "named_by": _named_by(instance.instance_id, names),
             "color": list(instance_color(instance.instance_id)),
             "parent": (parents or {}).get(instance.instance_id),
             **_place(places),
             "views": [frames[view].name for view in instance.view],
             "confidence": round(float(instance.confidence), 4),
+            "num_parts": int(instance.point_part.max(initial=0)),
             "num_points": len(instance.points),
             "num_gaussians": len(rows),
             "weak": bool(instance.weak),
@@ -63,17 +63,26 @@ def instance_file(instance_id: int) -> str:
     return f"instances/{instance_id:04d}.ply"
 
 
+def _named_by(instance_id: int, names: InstanceNames | None) -> str | None:
+    if names is None or instance_id not in names.instance_id:
+        return None
+    return "hints" if instance_id in names.given else names.encoder
+
+
 def _unique_names(ids: Sequence[int], names: InstanceNames | None) -> dict[int, str]:
-    given = {} if names is None else dict(zip(names.instance_id.tolist(), names.names, strict=True))
-    taken: Counter[str] = Counter()
-    called = {}
-    for instance_id in ids:
-        word = given.get(instance_id, "object")
-        taken[word] += 1
-        if word == "object":
-            called[instance_id] = f"object {instance_id}"
-        else:
-            called[instance_id] = word if taken[word] == 1 else f"{word} {taken[word]}"
+    words = {} if names is None else dict(zip(names.instance_id.tolist(), names.names, strict=True))
+    own = set() if names is None else set(names.given.tolist())
+    called: dict[int, str] = {}
+    taken: set[str] = set()
+    for instance_id in sorted(ids, key=lambda i: i not in own):  # what the user said stays as it was said
+        word = words.get(instance_id, "object")
+        name = f"object {instance_id}" if word == "object" else word
+        number = 1
+        while name in taken:
+            number += 1
+            name = f"{word} {number}"
+        taken.add(name)
+        called[instance_id] = name
     return called
 
 

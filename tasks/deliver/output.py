@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap, PointCloud, PointLabels, PointParts
 from ss_flow.tasks.deliver import ply
 from ss_flow.tasks.geometry.images import encode_png
 
@@ -84,9 +84,9 @@ def write_scene(folder: Path, scene: Gaussians, instances: Mapping[str, Any]) ->
             ply.write_gaussians(folder / "instances" / f"{instance_id:04d}.ply", one, labelled=True)
 
 
-def write_cloud(folder: Path, cloud: PointCloud, labels: PointLabels) -> None:
+def write_cloud(folder: Path, cloud: PointCloud, labels: PointLabels, parts: PointParts) -> None:
     """Write cloud_labeled.ply."""
-    ply.write_cloud(folder / "cloud_labeled.ply", cloud, labels)
+    ply.write_cloud(folder / "cloud_labeled.ply", cloud, labels, parts)
 
 
 def write_masks(folder: Path, frames: Sequence[Frame], maps: Sequence[LabelMap]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Float32, Gaussians, Int32, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import Float32, Gaussians, PointCloud, PointLabels, PointParts
 
 _REST = 45
 _STANDARD = (
@@ -64,10 +64,10 @@ def _gaussian_rows(gaussians: Gaussians, part: slice, width: int) -> Float32:
     return rows
 
 
-def write_cloud(path: Path, cloud: PointCloud, labels: PointLabels, part_id: Int32 | None = None) -> None:
+def write_cloud(path: Path, cloud: PointCloud, labels: PointLabels, parts: PointParts) -> None:
     """Write the labelled points: x y z, red green blue, instance_id, instance_conf, part_id.
 
-    part_id: [N]; zeros (the whole object) when None. Raises ValueError when cloud and labels differ in length.
+    Raises ValueError when cloud and labels differ in length.
     """
     if len(cloud.points) != len(labels.label):
         raise ValueError(f"{len(cloud.points)} points but {len(labels.label)} labels")
@@ -82,8 +82,7 @@ def write_cloud(path: Path, cloud: PointCloud, labels: PointLabels, part_id: Int
             rows[name] = cloud.colors[start:stop, channel]
         rows["instance_id"] = labels.label[start:stop]
         rows["instance_conf"] = labels.confidence[start:stop]
-        if part_id is not None:
-            rows["part_id"] = part_id[start:stop]
+        rows["part_id"] = parts.part[start:stop]
         return rows
 
     _write(path, dtype, len(cloud.points), block, ())

@@ -19,15 +19,16 @@ def initialise(
     colors: UInt8,
     instance_id: int | Int32,
     confidence: float | Float32,
+    part_id: int | Int32 = 0,
     *,
     sh_degree: int = 0,
     opacity: float = 0.1,
 ) -> Gaussians:
     """Round Gaussians at points (spec P1).
 
-    points: [N, 3] world, N >= 1. colors: [N, 3] RGB. instance_id, confidence: one for all, or [N]. The standard
-    deviation is the root of the mean squared distance to the three nearest other points. Raises ValueError when the
-    shapes do not fit.
+    points: [N, 3] world, N >= 1. colors: [N, 3] RGB. instance_id, confidence, part_id: one for all, or [N].
+    The standard deviation is the root of the mean squared distance to the three nearest other points.
+    Raises ValueError when the shapes do not fit.
     """
     from scipy.spatial import cKDTree
 
@@ -50,7 +51,7 @@ def initialise(
         sh=sh,
         instance_id=np.broadcast_to(np.asarray(instance_id, np.int32), (n,)).copy(),
         instance_conf=np.broadcast_to(np.asarray(confidence, np.float32), (n,)).copy(),
-        part_id=np.zeros(n, np.int32),
+        part_id=np.broadcast_to(np.asarray(part_id, np.int32), (n,)).copy(),
     )
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Descriptors, Float32, Int32
+from ss_flow.tasks.artifacts import Descriptors, Float32, Int32, PointLabels
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.colour_words import TERMS, ColourWords
 from ss_flow.tasks.semantics.encoders import encoder_of
@@ -39,6 +39,8 @@ class InstanceNames:
     """[L] cosine of the descriptor and the word; 0 where there is no descriptor."""
     encoder: str
     """Name of the text-image encoder."""
+    given: Int32 = field(default_factory=lambda: np.zeros(0, np.int32))
+    """[G] ids of the instances whose name is the user's own."""
 
 
 @task(uses=("onnxruntime",))
@@ -62,3 +64,25 @@ def name(
     )
     ids = np.array([d.instance_id for d in descriptors], np.int32)
     return InstanceNames(ids, names, cosines.max(axis=1, initial=-1) * seen, model.name)
+
+
+@task(name="semantics.given_names")
+def given_names(
+    names: InstanceNames, hinted: PointLabels, labels: PointLabels, *, objects: tuple[str, ...]
+) -> InstanceNames:
+    """The user's own names in the place of words, for the instances that are the objects that were clicked.
+
+    hinted: the dense points labelled by object; labels: by instance. objects: the objects' names. An object is the
+    instance that has most of its points, if that instance has of no other object more.
+    """
+    shared = np.zeros((len(objects) + 1, int(labels.label.max(initial=0)) + 1), np.int64)
+    np.add.at(shared, (hinted.label, labels.label), 1)
+    shared[0], shared[:, 0] = 0, 0
+    word_of = {}
+    for number, called in enumerate(objects, start=1):
+        best = int(shared[number].argmax())
+        if shared[number, best] and shared[:, best].argmax() == number:
+            word_of[best] = called
+    words = tuple(word_of.get(i, word) for i, word in zip(names.instance_id.tolist(), names.names, strict=True))
+    given = np.intersect1d(names.instance_id, list(word_of)).astype(np.int32)
+    return replace(names, names=words, given=given)

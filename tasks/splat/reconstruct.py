@@ -9,13 +9,12 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks, Int32
+from ss_flow.tasks.artifacts import REFINED, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks, Int32
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, NonNegative, Positive
 from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
-from ss_flow.tasks.splat.resolve import REFINED
 from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask_of, training_view
 
 
@@ -131,7 +130,11 @@ def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussian
     scale = params.background_scale if instance.instance_id == 0 else 1
     rows = thin(instance.points, round(params.max_points * scale))
     return initialise(
-        instance.points[rows], instance.colors[rows], instance.instance_id, instance.point_confidence[rows]
+        instance.points[rows],
+        instance.colors[rows],
+        instance.instance_id,
+        instance.point_confidence[rows],
+        instance.point_part[rows],
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.artifacts import DRAWN, REFINED, Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
@@ -19,7 +19,6 @@ from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive
 from ss_flow.tasks.splat.groups import box_diagonal, rasterizer, scene_views
-from ss_flow.tasks.splat.resolve import REFINED
 from ss_flow.tasks.splat.views import CropParams, SceneViews, crop_camera, mask_of, sample_depth
 
 Prompt = Callable[[Float32], tuple[Bool, float]]
@@ -89,9 +88,9 @@ def refine(
     `tau_iou`.
 
     model: the segmenter; embeddings: its embeddings of all views, none without a segmenter. Without one (None) no mask
-    is replaced; where a mask is missing, M^gs itself is added when the view's depth confirms at least `min_support` of
-    it. New masks are marked as refined (2) in `prompted`. The background (id 0) and an instance without Gaussians come
-    back as they are.
+    is replaced but those drawn from points; where one is missing or drawn, M^gs itself is taken when the view's depth
+    confirms at least `min_support` of it. New masks are marked as REFINED in `prompted`. The background (id 0) and an
+    instance without Gaussians come back as they are.
     """
     if instance.instance_id == 0 or not len(gaussians):
         return instance
@@ -103,7 +102,9 @@ def refine(
     for view, frame in enumerate(frames):
         old = mask_of(instance, held[view]) if view in held else None
         prompt = functools.partial(segmenter.predict_prompt, embeddings[view]) if segmenter else None
-        new = _replacement(scene, view, solid, old, params, prompt)
+        # A mask drawn from the points is worth less than one rendered from the Gaussians that grew out of them.
+        stays = old if segmenter or view not in held or instance.prompted[held[view]] != DRAWN else None
+        new = _replacement(scene, view, solid, stays, params, prompt)
         if new is not None:
             views.append(view)
             masks.append(np.packbits(new))

@@ -8,12 +8,9 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, InstanceMasks, LabelMap
+from ss_flow.tasks.artifacts import REFINED, Cameras, InstanceMasks, LabelMap
 from ss_flow.tasks.geometry.images import pack_masks
 from ss_flow.tasks.splat.views import mask_of
-
-REFINED = 2
-"""Value of `InstanceMasks.prompted` for masks that refinement has replaced, added or cut."""
 
 
 @task()

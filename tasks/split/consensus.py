@@ -6,14 +6,15 @@ that see both hold both inside one mask. No order of views enters.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Int32
+from ss_flow.tasks.artifacts import Int32, Observation
 from ss_flow.tasks.ranges import Count, Fraction
-from ss_flow.tasks.split.observation import MaskPoints, membership
+from ss_flow.tasks.split.observe import membership
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -29,8 +30,6 @@ class ConsensusParams:
     """Share of a group's seen points that one mask must hold to hold the group."""
     rate: Fraction = 0.9
     """Share of the views with a say about two groups that must hold both in one mask."""
-    split: Fraction = 0.3
-    """A mask whose points more than this share of the views spread over several masks is left out."""
     min_views: Count = 3
     """How many views must have a say about two labels before these are merged."""
 
@@ -44,13 +43,6 @@ class Opinions:
     held: csr_array
     """[G, T] by which masks, numbered over all views, each group is held."""
 
-    def merged(self, cluster: Int32) -> Opinions:
-        """The opinions on clusters of groups: cluster [G] numbers them from 0."""
-        parts = membership(
-            [np.flatnonzero(cluster == c).astype(np.int32) for c in range(cluster.max() + 1)], len(cluster)
-        )
-        return Opinions((parts @ self.say).sign(), (parts @ self.held).sign())
-
     def agree(self, rate: float, min_views: float) -> csr_array:
         """[G, G] which pairs have a say in at least `min_views` views, of which a share of `rate` holds both."""
         from scipy.sparse import csr_array
@@ -63,14 +55,14 @@ class Opinions:
 
 def opinions(
     groups: list[Int32],
-    views: list[list[MaskPoints]],
+    views: Sequence[Observation],
     num_points: int,
     params: ConsensusParams,
 ) -> Opinions:
     """Ask every view about groups of points.
 
-    groups: rows of the point cloud, each. A view has a say about a group when it sees enough of it under its masks;
-    a mask holds the group when it has nearly all that is seen.
+    groups: rows of the point cloud, each. views: one observation of each. A view has a say about a group when it sees
+    enough of it under its masks; a mask holds the group when it has nearly all that is seen.
     """
     from scipy.sparse import csr_array
 
@@ -78,16 +70,17 @@ def opinions(
     size = np.array([len(group) for group in groups])
     say, group_held, mask_held = [], [], []
     first_mask = 0
-    for masks in views:
+    for view in views:
+        masks = [view.inside(j) for j in range(len(view.mask))]
         # Points outside every mask say nothing for or against a union.
-        under = np.unique(np.concatenate([np.zeros(0, np.int32), *(m.points for m in masks)]))
+        under = np.unique(np.concatenate([np.zeros(0, np.int32), *masks]))
         mark = np.zeros(num_points, np.float32)
         mark[under] = 1
         seen = members @ mark
         has_say = (seen > 0) & (seen >= params.visible * size)
         say.append(has_say)
         if masks:
-            inside = (members @ membership([m.points for m in masks], num_points).T).toarray()
+            inside = (members @ membership(masks, num_points).T).toarray()
             best = inside.argmax(axis=1)
             holds = has_say & (inside.max(axis=1) >= params.contained * seen)
             group_held.append(np.flatnonzero(holds))
@@ -100,33 +93,7 @@ def opinions(
     )
 
 
-def cluster_masks(views: list[list[MaskPoints]], num_points: int, params: ConsensusParams) -> list[Int32]:
-    """Group the masks of all views into objects: for each view, the object (1..C) of each of its masks, 0 = none.
-
-    Masks that most views split are left out. The rest are united over rounds: first the pairs that many views have a
-    say about, then, with the unions' opinions, pairs that fewer do.
-    """
-    groups = [m.points for masks in views for m in masks]
-    if not groups:
-        return [np.zeros(0, np.int32) for _ in views]
-    asked = opinions(groups, views, num_points, params)
-    says, holds = asked.say.sum(axis=1), asked.held.sum(axis=1)
-    clean = np.flatnonzero((says > 0) & (says - holds <= params.split * says))
-    labels = np.zeros(len(groups), np.int32)
-    bounds = np.cumsum([len(masks) for masks in views])[:-1]
-    if not len(clean):
-        return np.split(labels, bounds)
-    state = Opinions(asked.say[clean], asked.held[clean])
-    cluster = np.arange(len(clean), dtype=np.int32)
-    counts = (state.say @ state.say.T).data
-    for needed in np.percentile(counts, range(95, -1, -5)).tolist():
-        united = _components(state.agree(params.rate, max(1.0, needed)))
-        state, cluster = state.merged(united), united[cluster]
-    labels[clean] = cluster + 1
-    return np.split(labels, bounds)
-
-
-def merge_labels(labels: Int32, views: list[list[MaskPoints]], params: ConsensusParams) -> Int32:
+def merge_labels(labels: Int32, views: Sequence[Observation], params: ConsensusParams) -> Int32:
     """Unite the labels of points that the views hold together (spec S4, global merge).
 
     labels: [N], 0 = none. A union takes its lowest label.

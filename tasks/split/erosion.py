@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Int32, MaskSet
+from ss_flow.tasks.artifacts import Bool, Int32, MaskSet, PromptedMasks
 from ss_flow.tasks.ranges import Fraction, Natural, NonNegative
 from ss_flow.tasks.split.mask_pool import canonical_order, exclusive
 
@@ -31,15 +31,17 @@ class ErosionParams:
 
 @dataclass(frozen=True)
 class Interior:
-    """The interior of one mask."""
+    """One mask and its interior, as flat pixel indices, ascending."""
 
     mask: int
-    """Index in its MaskSet."""
+    """Index in its set of masks."""
     pixels: Int32
-    """[P] flat pixel indices, ascending."""
+    """[P] the eroded mask."""
+    whole: Int32
+    """[W] the mask itself."""
 
 
-def interiors(masks: MaskSet, params: ErosionParams, *, nested: bool) -> list[Interior]:
+def interiors(masks: MaskSet | PromptedMasks, params: ErosionParams, *, nested: bool) -> list[Interior]:
     """The eroded masks of one view (Split&Splat, Eq. 3), in canonical order; empty ones are left out.
 
     nested: whether masks keep the pixels that smaller masks cover too. If not, each pixel belongs to the smallest mask
@@ -55,7 +57,7 @@ def interiors(masks: MaskSet, params: ErosionParams, *, nested: bool) -> list[In
         mask = dense[index] if on_top is None else on_top == index
         pixels = np.flatnonzero(erode(mask, params)).astype(np.int32)
         if pixels.size:
-            found.append(Interior(int(index), pixels))
+            found.append(Interior(int(index), pixels, np.flatnonzero(mask).astype(np.int32)))
     return found
 
 

@@ -1,21 +1,27 @@
-"""Mask propagation: one label per object over all views (Split&Splat, Sec. 3.1.3 and Algorithm 1)."""
+"""Mask propagation: one label per object over all views (Split&Splat, Sec. 3.1.3)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
-from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Float64, Int32, MaskSet, PointCloud, PointLabels, Visibility
+from ss_flow.tasks.artifacts import Float32, Int32, Observation, PointCloud, PointLabels, Visibility
 from ss_flow.tasks.geometry.clustering import main_clusters
-from ss_flow.tasks.geometry.zbuffer import paint
-from ss_flow.tasks.ranges import Count, Fraction, Natural, Range
-from ss_flow.tasks.split.consensus import ConsensusParams, cluster_masks, merge_labels
-from ss_flow.tasks.split.erosion import ErosionParams
-from ss_flow.tasks.split.observation import ClusterParams, MaskPoints, observe
+from ss_flow.tasks.ranges import Fraction, Natural
+from ss_flow.tasks.split.consensus import ConsensusParams, merge_labels
+from ss_flow.tasks.split.mask_clustering import (
+    MaskClusteringParams,
+    cluster_masks,
+    vote_at_once,
+)
+from ss_flow.tasks.split.observe import ClusterParams
+from ss_flow.tasks.split.sequential import Matches, SequentialParams, vote_in_turn
+from ss_flow.tasks.split.smoothing import smooth
+from ss_flow.tasks.split.touching import TouchingParams, merge_touching
 from ss_flow.tasks.split.voting import Votes
 
 
@@ -23,161 +29,92 @@ from ss_flow.tasks.split.voting import Votes
 class PropagateParams:
     """How masks of single views become labels of points."""
 
-    start: Literal["empty", "consensus"] = "consensus"
-    """Labels that the first pass starts from: none, as in the paper, or those that the consensus of all views gives."""
-    passes: Count = 1
-    """How often all views vote; each further pass matches every view against the labels of the pass before."""
-    nested: bool = False
-    """Whether a point inside two masks of a view votes for both; if not, for the smaller one."""
-    lambda_init: Annotated[float, Range(0.0, 1.0, open_below=True, open_above=True)] = 0.25
-    """What the first vote of a point weighs more than later ones, between 0 and 1."""
-    contested_vote: Fraction = 0.0
-    """Weight of a vote from a mask that touched several labels; 0 = the share of the label it went to."""
+    views: Literal["at_once", "in_turn"] = "at_once"
+    """Whether the masks of all views are clustered at once, or matched to labels view after view, as in the paper."""
+    at_once: MaskClusteringParams = field(default_factory=MaskClusteringParams)
+    """How masks are clustered (only with views=at_once)."""
+    in_turn: SequentialParams = field(default_factory=SequentialParams)
+    """How masks are matched (only with views=in_turn)."""
     tau_label: Fraction = 0.7
     """Share of its votes that a point's label needs."""
-    min_overlap: Natural = 3
-    """Painted pixels under a mask below which it is a new object."""
-    min_overlap_share: Fraction = 0.1
-    """The same as a share of the pixels under the mask where points fall; the larger of the two counts."""
-    min_new_points: Natural = 10
-    """Points under a mask below which it founds no object."""
-    min_label_points: Natural = 10
-    """Points below which a label is dropped in the end."""
-    global_merge: bool = True
+    smoothing: Natural = 3
+    """How often a point without a sure label takes the one that most of its neighbours carry; 0 = never."""
+    global_merge: bool = False
     """Whether labels that the views hold together in one mask are united in the end."""
     consensus: ConsensusParams = field(default_factory=ConsensusParams)
-    """When masks or labels belong together."""
-    erosion: ErosionParams = field(default_factory=ErosionParams)
-    """How far a mask's border is taken off before it votes."""
-    mask_clusters: ClusterParams = field(default_factory=ClusterParams)
-    """Which points under a mask are kept."""
-    label_clusters: ClusterParams = field(default_factory=lambda: ClusterParams(keep_share=0.05))
+    """When they are (only with global_merge)."""
+    touching_merge: bool = True
+    """Whether labels that go on into each other, alike in colour, are united in the end."""
+    touching: TouchingParams = field(default_factory=TouchingParams)
+    """When they are (only with touching_merge)."""
+    label_clusters: ClusterParams = field(default_factory=lambda: ClusterParams(eps=2.5, keep_share=0.05))
     """Which points of a label are kept in the end."""
+    min_label_points: Natural = 10
+    """Points below which a label is dropped in the end."""
 
 
-@dataclass(frozen=True)
-class Match:
-    """The label that a mask votes for."""
-
-    masked: MaskPoints
-    label: int
-    """0 when the mask founds a new object."""
-    purity: float
-    """Share of the painted pixels under the mask that carry the label."""
-
-
-@task(uses=("opencv-contrib-python-headless", "scipy"))
+@task(uses=("scipy", "opencv-contrib-python-headless"))
 def propagate(
-    points: PointCloud, visibility: tuple[Visibility, ...], masks: tuple[MaskSet, ...], *, params: PropagateParams
+    points: PointCloud,
+    visibility: Sequence[Visibility],
+    observations: Sequence[Observation],
+    *,
+    params: PropagateParams,
 ) -> PointLabels:
-    """Label the dense points so that each object has one label in all views (Algorithm 1, repaired; spec S4).
+    """Label the dense points so that each object has one label in all views (Algorithm 1, or better; spec S4).
 
-    visibility, masks: one of each per view, in the order of the views. View by view, the labels so far are painted
-    into the view; every mask takes the label it overlaps most, or founds a new one; then its points vote for it. In
-    the end a point keeps the label that got a share of tau_label of its votes. The order of the masks of a view does
-    not matter, nor does the scale of the world.
+    visibility, observations: one of each per view, in the order of the views. The masks vote for the labels of the
+    points under them; in the end a point keeps the label that got a share of tau_label of its votes. The order of the
+    masks of a view does not matter, nor does the scale of the world; nor, with views=at_once, the order of the views.
     """
-    num_points = len(points.points)
-    views = [
-        observe(view, pool, points.points, points.spacing, params.erosion, params.mask_clusters, nested=params.nested)
-        for view, pool in zip(visibility, masks, strict=True)
-    ]
-    given = np.zeros(num_points, np.int32)
-    num_labels = 0
-    if params.start == "consensus":
-        given, num_labels = _label_by_consensus(views, num_points, params)
-
-    for turn in range(params.passes):
-        votes = Votes(num_points)
-        matched: list[tuple[int, Match]] = []
-        for k, (view, masked) in enumerate(zip(visibility, views, strict=True)):
-            progress(turn * len(views) + k, params.passes * len(views), view.name)
-            virtual = _virtual_labels(view, given, votes, params.tau_label)
-            # Two phases: no mask of a view sees the votes of another mask of the same view (spec A5).
-            matches = [_match(m, virtual, num_labels, params) for m in masked]
-            for match in matches:
-                chosen = match.label
-                if not chosen:
-                    if len(match.masked.points) < params.min_new_points:
-                        continue
-                    num_labels += 1
-                    chosen = num_labels
-                _vote(votes, match, chosen, params)
-                matched.append((k, Match(match.masked, chosen, match.purity)))
-        given = _sure(votes, params.tau_label)
-
-    label = _settle(given, points, views, params)
-    renamed = _renaming(given, label, num_labels)
-    _, share = votes.leaders()
+    if params.views == "in_turn":
+        votes, matched = vote_in_turn(len(points.points), visibility, observations, params.tau_label, params.in_turn)
+        against = np.zeros(len(points.points), np.float32)
+    else:
+        votes, against, matched = _at_once(len(points.points), observations, params)
+    leader, share = votes.leaders()
+    covered = votes.weight() > against
+    sure = covered & (share >= params.tau_label)
+    label = np.where(sure, leader, 0).astype(np.int32)
+    if params.smoothing:
+        label = smooth(label, covered & ~sure, points.points, points.spacing, params.smoothing)
+    settled = _settle(label, points, observations, params)
+    num_labels = max(matched.label, default=0)
+    renamed = _renaming(label, settled, num_labels)
     return PointLabels(
-        label=label,
+        label=settled,
         confidence=share.astype(np.float32),
         num_labels=num_labels,
-        match_view=np.array([k for k, _ in matched], np.int32),
-        match_mask=np.array([m.masked.mask for _, m in matched], np.int32),
-        match_label=renamed[np.array([m.label for _, m in matched], np.int32)],
-        match_purity=np.array([m.purity for _, m in matched], np.float32),
+        match_view=np.array(matched.view, np.int32),
+        match_mask=np.array(matched.mask, np.int32),
+        match_label=renamed[np.array(matched.label, np.int32)],
+        match_purity=np.array(matched.purity, np.float32),
     )
 
 
-def _virtual_labels(view: Visibility, given: Int32, votes: Votes, tau_label: float) -> Int32:
-    """The labels so far, painted into a view: flat image, 0 = none (Split&Splat, M*_k; spec S4.1).
-
-    Given labels go first; points without one show what they were voted into in this pass.
-    """
-    voted, share = votes.leaders(view.point_index)
-    label = np.where(share >= tau_label, voted, 0)
-    label = np.where(given[view.point_index] > 0, given[view.point_index], label)
-    sure = label > 0
-    return paint(label[sure], view.pixel[sure], view.depth[sure], view.height * view.width)
-
-
-def _match(masked: MaskPoints, virtual: Int32, num_labels: int, params: PropagateParams) -> Match:
-    """The label that a mask overlaps most, or none when it hardly overlaps any (spec S4.2)."""
-    overlap = np.bincount(virtual[masked.pixels], minlength=num_labels + 1)[1:]
-    total = int(overlap.sum())
-    if total < max(params.min_overlap, params.min_overlap_share * masked.covered, 1):
-        return Match(masked, 0, 1.0)
-    best = int(overlap.argmax())
-    return Match(masked, best + 1, float(overlap[best] / total))
+def _at_once(
+    num_points: int, observations: Sequence[Observation], params: PropagateParams
+) -> tuple[Votes, Float32, Matches]:
+    """Votes for labels, votes against any [N], and the label of each mask, from the masks of all views at once."""
+    labels = cluster_masks(observations, num_points, params.at_once)
+    votes, against = vote_at_once(num_points, observations, labels, params.at_once)
+    leader, _ = votes.leaders()
+    matched = Matches([], [], [], [])
+    for k, (seen, shown) in enumerate(zip(observations, labels, strict=True)):
+        for j in np.flatnonzero(shown).tolist():
+            matched.view.append(k)
+            matched.mask.append(int(seen.mask[j]))
+            matched.label.append(int(shown[j]))
+            matched.purity.append(float((leader[seen.inside(j)] == shown[j]).mean()))
+    return votes, against, matched
 
 
-def _vote(votes: Votes, match: Match, label: int, params: PropagateParams) -> None:
-    """Let the points under a mask vote for its label (spec S4.3)."""
-    points = match.masked.points
-    weight: Float64 = np.where(votes.fresh(points), 1.0 + params.lambda_init, 1.0)
-    if match.purity < 1:
-        weight *= params.contested_vote or match.purity
-    votes.add(points, label, weight)
-
-
-def _label_by_consensus(views: list[list[MaskPoints]], num_points: int, params: PropagateParams) -> tuple[Int32, int]:
-    """Labels of the points by the objects that the views' masks form, and how many there are."""
-    votes = Votes(num_points)
-    objects = cluster_masks(views, num_points, params.consensus)
-    for masked, labels in zip(views, objects, strict=True):
-        for m, label in zip(masked, labels, strict=True):
-            if label:
-                votes.add(m.points, int(label), np.ones(len(m.points)))
-    num_labels = max((int(labels.max(initial=0)) for labels in objects), default=0)
-    return _sure(votes, params.tau_label), num_labels
-
-
-def _sure(votes: Votes, tau_label: float) -> Int32:
-    """The label of each point that got a share of tau_label of its votes: [N], 0 = none."""
-    leader, share = votes.leaders()
-    return np.where(share >= tau_label, leader, 0).astype(np.int32)
-
-
-def _settle(
-    label: Int32,
-    points: PointCloud,
-    views: list[list[MaskPoints]],
-    params: PropagateParams,
-) -> Int32:
-    """The final labels: united where the views agree, without stray points, without tiny labels."""
+def _settle(label: Int32, points: PointCloud, observations: Sequence[Observation], params: PropagateParams) -> Int32:
+    """The final labels: united where views or surfaces say so, without stray points, without tiny labels."""
     if params.global_merge:
-        label = merge_labels(label, views, params.consensus)
+        label = merge_labels(label, observations, params.consensus)
+    if params.touching_merge:
+        label = merge_touching(label, points, params.touching)
     label = label.copy()
     clusters = params.label_clusters
     if clusters.eps:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,22 +11,30 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import (
+    DRAWN,
+    FOUND,
+    PROMPTED,
+    Bool,
     InstanceMasks,
     Int32,
     MaskSet,
     PointCloud,
     PointLabels,
+    PointParts,
     PromptedMasks,
     Visibility,
 )
 from ss_flow.tasks.geometry.images import pack_masks
-from ss_flow.tasks.ranges import Count
+from ss_flow.tasks.ranges import Count, NonNegative
 from ss_flow.tasks.split.selection import (
+    PaintedView,
     SelectionParams,
     agreement,
     contradicted,
+    nearest_labels,
     paint_labels,
     select_masks,
+    smoothed,
     stack_exclusive,
 )
 
@@ -36,6 +45,12 @@ class ReprojectParams:
 
     selection: SelectionParams = field(default_factory=SelectionParams)
     """Which masks of a view show a label."""
+    draw_missing: bool = True
+    """Whether a label that a view sees, but that no mask shows, gets its points there, grown together, as its mask."""
+    min_points: Count = 10
+    """Points of a label that must be in front in a view for this."""
+    reach: NonNegative = 4.0
+    """How far a drawn mask reaches round its points, in pixels of an image with a diagonal of 800."""
     min_views: Count = 2
     """Views with a mask below which an instance is weak: kept as points, not reconstructed."""
 
@@ -43,20 +58,22 @@ class ReprojectParams:
 @task(uses=("opencv-contrib-python-headless",))
 def reproject(
     points: PointCloud,
-    visibility: tuple[Visibility, ...],
-    masks: tuple[MaskSet, ...],
+    visibility: Sequence[Visibility],
+    masks: Sequence[MaskSet],
     labels: PointLabels,
-    prompted: tuple[PromptedMasks, ...],
+    parts: PointParts,
+    prompted: Sequence[PromptedMasks],
     *,
     params: ReprojectParams,
 ) -> tuple[InstanceMasks, ...]:
     """The instances that the labelled points make, with one mask at most in each view (M~_{k,l}; spec S5).
 
     visibility, masks: one of each per view. prompted: masks from `split.reprompt`, for any of the views, by name; they
-    stand in where the view's own masks do not show a label. The masks of one view do not overlap: smaller ones are on
-    top. The first instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by
-    id. An instance's confidence is its points' mean share of votes, less the share of its painted pixels that other
-    labels contradict.
+    stand in where the view's own masks do not show a label, or show it less well; where there is none either, the
+    label's points do (`draw_missing`). The masks of one view do not overlap: smaller ones are on top. The first
+    instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id. An
+    instance's confidence is its points' mean share of votes, less the share of its painted pixels that other labels
+    contradict.
 
     Raises InputError when the frames of two views differ in size.
     """
@@ -69,33 +86,54 @@ def reproject(
     by_name = {extra.name: extra for extra in prompted}
     num_labels = int(labels.label.max(initial=0))
     held, against = np.zeros(num_labels + 1), np.zeros(num_labels + 1)
-    views: list[dict[int, tuple[np.ndarray, bool]]] = []
+    views: list[dict[int, tuple[np.ndarray, int]]] = []
     for k, (view, pool) in enumerate(zip(visibility, masks, strict=True)):
         progress(k, len(masks), view.name)
         painted = paint_labels(view, labels.label)
         shown = select_masks(painted, pool, params.selection)
-        own = set(shown)
+        origin = dict.fromkeys(shown, FOUND)
         if view.name in by_name:
             extra = by_name[view.name]
-            for label, mask in zip(extra.label, extra.dense(), strict=True):
-                if int(label) not in own and agreement(painted, mask, int(label)) >= params.selection.min_iou:
-                    shown[int(label)] = mask
+            for label, mask in zip(extra.label.tolist(), extra.dense(), strict=True):
+                agrees = agreement(painted, mask, label)
+                own = agreement(painted, shown[label], label) if label in shown else 0.0
+                if agrees >= params.selection.min_iou and agrees > own:
+                    shown[label], origin[label] = mask, PROMPTED
+        if params.draw_missing:
+            for label, mask in _drawn(painted, view, set(shown), params).items():
+                shown[label], origin[label] = mask, DRAWN
         ids = stack_exclusive(shown, view.height, view.width)
-        views.append({int(i): (pack_masks((ids == i)[None])[0], int(i) not in own) for i in np.unique(ids)})
+        views.append({int(i): (pack_masks((ids == i)[None])[0], origin.get(int(i), FOUND)) for i in np.unique(ids)})
         for total, part in zip((held, against), contradicted(painted, ids, num_labels), strict=True):
             total += part
     agreed = 1 - against / np.maximum(held, 1)
     return tuple(
-        _instance(int(label), points, labels, views, visibility[0], float(agreed[label]), params.min_views)
+        _instance(int(label), points, labels, parts, views, visibility[0], float(agreed[label]), params.min_views)
         for label in np.union1d([0], labels.label)
     )
+
+
+def _drawn(painted: PaintedView, view: Visibility, shown: set[int], params: ReprojectParams) -> dict[int, Bool]:
+    """Masks of the labels in front in a view, but those in `shown`: the pixels nearest to their points, smoothed.
+
+    A label whose points lie so scattered that hardly any of them is left inside has none.
+    """
+    names, counts = np.unique(painted.label, return_counts=True)
+    missing = set(names[(names > 0) & (counts >= params.min_points)].tolist()) - shown
+    if not missing:
+        return {}
+    reach = params.reach * float(np.hypot(view.height, view.width)) / 800
+    nearest = nearest_labels(painted, view.height, view.width, reach)
+    masks = {label: smoothed(nearest == label, round(reach)) for label in sorted(missing)}
+    return {label: mask for label, mask in masks.items() if agreement(painted, mask, label) >= params.selection.min_iou}
 
 
 def _instance(
     label: int,
     points: PointCloud,
     labels: PointLabels,
-    views: list[dict[int, tuple[np.ndarray, bool]]],
+    parts: PointParts,
+    views: list[dict[int, tuple[np.ndarray, int]]],
     size: Visibility,
     agreed: float,
     min_views: int,
@@ -109,6 +147,7 @@ def _instance(
         points=points.points[rows],
         colors=points.colors[rows],
         point_confidence=share,
+        point_part=parts.part[rows],
         confidence=float(share.mean(dtype=np.float64)) * agreed if share.size else 0.0,
         height=size.height,
         width=size.width,
@@ -116,6 +155,6 @@ def _instance(
         packed=np.array([views[k][label][0] for k in seen], np.uint8).reshape(
             len(seen), (size.height * size.width + 7) // 8
         ),
-        prompted=np.array([label > 0 and views[k][label][1] for k in seen], np.uint8),
+        prompted=np.array([views[k][label][1] for k in seen], np.uint8),
         weak=label > 0 and len(seen) < min_views,
     )

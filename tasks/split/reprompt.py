@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Frame, MaskSet, PointLabels, PromptedMasks, Visibility
+from ss_flow.tasks.artifacts import Float64, Frame, Int32, MaskSet, PointLabels, PromptedMasks, Visibility
 from ss_flow.tasks.geometry.images import decode_valid, pack_masks
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
-from ss_flow.tasks.ranges import Count, NonNegative
-from ss_flow.tasks.split.selection import SelectionParams, paint_labels, select_masks
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.split.selection import PaintedView, SelectionParams, agreement, paint_labels, select_masks
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,9 @@ class RepromptParams:
 
     min_points: Count = 10
     """Points of a label that must be in front in a view."""
+    min_agreement: Fraction = 0.5
+    """IoU of a label's mask with its points in the view below which another one is asked for; 0 = only where it has
+    none."""
     prompts: Count = 10
     """Points that ask for the mask together, far from each other."""
     alpha: NonNegative = 0.3
@@ -45,35 +48,57 @@ def reprompt(
     selection: SelectionParams,
     model: Model,
 ) -> PromptedMasks:
-    """Masks for the labels that are visible in a view but that none of its masks shows (spec S5).
+    """Masks for the labels that are visible in a view but that none of its masks shows, or shows well (spec S5).
 
     embedding, visibility, masks: those of the frame. selection: how the view's own masks are matched to labels, as in
-    the re-projection. Each missing label gets one mask, prompted at points spread over it. Whether the mask agrees with
+    the re-projection. Each such label gets one mask, prompted at points spread over it. Whether the mask agrees with
     the label is for `split.reproject` to judge. Raises InputError when the model cannot be opened.
     """
     painted = paint_labels(visibility, labels.label)
     shown = select_masks(painted, masks, selection)
+    good = {label for label, mask in shown.items() if agreement(painted, mask, label) >= params.min_agreement}
+    return prompt(frame, embedding, spread_prompts(painted, frame.width, good, params), model)
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """Points that ask for one mask together."""
+
+    points: Float64
+    """[n, 2] x, y in pixels of the frame."""
+    inside: Int32
+    """[n] 1 = inside the mask, 0 = outside."""
+
+
+def spread_prompts(painted: PaintedView, width: int, shown: set[int], params: RepromptParams) -> dict[int, Prompt]:
+    """For each label in front in a view of this width, but those in `shown`: points spread over it."""
     names, counts = np.unique(painted.label, return_counts=True)
-    missing = [
-        int(label)
-        for label, count in zip(names, counts, strict=True)
-        if label > 0 and count >= params.min_points and int(label) not in shown
-    ]
-    found: list[Bool] = []
-    if missing:
-        sam = Sam(model)
-        valid = decode_valid(frame)
-        for label in missing:
-            v, u = np.divmod(painted.pixel[painted.label == label], visibility.width)
+    prompts = {}
+    for label in names[(names > 0) & (counts >= params.min_points)].tolist():
+        if label not in shown:
+            v, u = np.divmod(painted.pixel[painted.label == label], width)
             places = np.stack([u, v], axis=-1) + 0.5
             chosen = greedy_farthest(places, params.prompts, alpha=params.alpha, drop_hull=params.drop_hull)
-            mask, _ = sam.predict_prompt(embedding, places[chosen])
-            found.append(mask & valid)
-    dense = np.array(found, bool).reshape(len(found), frame.height, frame.width)
+            prompts[label] = Prompt(places[chosen], np.ones(len(chosen), np.int32))
+    return prompts
+
+
+def prompt(frame: Frame, embedding: Embedding, prompts: dict[int, Prompt], model: Model) -> PromptedMasks:
+    """The masks of one frame that prompts ask for, by label in ascending order; without any the model is not opened."""
+    masks = np.zeros((len(prompts), frame.height, frame.width), bool)
+    predicted = np.zeros(len(prompts), np.float32)
+    if prompts:
+        sam = Sam(model)
+        valid = decode_valid(frame)
+        for row, label in enumerate(sorted(prompts)):
+            asked = prompts[label]
+            mask, predicted[row] = sam.predict_prompt(embedding, asked.points, asked.inside)
+            masks[row] = mask & valid
     return PromptedMasks(
         name=frame.name,
         height=frame.height,
         width=frame.width,
-        label=np.array(missing, np.int32),
-        packed=pack_masks(dense) if found else np.zeros((0, (frame.height * frame.width + 7) // 8), np.uint8),
+        label=np.array(sorted(prompts), np.int32),
+        packed=pack_masks(masks),
+        predicted_iou=predicted,
     )

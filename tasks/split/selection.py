@@ -13,6 +13,9 @@ from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.split.erosion import ErosionParams, interiors
 from ss_flow.tasks.split.mask_pool import canonical_order
 
+_CRUMB = 0.1
+"""Pieces of a drawn mask below this share of its largest one are no part of it."""
+
 
 @dataclass(frozen=True)
 class SelectionParams:
@@ -104,6 +107,37 @@ def _by_agreement(painted: PaintedView, dense: Bool, params: SelectionParams) ->
 def _iou(a: Bool, b: Bool) -> float:
     union = int((a | b).sum())
     return float((a & b).sum() / union) if union else 0.0
+
+
+def nearest_labels(painted: PaintedView, height: int, width: int, reach: float) -> Int32:
+    """The label of the nearest painted pixel, at most `reach` pixels away: [H, W], 0 = unlabelled or none so near."""
+    import cv2
+
+    empty = np.ones(height * width, np.uint8)
+    empty[painted.pixel] = 0
+    distance, nearest = cv2.distanceTransformWithLabels(
+        empty.reshape(height, width), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    table = np.zeros(int(nearest.max()) + 1, np.int32)
+    table[nearest.ravel()[painted.pixel]] = painted.label
+    return np.where(distance <= reach, table[nearest], 0)
+
+
+def smoothed(mask: Bool, radius: int) -> Bool:
+    """A mask [H, W] with smooth borders and without crumbs.
+
+    A pixel belongs to it when most of the square of this radius round it does; pieces of less than a tenth of the
+    largest one are dropped.
+    """
+    import cv2
+
+    side = 2 * radius + 1
+    most = cv2.boxFilter(mask.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE) > 0.5
+    _, piece, stats, _ = cv2.connectedComponentsWithStats(most.astype(np.uint8), connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    large = (area > 0) & (area >= _CRUMB * area.max())
+    return large[piece]
 
 
 def agreement(painted: PaintedView, mask: Bool, label: int) -> float:

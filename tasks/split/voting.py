@@ -46,3 +46,7 @@ class Votes:
         leader = np.where(best > 0, ties.min(axis=1), 0).astype(np.int32)
         total = weight.sum(axis=1)
         return leader, np.divide(best, total, out=np.zeros_like(best), where=total > 0)
+
+    def weight(self) -> Float64:
+        """[N] what the votes of each point weigh together."""
+        return self._weight.sum(axis=1)

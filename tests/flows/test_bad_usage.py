@@ -18,7 +18,35 @@ RUNS: dict[str, tuple[Make, str]] = {
     "a scene that is not there": (lambda base, scene: [base / "nowhere"], "nowhere does not exist; give the path"),
     "an empty folder": (lambda base, scene: [folder(base / "empty")], "empty holds no photo"),
     "a file that is no scene": (lambda base, scene: [file(base / "notes.txt")], "notes.txt is no scene"),
-    "masks that are not there": (lambda base, scene: [scene, "--masks", base / "none"], "none is no folder"),
+    "masks that are not there": (
+        lambda base, scene: [scene, "--masks", base / "none"],
+        r"none is no folder and no \.json",
+    ),
+    "masks in a file of another kind": (
+        lambda base, scene: [scene, "--masks", file(base / "masks.png")],
+        r"masks.png is no folder and no \.json",
+    ),
+    "a file of masks that is none": (
+        lambda base, scene: [scene, "--masks", file(base / "masks.json")],
+        "masks.json is not valid JSON",
+    ),
+    "hints that are not there": (lambda base, scene: [scene, "--hints", base / "none"], "none is missing"),
+    "hints that are none": (
+        lambda base, scene: [scene, "--hints", file(base / "clicks.json")],
+        "clicks.json is not valid JSON",
+    ),
+    "hints beside masks": (
+        lambda base, scene: [scene, "--hints", file(base / "c.json"), "--masks", scene / "instance_masks"],
+        "instance_masks and .*c.json cannot be used together",
+    ),
+    "hints without a segmenter": (
+        lambda base, scene: [scene, "--hints", clicked(base / "clicks.json")],
+        "hints need a segmenter to be prompted with, and there is none",
+    ),
+    "hints with the segmenter turned off": (
+        lambda base, scene: [scene, "--hints", clicked(base / "clicks.json"), "--set", "split.segmenter=none"],
+        "hints need a segmenter to be prompted with, and there is none",
+    ),
     "a preset that is unknown": (
         lambda base, scene: [scene, "--preset", "quick"],
         "choose one of: default, fast, paper",
@@ -102,6 +130,11 @@ def folder(path: Path) -> Path:
 def file(path: Path, answer: Path | None = None) -> Path:
     path.write_text("hello")
     return answer or path
+
+
+def clicked(path: Path) -> Path:
+    path.write_text('{"0000": {"mug": [[40, 30]]}}')
+    return path
 
 
 def cut(photo: Path, scene: Path) -> Path:

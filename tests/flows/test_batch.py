@@ -132,7 +132,7 @@ def test_a_scene_that_lost_an_instance_is_degraded(den, tmp_path, monkeypatch):
     real = reconstruct_module._from_points
 
     def begin(instance, params):
-        if instance.instance_id == 2:
+        if instance.instance_id == 1:
             raise ArithmeticError("it went wrong")
         return real(instance, params)
 
@@ -141,7 +141,7 @@ def test_a_scene_that_lost_an_instance_is_degraded(den, tmp_path, monkeypatch):
     assert called.code == 3
     (row,) = called.document()
     assert (row["status"], row["out"]) == ("degraded", str(tmp_path / "batch/den"))
-    assert row["error"] == "splat.reconstruct[2]: ArithmeticError: it went wrong"
+    assert row["error"] == "splat.reconstruct[1]: ArithmeticError: it went wrong"
     assert (tmp_path / "batch/den/run.json").is_file()
 
 

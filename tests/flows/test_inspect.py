@@ -37,7 +37,7 @@ def test_the_graph_is_mermaid_with_a_box_a_step_and_what_feeds_it(tiny):
     assert len(boxes) + len(arrows) + 1 == len(lines)
     assert boxes["split.visibility"] == "split.visibility x 5"
     assert {a for a, _, _ in arrows} | {b for _, _, b in arrows} <= set(boxes)
-    assert ("capture.ready_masks", "masks", "split.propagate") in arrows
+    assert ("capture.ready_masks", "masks", "split.observe") in arrows
     assert ("split.propagate", "labels", "split.reproject") in arrows
 
 
@@ -76,6 +76,7 @@ def test_cache_show_describes_the_items_of_a_list(tiny):
         "dense",
         "visibility[0001]",
         "propagate",
+        "parts",
         "reproject",
         "reconstruct[1]",
         "global_pass",

@@ -130,6 +130,7 @@ def test_a_bad_place_or_scene_is_refused_with_one_sentence(tiny, tmp_path):
     refused(ss_flow("sweep", *options), "there is no scene to sweep")
     refused(ss_flow("sweep", tmp_path / "nowhere", *options), "nowhere does not exist")
     refused(ss_flow("sweep", tiny.scene, tiny.scene, "--masks", tmp_path, *options), "--masks belongs to one scene")
+    refused(ss_flow("sweep", tiny.scene, tiny.scene, "--hints", tmp_path, *options), "--hints belongs to one scene")
 
 
 def test_with_a_text_the_search_is_a_step_and_its_threshold_can_be_swept(warm, tmp_path):

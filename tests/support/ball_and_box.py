@@ -52,6 +52,7 @@ class SmallScene:
             points=self.points[mine],
             colors=self.colors[mine],
             point_confidence=np.full(len(mine), 0.9, np.float32),
+            point_part=((self.points[mine, 2] > 0.25) & (instance_id > 0)).astype(np.int32),
             confidence=0.9,
             height=HEIGHT,
             width=WIDTH,

@@ -13,6 +13,7 @@ from ss_flow.tasks.artifacts import (
     Metrics,
     PointCloud,
     PointLabels,
+    PointParts,
     Visibility,
 )
 from ss_flow.tasks.deliver.draw import draw
@@ -44,8 +45,8 @@ def labels_of(label: np.ndarray) -> PointLabels:
 def instance_of(masks: np.ndarray, views: list[int]) -> InstanceMasks:
     n = len(views)
     return InstanceMasks(
-        2, POINTS, CLOUD.colors, np.ones(500, np.float32), 0.9, H, W, np.array(views, np.int32),
-        np.packbits(masks.reshape(n, H * W), axis=1),
+        2, POINTS, CLOUD.colors, np.ones(500, np.float32), np.zeros(500, np.int32), 0.9, H, W,
+        np.array(views, np.int32), np.packbits(masks.reshape(n, H * W), axis=1),
         np.zeros(n, np.uint8), False,
     )  # fmt: skip
 
@@ -96,8 +97,14 @@ def test_labels_take_the_colors_of_their_instances():
     assert not has_color(picture[:, : W // 3], instance_color(3))
 
 
-def test_labels_without_points_are_counted():
+def test_parts_have_colors_of_their_own():
+    picture = draw(PointParts(np.where(POINTS[:, 0] > 0, 1, 0).astype(np.int32)), points=CLOUD, cameras=CAMERAS)
+    assert has_color(picture[:, W // 2 :], instance_color(1)) and has_color(picture[:, : W // 2], (190, 190, 190))
+
+
+def test_labels_and_parts_without_points_are_counted():
     assert draw(labels_of(np.array([0, 1, 1]))).shape[1] == 800
+    assert draw(PointParts(np.array([0, 1, 1], np.int32))).shape[1] == 800
 
 
 def test_an_instance_is_shown_in_its_views():

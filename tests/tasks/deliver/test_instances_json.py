@@ -15,8 +15,8 @@ def instance(instance_id: int, points, views=(0, 2), weak: bool = False) -> Inst
     points = np.asarray(points, np.float32).reshape(-1, 3)
     n, v = len(points), len(views)
     return InstanceMasks(
-        instance_id, points, np.zeros((n, 3), np.uint8), np.ones(n, np.float32), 0.87654321, 2, 4,
-        np.array(views, np.int32), np.zeros((v, 1), np.uint8), np.zeros(v, np.uint8), weak,
+        instance_id, points, np.zeros((n, 3), np.uint8), np.ones(n, np.float32), np.arange(n, dtype=np.int32),
+        0.87654321, 2, 4, np.array(views, np.int32), np.zeros((v, 1), np.uint8), np.zeros(v, np.uint8), weak,
     )  # fmt: skip
 
 
@@ -45,6 +45,7 @@ def test_an_instance_is_described_by_its_points():
                 "centroid": [1, 2, 3],
                 "views": ["a", "c"],
                 "confidence": 0.8765,
+                "num_parts": 1,
                 "num_points": 2,
                 "num_gaussians": 0,
                 "weak": False,
@@ -80,6 +81,14 @@ def test_names_are_unique_and_the_unknown_go_by_their_id():
         (4, "sofa", "clip"),
         (5, "object 5", None),
     ]
+
+
+def test_names_that_the_user_gave_stay_and_are_told_from_those_of_the_encoder():
+    ids, given = np.array([1, 2, 3], np.int32), np.array([2, 3], np.int32)
+    names = InstanceNames(ids, ("mug", "mug", "my lamp"), np.ones(3, np.float32), "clip", given)
+    document = instances_document([instance(i, [[0, 0, 0]]) for i in (1, 2, 3)], None, names, FRAMES)
+    found = [(e["name"], e["named_by"]) for e in document["instances"]]
+    assert found == [("mug 2", "clip"), ("mug", "hints"), ("my lamp", "hints")]
 
 
 def test_the_background_is_no_instance_and_parts_know_their_whole():

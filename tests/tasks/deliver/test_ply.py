@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Gaussians, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import Gaussians, PointCloud, PointLabels, PointParts
 from ss_flow.tasks.deliver.ply import read_columns, read_gaussians, write_cloud, write_gaussians
 
 
@@ -110,7 +110,7 @@ def test_writing_takes_little_memory_beside_the_scene(tmp_path: Path):
     assert peak < (tmp_path / "a.ply").stat().st_size * 0.7
 
 
-def cloud_of(n: int) -> tuple[PointCloud, PointLabels]:
+def cloud_of(n: int) -> tuple[PointCloud, PointLabels, PointParts]:
     rng = np.random.default_rng(1)
     nothing, none = np.zeros(0, np.int32), np.zeros(0, np.float32)
     points, colors = rng.normal(size=(n, 3)).astype(np.float32), rng.integers(0, 256, (n, 3), np.uint8)
@@ -118,18 +118,19 @@ def cloud_of(n: int) -> tuple[PointCloud, PointLabels]:
     return (
         PointCloud(points, colors, 1.0, 0.02),
         PointLabels(labels, rng.random(n).astype(np.float32), 300, nothing, nothing, nothing, none),
+        PointParts(rng.integers(0, 5, n).astype(np.int32)),
     )
 
 
 def test_labelled_points_read_back_equal(tmp_path: Path):
-    cloud, labels = cloud_of(1000)
-    write_cloud(tmp_path / "c.ply", cloud, labels)
+    cloud, labels, parts = cloud_of(1000)
+    write_cloud(tmp_path / "c.ply", cloud, labels, parts)
     rows = read_columns(tmp_path / "c.ply")
     np.testing.assert_array_equal(np.stack([rows[a] for a in "xyz"], axis=1), cloud.points)
     np.testing.assert_array_equal(np.stack([rows[c] for c in ("red", "green", "blue")], axis=1), cloud.colors)
     np.testing.assert_array_equal(rows["instance_id"], labels.label)
     np.testing.assert_array_equal(rows["instance_conf"], labels.confidence)
-    assert not rows["part_id"].any()
+    np.testing.assert_array_equal(rows["part_id"], parts.part)
     assert [line for line in header_of(tmp_path / "c.ply") if "property" in line] == [
         *(f"property float {a}" for a in "xyz"),
         *(f"property uchar {c}" for c in ("red", "green", "blue")),
@@ -140,17 +141,17 @@ def test_labelled_points_read_back_equal(tmp_path: Path):
 def test_open3d_reads_the_points(tmp_path: Path):
     from ss_flow.tasks.geometry.open3d import load_open3d
 
-    cloud, labels = cloud_of(50)
-    write_cloud(tmp_path / "c.ply", cloud, labels)
+    cloud, labels, parts = cloud_of(50)
+    write_cloud(tmp_path / "c.ply", cloud, labels, parts)
     read = load_open3d().t.io.read_point_cloud(str(tmp_path / "c.ply"))
     np.testing.assert_array_equal(read.point.positions.numpy(), cloud.points)
     np.testing.assert_array_equal(read.point.instance_id.numpy()[:, 0], labels.label)
 
 
 def test_points_and_labels_of_different_length_are_an_error(tmp_path: Path):
-    cloud, labels = cloud_of(5)
+    cloud, labels, parts = cloud_of(5)
     with pytest.raises(ValueError, match="5 points but 4 labels"):
-        write_cloud(tmp_path / "c.ply", cloud, replace(labels, label=labels.label[:4]))
+        write_cloud(tmp_path / "c.ply", cloud, replace(labels, label=labels.label[:4]), parts)
 
 
 def test_quaternions_of_any_length_are_read_as_unit(tmp_path: Path):
@@ -188,7 +189,7 @@ def test_other_files_are_refused_by_name(tmp_path: Path, content, complaint):
 
 
 def test_points_are_not_taken_for_gaussians(tmp_path: Path):
-    cloud, labels = cloud_of(5)
-    write_cloud(tmp_path / "c.ply", cloud, labels)
+    cloud, labels, parts = cloud_of(5)
+    write_cloud(tmp_path / "c.ply", cloud, labels, parts)
     with pytest.raises(InputError, match=r"c\.ply lacks f_dc_0"):
         read_gaussians(tmp_path / "c.ply")

@@ -178,6 +178,8 @@ def test_initial_scales_are_the_root_mean_square_of_three_neighbours():
     assert np.exp(made.log_scales[0]) == pytest.approx([np.sqrt(14 / 3)] * 3)
     assert 1 / (1 + np.exp(-made.opacity_logits[0])) == pytest.approx(0.1)
     assert made.sh[0, 0] * 0.28209479 + 0.5 == pytest.approx([1, 1, 1])
+    assert made.part_id.tolist() == [0] * 4
+    assert initialise(points, np.zeros((4, 3), np.uint8), 7, 0.25, np.arange(4)).part_id.tolist() == [0, 1, 2, 3]
     lone = initialise(points[:1], np.zeros((1, 3), np.uint8), 7, 0.25)
     assert np.exp(lone.log_scales[0]) == pytest.approx([0.01] * 3)
 

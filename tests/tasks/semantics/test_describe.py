@@ -34,8 +34,8 @@ def scene(*views: tuple[np.ndarray, tuple[int, int, int]]) -> tuple[tuple[Frame,
     index = np.arange(len(views), dtype=np.int32)
     points = np.zeros((1, 3), np.float32)
     instance = InstanceMasks(
-        7, points, np.zeros((1, 3), np.uint8), np.ones(1, np.float32), 1.0, H, W, index, pack_masks(masks),
-        np.zeros(len(views), np.uint8), False,
+        7, points, np.zeros((1, 3), np.uint8), np.ones(1, np.float32), np.zeros(1, np.int32), 1.0, H, W, index,
+        pack_masks(masks), np.zeros(len(views), np.uint8), False,
     )  # fmt: skip
     return tuple(frames), instance
 

@@ -1,9 +1,9 @@
 import numpy as np
 
-from ss_flow.tasks.artifacts import Descriptors
+from ss_flow.tasks.artifacts import Descriptors, PointLabels
 from ss_flow.tasks.models.colour_words import ColourWords
 from ss_flow.tasks.semantics import name as module
-from ss_flow.tasks.semantics.name import name
+from ss_flow.tasks.semantics.name import InstanceNames, given_names, name
 
 
 def descriptor(instance_id: int, embedding, encoder: str) -> Descriptors:
@@ -34,3 +34,26 @@ def test_an_encoder_of_things_names_them_from_the_vocabulary(monkeypatch):
 
 def test_no_instances_have_no_names():
     assert name(()).names == ()
+
+
+def test_an_instance_is_called_what_the_user_calls_the_object_that_it_is():
+    """Instance 7 is most of the mug, 8 a chip of it; 9 holds the fork and, more of it, the knife; nobody clicked 5."""
+    labels = np.array([7] * 5 + [8] * 2 + [9] * 5 + [5] + [0] * 3, np.int32)
+    objects = np.array([1] * 7 + [2] * 2 + [3] * 3 + [0] + [4] * 3, np.int32)
+    words = ("red", "red", "blue", "green")
+    names = InstanceNames(np.array([5, 7, 8, 9], np.int32), words, np.ones(4, np.float32), "colour words")
+    found = given_names(names, labelled(objects), labelled(labels), objects=("my mug", "fork", "knife", "unseen"))
+    assert found.names == ("red", "my mug", "blue", "knife")
+    assert found.given.tolist() == [7, 9]
+    assert (found.encoder, found.instance_id.tolist()) == ("colour words", [5, 7, 8, 9])
+
+
+def test_an_object_whose_instance_was_left_out_names_nothing():
+    names = InstanceNames(np.zeros(0, np.int32), (), np.zeros(0, np.float32), "colour words")
+    found = given_names(names, labelled(np.ones(3, np.int32)), labelled(np.ones(3, np.int32)), objects=("mug",))
+    assert found.names == () and len(found.given) == 0
+
+
+def labelled(label: np.ndarray) -> PointLabels:
+    none = np.zeros(0, np.int32)
+    return PointLabels(label, np.ones(len(label), np.float32), 9, none, none, none, np.zeros(0, np.float32))

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
 
-from ss_flow.tasks.artifacts import Gaussians, InstanceMasks
+from ss_flow.tasks.artifacts import REFINED, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import initialise, select
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.splat import refine as module
 from ss_flow.tasks.splat.refine import RefineParams, refine, render_mask
-from ss_flow.tasks.splat.resolve import REFINED
 from ss_flow.tasks.splat.views import SceneViews
 
 PARAMS = RefineParams()

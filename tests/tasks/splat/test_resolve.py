@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Cameras, InstanceMasks, LabelMap
+from ss_flow.tasks.artifacts import REFINED, Cameras, InstanceMasks, LabelMap
 from ss_flow.tasks.geometry.images import pack_masks
-from ss_flow.tasks.splat.resolve import REFINED, exclusive, resolve
+from ss_flow.tasks.splat.resolve import exclusive, resolve
 
 CAMERAS = Cameras(
     ("a", "b"), np.array([[4, 3], [4, 3]], np.int32), np.ones((2, 4)), np.tile(np.eye(4), (2, 1, 1)), metric=True
@@ -16,8 +16,9 @@ CAMERAS = Cameras(
 def masks_of(instance_id: int, masks: dict[int, list[str]]) -> InstanceMasks:
     dense = np.array([[[c == "x" for c in row] for row in rows] for rows in masks.values()], bool)
     return InstanceMasks(
-        instance_id, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), 1.0, 3, 4,
-        np.array(list(masks), np.int32), pack_masks(dense), np.zeros(len(masks), np.uint8), False,
+        instance_id, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32),
+        np.zeros(0, np.int32), 1.0, 3, 4, np.array(list(masks), np.int32),
+        pack_masks(dense), np.zeros(len(masks), np.uint8), False,
     )  # fmt: skip
 
 

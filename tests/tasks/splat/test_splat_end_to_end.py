@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
 
-from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.artifacts import REFINED, Gaussians
 from ss_flow.tasks.gaussians.initialise import concatenate, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
@@ -18,7 +18,6 @@ from ss_flow.tasks.splat.merge import MergeParams, assemble, global_pass, merge_
 from ss_flow.tasks.splat.plan import PlanParams, plan
 from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
 from ss_flow.tasks.splat.refine import iou
-from ss_flow.tasks.splat.resolve import REFINED
 
 TRAIN = ReconstructParams(min_iterations=300, max_iterations=300, max_points=900)
 MERGE = MergeParams(min_iterations=300, max_iterations=300, global_iterations=200)
@@ -82,6 +81,15 @@ def test_the_merged_scene_shows_the_photos_and_keeps_the_instances_apart(built, 
             target = built.scene.ids[view] == label
             if target.sum() > 50:
                 assert iou(rendering.label_masks[label] >= 0.5, target) > 0.8
+
+
+def test_gaussians_keep_the_part_of_the_points_that_they_grew_from(whole):
+    for instance_id, low, high in ((1, 0.15, 0.35), (2, 0.2, 0.3)):
+        mine = select(whole, whole.instance_id == instance_id)
+        assert set(np.unique(mine.part_id)) == {0, 1}
+        assert (mine.part_id[mine.means[:, 2] > high] == 1).mean() > 0.9
+        assert (mine.part_id[mine.means[:, 2] < low] == 0).mean() > 0.9
+    assert not whole.part_id[whole.instance_id == 0].any()
 
 
 def test_training_twice_gives_the_same_bytes_and_the_order_of_a_pair_does_not_matter(built, merged):

@@ -6,21 +6,41 @@ import pytest
 from box_scene import mask_set, permuted, row_of_points, true_masks
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
 
 from ss_flow.tasks.artifacts import PointCloud
 from ss_flow.tasks.split.dense import DenseParams, dense
-from ss_flow.tasks.split.observation import ClusterParams
+from ss_flow.tasks.split.mask_clustering import MaskClusteringParams
+from ss_flow.tasks.split.observe import ClusterParams, ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
+from ss_flow.tasks.split.sequential import SequentialParams
 from ss_flow.tasks.split.visibility import visibility
 
 BARE = PropagateParams(
-    start="empty", min_overlap=1, min_overlap_share=0, min_new_points=1, min_label_points=1, global_merge=False
+    views="in_turn",
+    in_turn=SequentialParams(min_overlap=1, min_overlap_share=0, min_new_points=1),
+    smoothing=0,
+    touching_merge=False,
+    label_clusters=ClusterParams(),
+    min_label_points=1,
 )
+
+
+def in_turn(**values):
+    return replace(BARE, in_turn=replace(BARE.in_turn, **values))
+
+
 PRESETS = {
-    "paper": replace(BARE, nested=True, contested_vote=1.0),
-    "reference": replace(BARE, nested=True, contested_vote=0.75),
-    "default": BARE,
+    "paper": (in_turn(contested_vote=1.0), ObserveParams(nested=True)),
+    "reference": (in_turn(contested_vote=0.75), ObserveParams(nested=True)),
+    "default": (BARE, ObserveParams()),
 }
+
+
+def run(points, visible, masks, params, observing=ObserveParams()):
+    """The labels that masks give, from the points under each mask on."""
+    seen = tuple(observe(points, view, pool, params=observing) for view, pool in zip(visible, masks, strict=True))
+    return propagate(points, visible, seen, params=params)
 
 
 def points(count):
@@ -47,7 +67,7 @@ EXAMPLE = ([[1, 2, 3], [4, 5]], [[2, 3, 4], [5, 6]], [[4, 5, 6]])
 )
 def test_the_worked_example_of_the_specification(preset, label_of_4, share_of_4):
     visible, masks = views_of(*EXAMPLE)
-    result = propagate(points(8), visible, masks, params=PRESETS[preset])
+    result = run(points(8), visible, masks, *PRESETS[preset])
     assert result.label.tolist() == [0, 1, 1, 1, label_of_4, 2, 2, 0]
     np.testing.assert_allclose(result.confidence, [0, 1, 1, 1, share_of_4, 1, 1, 0], rtol=1e-6)
     assert result.num_labels == 2
@@ -60,32 +80,32 @@ def test_the_worked_example_of_the_specification(preset, label_of_4, share_of_4)
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("nested", [False, True])
 def test_swapping_the_masks_of_the_worked_example_changes_nothing(preset, nested):
-    params = replace(PRESETS[preset], nested=nested)
+    params, _ = PRESETS[preset]
     visible, masks = views_of(*EXAMPLE)
     swapped = tuple(permuted(m, np.arange(len(m))[::-1]) for m in masks)
-    a, b = (propagate(points(8), visible, m, params=params) for m in (masks, swapped))
+    a, b = (run(points(8), visible, m, params, ObserveParams(nested=nested)) for m in (masks, swapped))
     assert a.label.tolist() == b.label.tolist()
     assert a.confidence.tolist() == b.confidence.tolist()
 
 
 def test_a_mask_without_enough_points_founds_no_object():
     visible, masks = views_of([[1, 2, 3], [4, 5]])
-    result = propagate(points(8), visible, masks, params=replace(BARE, min_new_points=3))
+    result = run(points(8), visible, masks, in_turn(min_new_points=3))
     assert result.label.tolist() == [0, 1, 1, 1, 0, 0, 0, 0]
     assert result.match_mask.tolist() == [0]
 
 
 def test_labels_of_few_points_are_dropped_in_the_end():
     visible, masks = views_of([[1, 2, 3], [4, 5]])
-    result = propagate(points(8), visible, masks, params=replace(BARE, min_label_points=3))
+    result = run(points(8), visible, masks, replace(BARE, min_label_points=3))
     assert set(result.label) == {0, 1}
     assert result.num_labels == 2
 
 
 def test_a_mask_that_hardly_touches_a_label_is_a_new_object():
     visible, masks = views_of([[0, 1]], [[1, 2, 3, 4, 5, 6]])
-    joined = propagate(points(8), visible, masks, params=BARE)
-    apart = propagate(points(8), visible, masks, params=replace(BARE, min_overlap_share=0.5))
+    joined = run(points(8), visible, masks, BARE)
+    apart = run(points(8), visible, masks, in_turn(min_overlap_share=0.5))
     assert joined.label[6] == joined.label[0] == 1
     assert apart.label[6] == 2
 
@@ -93,22 +113,24 @@ def test_a_mask_that_hardly_touches_a_label_is_a_new_object():
 def test_a_second_pass_matches_early_views_against_late_labels():
     # View 1 sees two halves of an object, view 2 all of it: only then is it known that the halves are one.
     visible, masks = views_of([[1, 2, 3], [4, 5, 6, 7]], [[1, 2, 3, 4, 5, 6, 7]], [[1, 2, 3, 4, 5, 6, 7]])
-    params = replace(BARE, tau_label=0.6, contested_vote=1.0)
-    once = propagate(points(8), visible, masks, params=params)
-    twice = propagate(points(8), visible, masks, params=replace(params, passes=2))
+    once, twice = (
+        run(points(8), visible, masks, replace(in_turn(contested_vote=1.0, passes=passes), tau_label=0.6))
+        for passes in (1, 2)
+    )
     assert once.label[1:].tolist() == [1] * 7
     assert once.confidence[1] == pytest.approx(2 / 3.25)
     assert twice.confidence[1:].tolist() == [1.0] * 7
 
 
-def test_the_consensus_of_the_views_outvotes_one_mask_that_holds_two_objects():
+def test_views_at_once_outvote_one_mask_that_holds_two_objects():
     good = [[0, 1, 2, 3], [4, 5, 6, 7]]
     visible, masks = views_of([[0, 1, 2, 3, 4, 5, 6, 7]], good, good, good, good)
-    result = propagate(points(8), visible, masks, params=replace(BARE, start="consensus", min_overlap_share=0.1))
+    clustering = MaskClusteringParams(min_points=1)
+    result = run(points(8), visible, masks, replace(BARE, views="at_once", at_once=clustering))
     left, right = result.label[:4], result.label[4:]
     assert len(set(left)) == len(set(right)) == 1
     assert left[0] != right[0]
-    sequential = propagate(points(8), visible, masks, params=BARE)
+    sequential = run(points(8), visible, masks, BARE)
     assert len(set(sequential.label)) == 1
 
 
@@ -139,13 +161,17 @@ def degraded(seed):
     return tuple(sets)
 
 
-DEFAULTS = (PropagateParams(), PropagateParams(start="empty", passes=2), PropagateParams(start="empty", nested=True))
+DEFAULTS = (
+    (PropagateParams(), ObserveParams()),
+    (PropagateParams(views="in_turn", in_turn=SequentialParams(passes=2)), ObserveParams()),
+    (PropagateParams(views="in_turn"), ObserveParams(nested=True)),
+)
 
 
 @pytest.mark.parametrize("params", DEFAULTS)
 def test_true_masks_give_each_box_one_label_in_all_views(boxes, params):
     cloud, seen = boxes
-    result = propagate(cloud, seen, true_masks(), params=params)
+    result = run(cloud, seen, true_masks(), *params)
     for number, (low, high) in enumerate(box_scene.BOXES, start=1):
         inner = ((cloud.points > low + 0.03 * (low > 0)) & (cloud.points < high + 0.01)).all(axis=1)
         inner &= (cloud.points[:, 2] > 0.05) & (cloud.points[:, 0] > low[0] - 0.01)
@@ -163,7 +189,7 @@ def test_permuting_the_masks_of_every_view_changes_no_label(boxes, params, seed)
     masks = degraded(seed)
     random = np.random.default_rng(seed)
     shuffled = tuple(permuted(m, random.permutation(len(m))) for m in masks)
-    a, b = (propagate(cloud, seen, m, params=params) for m in (masks, shuffled))
+    a, b = (run(cloud, seen, m, *params) for m in (masks, shuffled))
     assert a.label.tobytes() == b.label.tobytes()
     assert a.confidence.tobytes() == b.confidence.tobytes()
 
@@ -173,11 +199,14 @@ def test_permuting_the_masks_of_every_view_changes_no_label(boxes, params, seed)
 def test_scaling_the_world_changes_no_label(boxes, scale, seed):
     cloud, seen = boxes
     clusters = ClusterParams(eps=5.0)
-    params = PropagateParams(mask_clusters=clusters, label_clusters=replace(clusters, eps=2.5, keep_share=0.05))
+    params = (
+        PropagateParams(label_clusters=replace(clusters, eps=2.5, keep_share=0.05)),
+        ObserveParams(clusters=clusters),
+    )
     scaled = replace(cloud, points=cloud.points * np.float32(scale), unit=scale, spacing=cloud.spacing * scale)
     far = tuple(replace(v, depth=v.depth * np.float32(scale)) for v in seen)
     masks = degraded(seed)
-    a, b = propagate(cloud, seen, masks, params=params), propagate(scaled, far, masks, params=params)
+    a, b = run(cloud, seen, masks, *params), run(scaled, far, masks, *params)
     assert (a.label == b.label).mean() > 0.999
 
 
@@ -188,7 +217,7 @@ def test_scaling_the_world_changes_no_label_from_depth_to_labels(scale):
         cameras, depths = box_scene.cameras(size), box_scene.depths(size)
         cloud = dense(box_scene.frames(), cameras, depths, params=DenseParams())
         seen = tuple(visibility(cloud, cameras, d, view=k, tau_depth=0.02) for k, d in enumerate(depths))
-        labels.append(propagate(cloud, seen, degraded(3), params=PropagateParams()).label)
+        labels.append(run(cloud, seen, degraded(3), PropagateParams()).label)
     assert labels[0].tobytes() == labels[1].tobytes()
 
 
@@ -199,18 +228,65 @@ def test_clustering_keeps_stray_points_of_a_mask_from_voting(boxes):
     first[0, :6, :6] = True  # a patch of the far floor
     masks[0] = mask_set(first, "0")
     only = (seen[0],), (masks[0],)
-    params = replace(BARE, mask_clusters=ClusterParams(eps=5.0, keep_share=1.0))
+    cleaned = ObserveParams(clusters=ClusterParams(eps=5.0, keep_share=1.0))
     stray = (seen[0].pixel % box_scene.WIDTH < 3) & (seen[0].pixel // box_scene.WIDTH < 3)
     assert stray.any()
     rows = seen[0].point_index[stray]
-    assert (propagate(cloud, *only, params=BARE).label[rows] > 0).all()
-    assert (propagate(cloud, *only, params=params).label[rows] == 0).all()
+    assert (run(cloud, *only, BARE).label[rows] > 0).all()
+    assert (run(cloud, *only, BARE, cleaned).label[rows] == 0).all()
 
 
 def test_views_without_masks_label_nothing(boxes):
     cloud, seen = boxes
     nothing = tuple(mask_set(np.zeros((0, box_scene.HEIGHT, box_scene.WIDTH), bool), v.name) for v in seen)
-    result = propagate(cloud, seen, nothing, params=PropagateParams())
+    result = run(cloud, seen, nothing, PropagateParams())
     assert not result.label.any()
     assert result.num_labels == 0
     assert len(result.match_mask) == 0
+
+
+def relabelled(a, b):
+    """Share of the points whose label in `b` is not what their label in `a` became."""
+    table = np.zeros((a.max() + 1, b.max() + 1), int)
+    np.add.at(table, (a, b), 1)
+    rows, columns = linear_sum_assignment(-table[1:, 1:])
+    return 1 - (table[1:, 1:][rows, columns].sum() + table[0, 0]) / len(a)
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=st.integers(0, 1000))
+def test_permuting_the_views_changes_no_label(boxes, seed):
+    cloud, seen = boxes
+    masks = degraded(seed)
+    order = np.random.default_rng(seed).permutation(len(seen))
+    a = run(cloud, seen, masks, PropagateParams())
+    b = run(cloud, tuple(seen[k] for k in order), tuple(masks[k] for k in order), PropagateParams())
+    assert a.label.tobytes() == b.label.tobytes()
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=st.integers(0, 1000))
+def test_seeing_every_view_twice_changes_no_label(boxes, seed):
+    cloud, seen = boxes
+    masks = degraded(seed)
+    a, b = run(cloud, seen, masks, PropagateParams()), run(cloud, 2 * seen, 2 * masks, PropagateParams())
+    assert a.label.tobytes() == b.label.tobytes()
+
+
+def test_views_clustered_in_lots_give_the_same_labels(boxes):
+    cloud, seen = boxes
+    few = PropagateParams(at_once=MaskClusteringParams(max_views=3))
+    a, b = run(cloud, seen, true_masks(), PropagateParams()), run(cloud, seen, true_masks(), few)
+    assert relabelled(a.label, b.label) < 0.01
+    assert set(b.match_view.tolist()) == set(range(len(seen)))
+
+
+def test_contested_points_follow_their_neighbours():
+    # Two views disagree about point 3 of a row; its neighbours are sure.
+    row = [[0, 1, 2, 3], [4, 5, 6, 7]], [[0, 1, 2], [3, 4, 5, 6, 7]]
+    visible, masks = views_of(*row, *row)
+    wanted = replace(BARE, views="at_once", at_once=MaskClusteringParams(min_points=1))
+    assert run(points(8), visible, masks, wanted).label[3] == 0
+    smooth = run(points(8), visible, masks, replace(wanted, smoothing=1))
+    assert (smooth.label > 0).all()
+    assert len(set(smooth.label.tolist())) == 2

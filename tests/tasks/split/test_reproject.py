@@ -6,16 +6,36 @@ import pytest
 from box_scene import mask_set
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import PointCloud, PointLabels, PromptedMasks, Visibility
+from ss_flow.tasks.artifacts import (
+    DRAWN,
+    FOUND,
+    PROMPTED,
+    PointCloud,
+    PointLabels,
+    PointParts,
+    PromptedMasks,
+    Visibility,
+)
 from ss_flow.tasks.geometry.images import pack_masks
 from ss_flow.tasks.split.dense import DenseParams, dense
+from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
 from ss_flow.tasks.split.reproject import ReprojectParams, reproject
-from ss_flow.tasks.split.selection import SelectionParams, paint_labels, select_masks, stack_exclusive
+from ss_flow.tasks.split.selection import (
+    PaintedView,
+    SelectionParams,
+    nearest_labels,
+    paint_labels,
+    select_masks,
+    smoothed,
+    stack_exclusive,
+)
 from ss_flow.tasks.split.visibility import visibility
 
-ALL = ReprojectParams(SelectionParams(masks="all"))
+ALL = ReprojectParams(SelectionParams(masks="all"), draw_missing=False)
+FOUND_ONLY = ReprojectParams(draw_missing=False)
 H, W = 4, 10
+WHOLE = PointParts(np.zeros(H * W, np.int32))
 
 
 def view(name="a"):
@@ -52,7 +72,7 @@ def halves(left=1, right=2):
 def run(masks, image, params=None, prompted=()):
     cloud, labels = labelled(image)
     found = reproject(
-        cloud, (view(),), (mask_set(np.stack(masks), "a"),), labels, prompted, params=params or ReprojectParams()
+        cloud, (view(),), (mask_set(np.stack(masks), "a"),), labels, WHOLE, prompted, params=params or FOUND_ONLY
     )
     return {i.instance_id: i for i in found}
 
@@ -75,7 +95,7 @@ def test_a_mask_that_agrees_too_little_shows_nothing():
     assert not len(found[1].view) or (found[1].dense()[0] == columns(4, 10)).all()
     # Four of the eight columns of label 1, and two without label: IoU 4 / 10.
     assert len(found[1].view) == 1
-    strict = ReprojectParams(SelectionParams(min_iou=0.5))
+    strict = replace(FOUND_ONLY, selection=SelectionParams(min_iou=0.5))
     assert not len(run([columns(4, 10)], halves(right=1), strict)[1].view)
 
 
@@ -100,10 +120,18 @@ def test_the_background_is_what_is_left():
     assert list(found) == [0, 1, 2]
 
 
+def test_an_instance_knows_the_parts_of_its_points():
+    cloud, labels = labelled(halves())
+    parts = PointParts(np.arange(H * W, dtype=np.int32))
+    found = reproject(cloud, (view(),), (mask_set(columns(0, 5)[None], "a"),), labels, parts, (), params=FOUND_ONLY)
+    for instance in found:
+        assert instance.point_part.tolist() == np.flatnonzero(labels.label == instance.instance_id).tolist()
+
+
 def test_an_instance_seen_in_one_view_is_weak():
     cloud, labels = labelled(halves())
     masks = (mask_set(columns(0, 5)[None], "a"), mask_set(np.stack([columns(0, 5), columns(5, 8)]), "b"))
-    _, one, two = reproject(cloud, (view("a"), view("b")), masks, labels, (), params=ReprojectParams())
+    _, one, two = reproject(cloud, (view("a"), view("b")), masks, labels, WHOLE, (), params=FOUND_ONLY)
     assert (one.view.tolist(), one.weak) == ([0, 1], False)
     assert (two.view.tolist(), two.weak) == ([1], True)
 
@@ -111,7 +139,7 @@ def test_an_instance_seen_in_one_view_is_weak():
 def test_confidence_is_the_mean_share_less_what_other_labels_contradict():
     cloud, labels = labelled(halves(), confidence=0.8)
     masks = (mask_set(columns(0, 6)[None], "a"),)
-    _, one, two = reproject(cloud, (view(),), masks, labels, (), params=ReprojectParams())
+    _, one, two = reproject(cloud, (view(),), masks, labels, WHOLE, (), params=FOUND_ONLY)
     # The mask of label 1 holds one column of label 2 among six.
     assert one.confidence == pytest.approx(0.8 * 5 / 6)
     assert two.confidence == pytest.approx(0.8)
@@ -119,7 +147,7 @@ def test_confidence_is_the_mean_share_less_what_other_labels_contradict():
 
 
 def prompt(label, mask):
-    return (PromptedMasks("a", H, W, np.array([label], np.int32), pack_masks(mask[None])),)
+    return (PromptedMasks("a", H, W, np.array([label], np.int32), pack_masks(mask[None]), np.ones(1, np.float32)),)
 
 
 def test_a_prompted_mask_stands_in_where_no_mask_shows_a_label():
@@ -132,10 +160,13 @@ def test_a_prompted_mask_that_misses_its_label_is_refused():
     assert not len(run([columns(0, 5)], halves(), prompted=prompt(2, columns(0, 6)))[2].view)
 
 
-def test_a_prompted_mask_never_replaces_the_segmenters_own():
+def test_a_prompted_mask_replaces_the_views_own_only_where_it_agrees_better():
     found = run([columns(0, 5)], halves(), prompted=prompt(1, columns(0, 4)))
     assert (found[1].dense()[0] == columns(0, 5)).all()
-    assert found[1].prompted.tolist() == [0]
+    assert found[1].prompted.tolist() == [FOUND]
+    found = run([columns(0, 3)], halves(), prompted=prompt(1, columns(0, 4)))
+    assert (found[1].dense()[0] == columns(0, 4)).all()
+    assert found[1].prompted.tolist() == [PROMPTED]
 
 
 def test_the_point_in_front_gives_a_pixel_its_label():
@@ -164,8 +195,10 @@ def test_true_masks_come_back_with_one_id_in_every_view(params):
     cameras, depths, masks = box_scene.cameras(), box_scene.depths(), box_scene.true_masks()
     cloud = dense(box_scene.frames(), cameras, depths, params=DenseParams())
     seen = tuple(visibility(cloud, cameras, d, view=k, tau_depth=0.02) for k, d in enumerate(depths))
-    labels = propagate(cloud, seen, masks, params=PropagateParams())
-    found = reproject(cloud, seen, masks, labels, (), params=params)
+    observed = tuple(observe(cloud, view, pool, params=ObserveParams()) for view, pool in zip(seen, masks, strict=True))
+    labels = propagate(cloud, seen, observed, params=PropagateParams())
+    whole = PointParts(np.zeros(len(cloud.points), np.int32))
+    found = reproject(cloud, seen, masks, labels, whole, (), params=params)
     assert len(found) == 4
     truth = np.stack([box_scene.cast(k)[1] for k in range(box_scene.VIEWS)])
     boxes = set()
@@ -186,4 +219,38 @@ def test_frames_of_different_sizes_are_bad_input():
     other = replace(view("b"), height=H + 1)
     masks = (mask_set(columns(0, 5)[None], "a"),) * 2
     with pytest.raises(InputError, match="Frame b is 10 x 5"):
-        reproject(cloud, (view("a"), other), masks, labels, (), params=ReprojectParams())
+        reproject(cloud, (view("a"), other), masks, labels, WHOLE, (), params=FOUND_ONLY)
+
+
+def test_a_label_without_a_mask_is_drawn_from_its_points():
+    params = ReprojectParams(min_points=10, reach=0.0)
+    instances = run([columns(0, 5)], halves(), params)
+    np.testing.assert_array_equal(instances[2].dense()[0], columns(5, 8))
+    assert instances[1].prompted.tolist() == [FOUND]
+    assert instances[2].prompted.tolist() == [DRAWN]
+    assert not len(run([columns(0, 5)], halves(), replace(params, min_points=13))[2].view)
+
+
+def test_a_drawn_mask_reaches_a_little_round_its_points():
+    painted = PaintedView(np.array([0, 5, 33], np.int32), np.array([4, 0, 7], np.int32))
+    near = nearest_labels(painted, H, W, 1.5)
+    assert near[0, :2].tolist() == [4, 4] and near[1, 0] == 4
+    assert near[3, 2:5].tolist() == [7, 7, 7] and near[2, 3] == 7
+    assert near[0, 4:7].tolist() == [0, 0, 0]  # nearest to an unlabelled point
+    assert near[1, 8] == 0
+
+
+def test_a_smoothed_mask_has_neither_crumbs_nor_holes():
+    mask = np.zeros((30, 30), bool)
+    mask[5:20, 5:20] = True
+    ragged = mask.copy()
+    ragged[10, 10] = ragged[5, 12] = False
+    ragged[25, 25] = ragged[2, 2] = True
+    clean = smoothed(ragged, 1)
+    assert (clean ^ mask).sum() <= 8 and clean[10, 10] and not clean[20:].any()
+    two = mask.copy()
+    two[22:26, 22:26] = True  # 16 of 225 pixels: a crumb
+    assert not smoothed(two, 1)[21:, 21:].any()
+    two[22:28, 22:28] = True
+    assert smoothed(two, 1)[24, 24]
+    assert not smoothed(np.zeros((4, 4), bool), 2).any()

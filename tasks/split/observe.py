@@ -1,0 +1,85 @@
+"""What the masks of each view say about the dense points (Split&Splat, Eq. 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import BORDER, INSIDE, STRAY, Int32, MaskSet, Observation, PointCloud, Visibility
+from ss_flow.tasks.geometry.clustering import main_clusters
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.split.erosion import ErosionParams, interiors
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+
+@dataclass(frozen=True)
+class ClusterParams:
+    """Which points of a group belong together (DBSCAN; spec rows 14 and 15)."""
+
+    eps: NonNegative = 0.0
+    """Neighbourhood radius in multiples of the cloud's spacing; 0 keeps all points."""
+    min_samples: Count = 10
+    """Neighbours that make a core point."""
+    keep_share: Fraction = 0.1
+    """Clusters with at least this share of the points are kept, and always the largest; 1 keeps that one alone."""
+
+
+@dataclass(frozen=True)
+class ObserveParams:
+    """Which points lie under which mask."""
+
+    nested: bool = False
+    """Whether a point under two masks of a view belongs to both; if not, to the smaller one."""
+    erosion: ErosionParams = field(default_factory=ErosionParams)
+    """How far a mask's border is taken off."""
+    clusters: ClusterParams = field(default_factory=ClusterParams)
+    """Which points inside a mask are kept."""
+
+
+@task(uses=("opencv-contrib-python-headless", "scipy"))
+def observe(points: PointCloud, visibility: Visibility, masks: MaskSet, *, params: ObserveParams) -> Observation:
+    """The points under each mask of one view, those at its border told apart (spec S4.3, Q_i).
+
+    visibility, masks: those of one view.
+    """
+    inner = np.zeros(visibility.height * visibility.width, bool)
+    whole = np.zeros_like(inner)
+    mask: list[int] = []
+    rows: list[Int32] = []
+    standings: list[np.ndarray] = []
+    for interior in interiors(masks, params.erosion, nested=params.nested):
+        whole[interior.whole] = inner[interior.pixels] = True
+        row = np.flatnonzero(whole[visibility.pixel]).astype(np.int32)
+        inside = inner[visibility.pixel[row]]
+        whole[interior.whole] = inner[interior.pixels] = False
+        standing = np.where(inside, INSIDE, BORDER).astype(np.uint8)
+        if params.clusters.eps and inside.any():
+            places = points.points[visibility.point_index[row[inside]]]
+            clusters = params.clusters
+            kept = main_clusters(places, clusters.eps * points.spacing, clusters.min_samples, clusters.keep_share)
+            standing[inside] = np.where(kept, INSIDE, STRAY)
+        mask.append(interior.mask)
+        rows.append(row)
+        standings.append(standing)
+    return Observation(
+        name=visibility.name,
+        point_index=visibility.point_index,
+        mask=np.array(mask, np.int32),
+        first=np.cumsum([0, *map(len, rows)]).astype(np.int32),
+        row=np.concatenate([np.zeros(0, np.int32), *rows]),
+        standing=np.concatenate([np.zeros(0, np.uint8), *standings]),
+    )
+
+
+def membership(groups: list[Int32], num_points: int) -> csr_array:
+    """Groups of points as a sparse matrix [groups, points] of ones."""
+    from scipy.sparse import csr_array
+
+    bounds = np.cumsum([0, *(len(group) for group in groups)])
+    columns = np.concatenate([np.zeros(0, np.int32), *groups])
+    return csr_array((np.ones(len(columns), np.float32), columns, bounds), shape=(len(groups), num_points))

@@ -1,0 +1,41 @@
+"""Labels for contested points, from their neighbours (spec A12)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float32, Int32
+
+_NEIGHBOURS = 8
+_REACH = 3.0
+"""How far a neighbour may be, in multiples of the cloud's spacing."""
+
+
+def smooth(label: Int32, contested: Bool, points: Float32, spacing: float, rounds: int) -> Int32:
+    """Give contested points the label that most of their nearest neighbours carry; ties go to the lowest.
+
+    label: [N], 0 = none. contested: [N] which points may change. points: [N, 3]. spacing: the cloud's. rounds: how
+    often; each round sees the labels of the one before. Points all of whose neighbours are unlabelled stay so.
+    """
+    from scipy.spatial import cKDTree
+
+    rows = np.flatnonzero(contested)
+    if not rows.size:
+        return label
+    count = min(_NEIGHBOURS + 1, len(points))
+    _, near = cKDTree(points).query(points[rows], k=count, distance_upper_bound=_REACH * spacing)
+    near = np.asarray(near).reshape(len(rows), count)
+    padded = np.append(label, np.int32(0))  # a neighbour out of reach has the number len(points)
+    for _ in range(rounds):
+        around = np.where(near == rows[:, None], 0, padded[near])
+        padded[rows] = _most_frequent(around)
+    return padded[:-1]
+
+
+def _most_frequent(labels: Int32) -> Int32:
+    """The most frequent label above 0 in each row of [M, Q]; ties go to the lowest; 0 where there is none."""
+    ordered = np.sort(labels, axis=1)
+    count = (ordered[:, :, None] == ordered[:, None, :]).sum(axis=2)
+    count[ordered == 0] = 0
+    best = count.argmax(axis=1)
+    return ordered[np.arange(len(ordered)), best]
