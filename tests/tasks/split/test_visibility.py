@@ -66,3 +66,14 @@ def test_it_agrees_with_equations_1_and_2_point_by_point(view, seed):
             expected.append((i, h * camera.width + w))
     seen = visibility(points, cameras, depth, view=view, tau_depth=0.02)
     assert list(zip(seen.point_index.tolist(), seen.pixel.tolist(), strict=True)) == expected
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, box_scene.VIEWS - 1), st.integers(0, 100), st.lists(st.floats(1e-4, 1.0), min_size=2, max_size=2))
+def test_raising_the_threshold_removes_no_point(view, seed, thresholds):
+    points = cloud(np.random.default_rng(seed).uniform((-1, -1, -0.1), (1, 1, 0.1), (300, 3)))
+    cameras, depth = box_scene.cameras(), box_scene.depths()[view]
+    few, many = (visibility(points, cameras, depth, view=view, tau_depth=tau) for tau in sorted(thresholds))
+    assert set(zip(few.point_index.tolist(), few.pixel.tolist(), strict=True)) <= set(
+        zip(many.point_index.tolist(), many.pixel.tolist(), strict=True)
+    )
