@@ -284,6 +284,11 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
+    @property
+    def opacities(self) -> Float64:
+        """[N] 0..1."""
+        return 1 / (1 + np.exp(-self.opacity_logits.astype(np.float64)))
+
 
 @dataclass(frozen=True)
 class Descriptors:

@@ -34,8 +34,7 @@ def group_box(gaussians: Gaussians, *, min_opacity: float, quantile: float) -> F
     """
     if not len(gaussians):
         return np.array([[np.inf] * 3, [-np.inf] * 3])
-    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    solid = opacity >= min_opacity
+    solid = gaussians.opacities >= min_opacity
     centers = gaussians.means[solid] if solid.any() else gaussians.means
     return np.quantile(centers.astype(np.float64), (quantile, 1 - quantile), axis=0)
 

@@ -167,7 +167,7 @@ def _shows(gaussians: Gaussians, views: Sequence[TrainView], params: MergeParams
     strongest = np.zeros(len(gaussians), np.float32)
     for view in views:
         np.maximum(strongest, render(gaussians, view.camera).max_contribution, out=strongest)
-    opaque = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))) >= params.prune_opacity
+    opaque = gaussians.opacities >= params.prune_opacity
     return opaque & (strongest >= params.prune_contribution)
 
 

@@ -164,9 +164,8 @@ def _pasted(mask: Bool, camera: Camera, full: Camera) -> Bool:
 
 def _solid(gaussians: Gaussians, params: RefineParams) -> Gaussians:
     """Without the faint and the oversized Gaussians (spec row 28); all of them where none would remain."""
-    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     longest = np.exp(gaussians.log_scales.max(axis=1))
-    keep = (opacity >= params.min_opacity) & (longest <= params.max_scale * box_diagonal(gaussians.means))
+    keep = (gaussians.opacities >= params.min_opacity) & (longest <= params.max_scale * box_diagonal(gaussians.means))
     return select(gaussians, keep) if keep.any() else gaussians
 
 

@@ -36,14 +36,14 @@ class ConsensusParams:
 
 @dataclass(frozen=True)
 class Opinions:
-    """What the views say about groups of points; on a union they say what they say on any part of it."""
+    """What the views say about groups of points."""
 
     say: csr_array
     """[G, K] in which views each group has a say."""
     held: csr_array
     """[G, T] by which masks, numbered over all views, each group is held."""
 
-    def agree(self, rate: float, min_views: float) -> csr_array:
+    def agree(self, rate: float, min_views: int) -> csr_array:
         """[G, G] which pairs have a say in at least `min_views` views, of which a share of `rate` holds both."""
         from scipy.sparse import csr_array
 

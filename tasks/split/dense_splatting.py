@@ -160,7 +160,7 @@ def _whole_views(
 
 def _centres(gaussians: Gaussians, min_opacity: float) -> VoxelSums:
     """The centres of the opaque Gaussians, with their colours."""
-    opaque = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))) >= min_opacity
+    opaque = gaussians.opacities >= min_opacity
     colors = np.clip(255 * (0.5 + SH_ZERO * gaussians.sh[opaque, 0].astype(np.float64)), 0, 255)
     return VoxelSums(gaussians.means[opaque].astype(np.float64), colors, np.ones(len(colors)))
 

@@ -23,8 +23,9 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding
-from ss_flow.tasks.split.erosion import ErosionParams, interiors
+from ss_flow.tasks.split.erosion import ErosionParams
 from ss_flow.tasks.split.mask_pool import mask_set
+from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.reprompt import Prompt, RepromptParams, prompt, spread_prompts
 from ss_flow.tasks.split.selection import PaintedView, paint_labels
 from ss_flow.tasks.split.voting import Votes
@@ -67,12 +68,10 @@ def label(
     votes = Votes(len(points.points))
     for k, (view, of_view) in enumerate(zip(visibility, masks, strict=True)):
         progress(k, len(masks), view.name)
-        inside = np.zeros(view.height * view.width, bool)
-        for interior in interiors(of_view, erosion, nested=False):
-            inside[interior.pixels] = True
-            rows = view.point_index[inside[view.pixel]]
-            inside[interior.pixels] = False
-            votes.add(rows, int(of_view.label[interior.mask]), np.ones(len(rows)))
+        seen = observe(points, view, of_view, params=ObserveParams(erosion=erosion))
+        for j, mask in enumerate(seen.mask):
+            rows = seen.inside(j)
+            votes.add(rows, int(of_view.label[mask]), np.ones(len(rows)))
     leader, share = votes.leaders()
     nothing = np.zeros(0, np.int32)
     return PointLabels(

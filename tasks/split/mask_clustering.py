@@ -8,6 +8,7 @@ outvoted by those that part them. Beyond Split&Splat, whose labels can only grow
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -71,19 +72,18 @@ def cluster_masks(observations: Sequence[Observation], num_points: int, params: 
 def _cluster(views: list[list[Int32]], num_points: int, params: MaskClusteringParams) -> list[Int32]:
     """The same for the points inside the masks of each view."""
     contents = [b"".join([np.int64(len(points)).tobytes() + points.tobytes() for points in masks]) for masks in views]
-    original = [contents.index(content) for content in contents]
+    first: dict[bytes, int] = {}
+    original = [first.setdefault(content, k) for k, content in enumerate(contents)]
     labels = [np.zeros(len(masks), np.int32) for masks in views]
     found = [
-        (points, k, j)
-        for k in sorted(set(original))
-        for j, points in enumerate(views[k])
-        if len(points) >= params.min_points
+        (points, k, j) for k in first.values() for j, points in enumerate(views[k]) if len(points) >= params.min_points
     ]
     if found:
         # The canonical order of masks keeps ties from depending on the order of views.
         found.sort(key=lambda mask: (-len(mask[0]), mask[0].tobytes(), contents[mask[1]]))
         members = membership([points for points, _, _ in found], num_points)
-        copies = np.array([original.count(k) for _, k, _ in found])
+        alike = Counter(original)
+        copies = np.array([alike[k] for _, k, _ in found])
         together, said = evidence(members, np.array([k for _, k, _ in found]), copies, params.min_share)
         cluster = correlation_clusters(together, said, copies, params.rate)
         size = np.bincount(cluster, weights=np.diff(members.indptr))

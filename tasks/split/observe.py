@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import BORDER, INSIDE, STRAY, Int32, MaskSet, Observation, PointCloud, Visibility
+from ss_flow.tasks.artifacts import (
+    BORDER,
+    INSIDE,
+    STRAY,
+    Int32,
+    MaskSet,
+    Observation,
+    PointCloud,
+    PromptedMasks,
+    Visibility,
+)
 from ss_flow.tasks.geometry.clustering import main_clusters
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.erosion import ErosionParams, interiors
@@ -42,7 +52,9 @@ class ObserveParams:
 
 
 @task(uses=("opencv-contrib-python-headless", "scipy"))
-def observe(points: PointCloud, visibility: Visibility, masks: MaskSet, *, params: ObserveParams) -> Observation:
+def observe(
+    points: PointCloud, visibility: Visibility, masks: MaskSet | PromptedMasks, *, params: ObserveParams
+) -> Observation:
     """The points under each mask of one view, those at its border told apart (spec S4.3, Q_i).
 
     visibility, masks: those of one view.

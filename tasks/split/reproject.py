@@ -31,6 +31,7 @@ from ss_flow.tasks.split.selection import (
     SelectionParams,
     agreement,
     contradicted,
+    labels_in_front,
     nearest_labels,
     paint_labels,
     select_masks,
@@ -77,18 +78,18 @@ def reproject(
 
     Raises InputError when the frames of two views differ in size.
     """
-    for view in visibility:
-        if (view.height, view.width) != (visibility[0].height, visibility[0].width):
-            raise InputError(
-                f"Frame {view.name} is {view.width} x {view.height} pixels but {visibility[0].name} is "
-                f"{visibility[0].width} x {visibility[0].height}; all frames of a scene should have one size."
-            )
+    first = visibility[0]
     by_name = {extra.name: extra for extra in prompted}
     num_labels = int(labels.label.max(initial=0))
     held, against = np.zeros(num_labels + 1), np.zeros(num_labels + 1)
     views: list[dict[int, tuple[np.ndarray, int]]] = []
     for k, (view, pool) in enumerate(zip(visibility, masks, strict=True)):
         progress(k, len(masks), view.name)
+        if (view.height, view.width) != (first.height, first.width):
+            raise InputError(
+                f"Frame {view.name} is {view.width} x {view.height} pixels but {first.name} is "
+                f"{first.width} x {first.height}; all frames of a scene should have one size."
+            )
         painted = paint_labels(view, labels.label)
         shown = select_masks(painted, pool, params.selection)
         origin = dict.fromkeys(shown, FOUND)
@@ -108,7 +109,7 @@ def reproject(
             total += part
     agreed = 1 - against / np.maximum(held, 1)
     return tuple(
-        _instance(int(label), points, labels, parts, views, visibility[0], float(agreed[label]), params.min_views)
+        _instance(int(label), points, labels, parts, views, first, float(agreed[label]), params.min_views)
         for label in np.union1d([0], labels.label)
     )
 
@@ -118,13 +119,12 @@ def _drawn(painted: PaintedView, view: Visibility, shown: set[int], params: Repr
 
     A label whose points lie so scattered that hardly any of them is left inside has none.
     """
-    names, counts = np.unique(painted.label, return_counts=True)
-    missing = set(names[(names > 0) & (counts >= params.min_points)].tolist()) - shown
+    missing = [label for label in labels_in_front(painted, params.min_points) if label not in shown]
     if not missing:
         return {}
     reach = params.reach * float(np.hypot(view.height, view.width)) / 800
     nearest = nearest_labels(painted, view.height, view.width, reach)
-    masks = {label: smoothed(nearest == label, round(reach)) for label in sorted(missing)}
+    masks = {label: smoothed(nearest == label, round(reach)) for label in missing}
     return {label: mask for label, mask in masks.items() if agreement(painted, mask, label) >= params.selection.min_iou}
 
 

@@ -13,7 +13,14 @@ from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
-from ss_flow.tasks.split.selection import PaintedView, SelectionParams, agreement, paint_labels, select_masks
+from ss_flow.tasks.split.selection import (
+    PaintedView,
+    SelectionParams,
+    agreement,
+    labels_in_front,
+    paint_labels,
+    select_masks,
+)
 
 
 @dataclass(frozen=True)
@@ -72,9 +79,8 @@ class Prompt:
 
 def spread_prompts(painted: PaintedView, width: int, shown: set[int], params: RepromptParams) -> dict[int, Prompt]:
     """For each label in front in a view of this width, but those in `shown`: points spread over it."""
-    names, counts = np.unique(painted.label, return_counts=True)
     prompts = {}
-    for label in names[(names > 0) & (counts >= params.min_points)].tolist():
+    for label in labels_in_front(painted, params.min_points):
         if label not in shown:
             v, u = np.divmod(painted.pixel[painted.label == label], width)
             places = np.stack([u, v], axis=-1) + 0.5

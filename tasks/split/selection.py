@@ -46,6 +46,13 @@ def paint_labels(view: Visibility, label: Int32) -> PaintedView:
     return PaintedView(pixel, image[pixel] - 1)
 
 
+def labels_in_front(painted: PaintedView, min_points: int) -> list[int]:
+    """The labels that at least so many points in front carry, ascending."""
+    names, counts = np.unique(painted.label, return_counts=True)
+    found: list[int] = names[(names > 0) & (counts >= min_points)].tolist()
+    return found
+
+
 def select_masks(painted: PaintedView, pool: MaskSet, params: SelectionParams) -> dict[int, Bool]:
     """For each label that a view's masks show, its mask [H, W]; the masks of two labels may overlap (spec S5)."""
     dense = pool.dense()
