@@ -20,7 +20,12 @@ from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_cloud, write_masks, write_scene
 
 STATUS_EXIT = {"ok": 0, "degraded": 3, "failed": 1}
-METRICS = {"metrics_split": "split", "metrics_splat": "splat", "novel_view": "novel_view"}
+METRICS = {
+    "metrics_split": "split",
+    "metrics_refined": "refined",
+    "metrics_splat": "splat",
+    "novel_view": "novel_view",
+}
 FALLBACKS = {
     "segmenter": "colour, depth and normals (no network)",
     "encoder": "colour words (no network)",

@@ -16,6 +16,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "reproject": ("split.instances",),
     "scene": ("splat.instances", "splat.gaussians"),
     "metrics_split": tuple(f"split.{name}" for name in _MASKS + _COUNTS),
+    "metrics_refined": tuple(f"refined.{name}" for name in _MASKS + _COUNTS),
     "metrics_splat": tuple(f"splat.{name}" for name in _MASKS + _COUNTS),
     "novel_view": ("novel_view.psnr", "novel_view.ssim"),
     "query": ("query.matched", "query.matched_share", "query.best"),

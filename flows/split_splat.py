@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
 from ss_flow.errors import InputError
 from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import Params, SplitParams
-from ss_flow.graph import each, expand, gather, labelled
+from ss_flow.graph import each, expand, gather, labelled, otherwise
 from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.evaluate.novel_view import novel_view
 from ss_flow.tasks.models.catalogue import Model
@@ -19,6 +20,7 @@ from ss_flow.tasks.splat.merge import assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import plan
 from ss_flow.tasks.splat.reconstruct import reconstruct, retrain
 from ss_flow.tasks.splat.refine import refine
+from ss_flow.tasks.splat.render_masks import render_masks
 from ss_flow.tasks.splat.resolve import exclusive, resolve
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.dense import dense
@@ -83,10 +85,11 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
             )
     results |= splat(capture, halved, networks, params)
     if capture.truth is not None:
-        with labelled("splat"):
-            results["metrics_splat"] = evaluate_masks(
-                results["masks"], capture.truth, zero_is_void=params.evaluate.zero_is_void
-            )
+        for stage, masks in (("refined", "masks_refined"), ("splat", "masks")):
+            with labelled(stage):
+                results[f"metrics_{stage}"] = evaluate_masks(
+                    results[masks], capture.truth, zero_is_void=params.evaluate.zero_is_void
+                )
     if held_out is not None:
         results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])
     results["describe"] = each(
@@ -238,8 +241,16 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
         masks = resolve(capture.cameras, better)
     groups = each(better, first, build=again, on_error="skip")
     merged = merge_rounds(views, groups, masks, params, 0)
-    scene = global_pass(*views, assemble(merged), masks, params=settings.merge)
-    return {"reconstruct": first, "refine": better, "masks": masks, "merge": merged, "scene": scene}
+    assembled = assemble(merged)
+    scene = otherwise(global_pass(*views, assembled, masks, params=settings.merge), lambda: assembled)
+    return {
+        "reconstruct": first,
+        "refine": better,
+        "masks_refined": masks,
+        "merge": merged,
+        "scene": scene,
+        "masks": render_masks(capture.cameras, scene, masks),
+    }
 
 
 def merge_rounds(views: tuple[Any, Any, Any], groups: Any, masks: Any, params: Params, number: int) -> Any:
@@ -250,18 +261,18 @@ def merge_rounds(views: tuple[Any, Any, Any], groups: Any, masks: Any, params: P
             return groups
         merged: list[Any] = []
         for a, b in planned.pairs.tolist():
+            pair = groups[a], groups[b]
             with labelled(f"{number}.{a}+{b}"):
-                merged.append(
-                    merge_pair(
-                        *views,
-                        groups[a],
-                        groups[b],
-                        masks,
-                        params=params.splat.merge,
-                        w_mask=planned.mask_weight,
-                        **vars(params.split.visibility),
-                    )
+                refined = merge_pair(
+                    *views,
+                    *pair,
+                    masks,
+                    params=params.splat.merge,
+                    w_mask=planned.mask_weight,
+                    **vars(params.split.visibility),
                 )
+                # A pair that cannot be refined is joined as it is.
+                merged.append(otherwise(refined, functools.partial(assemble, pair)))
         rest = [groups[i] for i in planned.singles.tolist()]
         return merge_rounds(views, gather([*merged, *rest]), masks, params, number + 1)
 

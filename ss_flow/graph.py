@@ -1,7 +1,7 @@
 """Flows: ordinary functions in which calling a task adds a node to a graph instead of running it.
 
 A node stands for one artifact, or for a list of artifacts. `each` fans a list out, `expand` lets a result decide what
-comes next, a plain sequence of nodes passed to a task is a list.
+comes next, `otherwise` says what stands in for a failed node, a plain sequence of nodes passed to a task is a list.
 """
 
 from __future__ import annotations
@@ -86,6 +86,14 @@ class Expand(Node):
 
 
 @dataclass(eq=False)
+class Otherwise(Node):
+    """What `source` comes to, or where that failed, what `build` puts in its place."""
+
+    source: Node
+    build: Callable[[], Node]
+
+
+@dataclass(eq=False)
 class Stored(Node):
     """Something that is in the store already: the result of another run."""
 
@@ -146,7 +154,7 @@ def sources_of(node: Node) -> list[Node]:
     match node:
         case Call():
             return list(node.inputs.values())
-        case Item():
+        case Item() | Otherwise():
             return [node.source]
         case Gather():
             return [source for row in node.rows for source in row]
@@ -215,6 +223,15 @@ def expand(plan: Any, build: Callable[[Any], Any]) -> Any:
     """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes."""
     flow = _building()
     return flow.attach(Expand(flow, "expand", _item.get(), [plan], build, loads=True))
+
+
+def otherwise(node: Any, build: Callable[[], Any]) -> Any:
+    """A node for the result of `node`, or where that failed, for the result of the node that `build` adds.
+
+    The run is then degraded.
+    """
+    flow = _building()
+    return flow.attach(Otherwise(flow, "otherwise", _item.get(), node, build))
 
 
 def stored(name: str, value: str | Sequence[str]) -> Any:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ss_flow.graph import Call, Expand, Gather, Item, Node, Stored, sources_of
+from ss_flow.graph import Call, Expand, Gather, Item, Node, Otherwise, Stored, sources_of
 from ss_flow.keys import Value
 
 
@@ -18,6 +19,10 @@ class Failure:
     label: str
     """The node that failed first."""
     error: BaseException
+
+
+class NotRun(RuntimeError):
+    """Why a node has no result in a dry run: nothing went wrong."""
 
 
 class Resolution:
@@ -128,6 +133,14 @@ class Resolution:
                     self.settle(node, failed)
                 else:
                     self._expand(node)
+            case Otherwise():
+                value = self.values[node.source]
+                if node in self._expanded:
+                    self.settle(node, self.values[self._expanded[node]])
+                elif isinstance(value, Failure) and not isinstance(value.error, NotRun):
+                    self._replace(node, node.build)
+                else:
+                    self.settle(node, value)
             case Stored():
                 self.settle(node, node.value)
 
@@ -138,19 +151,26 @@ class Resolution:
         return None
 
     def _gathered(self, node: Gather) -> Value | Failure:
-        failed = self._failed_source(node)
         whole = node.rows
-        if failed is not None:
-            whole = [row for row in node.rows if not any(isinstance(self.values[n], Failure) for n in row)]
+        failures = [value for row in whole for n in row if isinstance(value := self.values[n], Failure)]
+        if failures:
+            whole = [row for row in whole if not any(isinstance(self.values[n], Failure) for n in row)]
             if node.on_error == "fail" or not whole:
-                return failed
+                return failures[0]
+            for failure in failures:
+                if isinstance(failure.error, NotRun):
+                    return failure
         return _flattened(self.values[row[node.position]] for row in whole)
 
     def _expand(self, node: Expand) -> None:
         values: list[Any] = [self.values[source] for source in node.sources]
         arguments = [self._load(v) if node.loads and isinstance(v, str) else len(v) for v in values]
+        self._replace(node, functools.partial(node.build, *arguments))
+
+    def _replace(self, node: Node, build: Callable[[], Node]) -> None:
+        """Let a node come to what the node that `build` adds comes to."""
         with node.flow.building(node.item):
-            inner = node.build(*arguments)
+            inner = build()
         self._expanded[node] = inner
         self.need(inner)
         self._await(node, [inner])

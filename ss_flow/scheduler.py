@@ -27,7 +27,7 @@ from ss_flow.explain import first_difference
 from ss_flow.graph import Call, Flow, Node
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.keys import Components, Keys, Value
-from ss_flow.resolution import Failure, Resolution
+from ss_flow.resolution import Failure, NotRun, Resolution
 from ss_flow.task import Resources
 
 POLL_SECONDS = 0.2
@@ -150,7 +150,7 @@ class Scheduler:
         why = self._why(node, key, parts)
         if self._dry:
             self._tell("would run", node, key=key, why=why)
-            self._graph.settle(node, Failure(node.label, RuntimeError("not run")))
+            self._graph.settle(node, Failure(node.label, NotRun("not run")))
             return
         recipe = self._keys.recipe(node.task)
         self._store.put_closure(recipe.components["code"], recipe.closure)

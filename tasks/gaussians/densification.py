@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64
 from ss_flow.tasks.gaussians.optimizer import Parameters
+from ss_flow.tasks.ranges import Count, Natural
 
 CLONE_SHARE = 0.01
 """Gaussians larger than this share of the extent are split, smaller ones cloned."""
@@ -78,17 +79,24 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Schedule:
-    """When to densify; 3DGS's numbers for 30,000 iterations, and shares of the whole for shorter trainings."""
+    """When Gaussians are cloned, split and pruned; the defaults are those of 3DGS, for 30,000 steps."""
 
-    start: int
-    stop: int
-    every: int
-    reset_every: int
+    start: Natural = 500
+    """No clones before this step."""
+    stop: Natural = 15_000
+    """None after this one."""
+    every: Count = 100
+    """Steps from one time to the next."""
+    reset_every: Count = 3_000
+    """Steps from one reset of all opacities, to at most 0.01, to the next."""
+    shorten: bool = True
+    """Whether a short training begins after a fifth of its steps and stops at the half of them at the latest."""
 
-    @classmethod
-    def of(cls, iterations: int) -> Schedule:
-        """From 1/5 (at most 500) to the half (at most 15,000), every 100, opacity reset every 3,000."""
-        return cls(min(500, iterations // 5), min(15_000, iterations // 2), 100, 3_000)
+    def of(self, iterations: int) -> Schedule:
+        """The same for a training of so many steps: no reset that nothing follows."""
+        if not self.shorten:
+            return replace(self, stop=min(self.stop, iterations))
+        return replace(self, start=min(self.start, iterations // 5), stop=min(self.stop, iterations // 2))
 
     def densifies(self, step: int) -> bool:
         return self.start < step <= self.stop and step % self.every == 0

@@ -38,7 +38,7 @@ class MarkovChain:
 
     def __init__(self, iterations: int, *, extent: float, most: int) -> None:
         # 3DGS-MCMC acts until 25,000 of 30,000 iterations.
-        schedule = Schedule.of(iterations)
+        schedule = Schedule().of(iterations)
         self._start, self._every, self.last_step = schedule.start, schedule.every, round(iterations * 5 / 6)
         self._extent, self._most = extent, most
 

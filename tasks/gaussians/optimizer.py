@@ -41,8 +41,19 @@ class Parameters:
         """[N] between 0 and 1."""
         return 1 / (1 + np.exp(-self.values["opacity_logits"].astype(np.float64)))
 
-    def step(self, gradients: Mapping[str, Float32], rates: Mapping[str, float], number: int, sh_degree: int) -> None:
-        """One step of Adam; number: 1 for the first. rates: by name, "sh_rest" for the colours above degree 0."""
+    def step(
+        self,
+        gradients: Mapping[str, Float32],
+        rates: Mapping[str, float],
+        number: int,
+        sh_degree: int,
+        means_rates: Float32,
+    ) -> None:
+        """One step of Adam; number: 1 for the first. rates: by name, "sh_rest" for the colours above degree 0.
+
+        means_rates: [N] the learning rate of each mean, world units.
+        """
+        before = self.values["means"].copy()
         for name, value in self.values.items():
             rows, width, head = len(value), value[:1].size, 0
             active = width
@@ -53,6 +64,9 @@ class Parameters:
                 address(self._second[name]), rates[name], rates["sh_rest"] if name == "sh" else rates[name], number,
                 EPSILON,
             )  # fmt: skip
+        # A step of Adam is as long as its rate: those of the means, taken with rate 1, are cut to size here.
+        means = self.values["means"]
+        means[:] = before + means_rates[:, None] * (means - before)
 
     def rearrange(self, values: dict[str, Float32], source: NDArray[np.integer], fresh: Bool) -> None:
         """Replace the rows by new ones that descend from `source`; those that are fresh start without momentum."""
@@ -76,6 +90,10 @@ class Parameters:
         np.minimum(logits, np.float32(np.log(opacity / (1 - opacity))), out=logits)
         self._first["opacity_logits"][:] = 0
         self._second["opacity_logits"][:] = 0
+
+    def limit_scale(self, longest: Float32) -> None:
+        """No standard deviation above these: [N] world units."""
+        np.minimum(self.values["log_scales"], np.log(longest)[:, None], out=self.values["log_scales"])
 
     def finite(self) -> bool:
         return all(bool(np.isfinite(a).all()) for a in self.values.values())

@@ -51,6 +51,24 @@ class TrainView:
 
 
 @dataclass(frozen=True)
+class LearningRates:
+    """Adam's learning rates, for trainings of hundreds of steps; those of 3DGS, for 30,000, are several times lower."""
+
+    position: NonNegative = 3.2e-4
+    """Of the means at the first step, times the extent of what is trained."""
+    position_final: NonNegative = 3.2e-6
+    """Of the means at the last step, times the extent; the decay is exponential."""
+    color: NonNegative = 1e-2
+    """Of the colours; a twentieth above degree 0."""
+    opacity: NonNegative = 0.05
+    """Of the opacity logits."""
+    scale: NonNegative = 2e-2
+    """Of the logarithmic scales."""
+    rotation: NonNegative = 3e-3
+    """Of the quaternions."""
+
+
+@dataclass(frozen=True)
 class TrainParams:
     """How to train."""
 
@@ -58,18 +76,8 @@ class TrainParams:
     """Steps, one view each."""
     sh_degree: HarmonicsDegree = 3
     """Highest degree of the colours; 0 is used below 2,000 iterations, otherwise one more every 1,000 steps."""
-    position_lr: NonNegative = 1.6e-4
-    """Learning rate of the means at the start, times the extent."""
-    position_lr_final: NonNegative = 1.6e-6
-    """Learning rate of the means at the last step, times the extent; the decay is exponential."""
-    color_lr: NonNegative = 1e-2
-    """Learning rate of the colours (four times that of 3DGS, which trains longer); a twentieth above degree 0."""
-    opacity_lr: NonNegative = 0.05
-    """Learning rate of the opacity logits."""
-    scale_lr: NonNegative = 5e-3
-    """Learning rate of the logarithmic scales."""
-    rotation_lr: NonNegative = 1e-3
-    """Learning rate of the quaternions."""
+    rates: LearningRates = LearningRates()
+    """How fast each parameter is learnt."""
     ssim_weight: Fraction = 0.2
     """Share of 1 - SSIM in the colour loss; the rest is L1."""
     alpha_weight: NonNegative = 0.5
@@ -87,6 +95,8 @@ class TrainParams:
     opaque ones are and grows by 5 % at a time, "none" leaves it."""
     densify_grad: Positive = 2e-4
     """Mean screen gradient from which a Gaussian is cloned or split, in 3DGS's units for images 512 pixels high."""
+    schedule: Schedule = Schedule()
+    """When "classic" clones and splits."""
     max_gaussians: Count = 30_000
     """Densification ends at this number."""
     plateau: Fraction = 0.0
@@ -98,6 +108,8 @@ class TrainParams:
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
     """Gaussians with no larger weight in any view are dropped at the end; 0 keeps them."""
+    max_scale: NonNegative = 0.0
+    """No standard deviation exceeds this share of the extent; 0 = no limit."""
     antialias: bool = False
     """Whether to lower the opacity of Gaussians smaller than a pixel."""
 
@@ -124,26 +136,27 @@ def train(
     views: Sequence[TrainView],
     *,
     params: TrainParams,
-    extent: float,
+    extent: float | Float32,
     seed: int,
     label_ids: Sequence[int] = (),
 ) -> TrainResult:
     """Fit Gaussians to views with Adam (Kerbl et al. 2023, Sec. 5; spec P1, P4).
 
-    extent: size of what is trained, world units: scales the learning rate of the means and tells large Gaussians from
-    small. label_ids: instance ids of the mask loss. On the CPU the number of threads changes no byte, and neither does
-    a kill: a later try goes on from the last checkpoint.
+    extent: size of what is trained, world units, or [N] of what each Gaussian is part of: scales the learning rate of
+    the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. On the CPU the number of
+    threads changes no byte, and neither does a kill: a later try goes on from the last checkpoint.
     Raises ValueError when there are no views or Gaussians or an array does not fit its camera, TrainingDiverged when
     numbers blow up. The result has no Gaussians when all were pruned.
     """
     if len(initial) == 0 or len(views) == 0:
         raise ValueError(f"training needs Gaussians and views, but got {len(initial)} and {len(views)}")
-    if not extent > 0:
-        raise ValueError(f"the extent must be positive, not {extent}")
+    extents = np.broadcast_to(np.asarray(extent, np.float32), len(initial))
+    if not (extents > 0).all():
+        raise ValueError(f"the extent must be positive, not {extents.min()}")
     for name, allowed in (("background", ("random", "black", "white")), ("densify", ("classic", "mcmc", "none"))):
         if getattr(params, name) not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {getattr(params, name)!r}")
-    training = _Training(initial, views, params, extent, seed, label_ids)
+    training = _Training(initial, views, params, extents, seed, label_ids)
     training.resume()
     saved = time.monotonic()
     while training.step < params.iterations and not training.settled():
@@ -171,12 +184,12 @@ class _Training:
         initial: Gaussians,
         views: Sequence[TrainView],
         params: TrainParams,
-        extent: float,
+        extents: Float32,
         seed: int,
         label_ids: Sequence[int],
     ) -> None:
         num_labels = len(label_ids) if params.mask_weight else 0
-        self._initial, self._params, self._extent, self._num_labels = initial, params, extent, num_labels
+        self._initial, self._params, self._extents, self._num_labels = initial, params, extents, num_labels
         self._targets = [Target.of(v.camera, v.image, v.inside, v.free, v.depth, v.ids, num_labels) for v in views]
         self._generator = np.random.default_rng(seed)
         self._given_degree = round(initial.sh.shape[1] ** 0.5) - 1
@@ -188,7 +201,8 @@ class _Training:
         if params.reset_opacity:
             self.parameters.limit_opacity(0.01)
         self._channels = channels_of(initial.instance_id, label_ids)
-        self._strategy = _strategy(params, len(initial), extent)
+        self._extent = float(extents.max())
+        self._strategy = _strategy(params, len(initial), self._extent)
         self.step = 0
         self.losses = np.zeros(params.iterations, np.float32)
         self._order: list[int] = []
@@ -219,9 +233,12 @@ class _Training:
         if not np.isfinite(found.loss):
             raise TrainingDiverged(f"training of {len(parameters)} Gaussians diverged at step {self.step}")
         self._strategy.regularise(parameters, found.gradients)
-        rates = _rates(params, self._extent, done_share)
-        parameters.step(found.gradients, rates, self.step, degree)
-        seen = Seen(found.gradients, found.radii, target.pixels, rates["means"])
+        extents = self._extents[parameters.origin]
+        means_rate = _decay(params.rates.position, params.rates.position_final, done_share)
+        parameters.step(found.gradients, _by_name(params.rates), self.step, degree, np.float32(means_rate) * extents)
+        if params.max_scale:
+            parameters.limit_scale(np.float32(params.max_scale) * extents)
+        seen = Seen(found.gradients, found.radii, target.pixels, means_rate * self._extent)
         self._strategy.after(self.step, parameters, seen, self._generator)
 
     def check(self) -> None:
@@ -289,7 +306,7 @@ def _strategy(params: TrainParams, count: int, extent: float) -> Strategy:
     if params.densify == "classic":
         return AdaptiveControl(
             count,
-            Schedule.of(params.iterations),
+            params.schedule.of(params.iterations),
             threshold=params.densify_grad,
             extent=extent,
             most=params.max_gaussians,
@@ -311,12 +328,12 @@ def _decay(start: float, final: float, share: float) -> float:
     return float(start * (final / start) ** share)
 
 
-def _rates(params: TrainParams, extent: float, share: float) -> dict[str, float]:
+def _by_name(rates: LearningRates) -> dict[str, float]:
     return {
-        "means": extent * _decay(params.position_lr, params.position_lr_final, share),
-        "quaternions": params.rotation_lr,
-        "log_scales": params.scale_lr,
-        "opacity_logits": params.opacity_lr,
-        "sh": params.color_lr,
-        "sh_rest": params.color_lr / 20,
+        "means": 1.0,
+        "quaternions": rates.rotation,
+        "log_scales": rates.scale,
+        "opacity_logits": rates.opacity,
+        "sh": rates.color,
+        "sh_rest": rates.color / 20,
     }

@@ -44,3 +44,13 @@ def box_diagonal(points: Float32) -> float:
     """The diagonal of the box around points, less the outermost 0.5 % on each axis: [N, 3] world -> world units."""
     low, high = np.quantile(points, (0.005, 0.995), axis=0)
     return float(np.linalg.norm(high - low))
+
+
+def extents(gaussians: Gaussians) -> Float32:
+    """[N] the size of the instance that each Gaussian is part of, world units: the diagonal of its box."""
+    sizes = np.zeros(len(gaussians), np.float32)
+    for instance_id in np.unique(gaussians.instance_id):
+        own = gaussians.instance_id == instance_id
+        sizes[own] = box_diagonal(gaussians.means[own])
+    # An instance of a single Gaussian is as large as that.
+    return np.maximum(sizes, np.exp(gaussians.log_scales.max(axis=1)))

@@ -13,12 +13,12 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import concatenate, select
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import TrainParams, TrainView, train
+from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, TrainView, train
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import group_box
-from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
+from ss_flow.tasks.splat.groups import NO_GAUSSIANS, extents, rasterizer, scene_views
 from ss_flow.tasks.splat.views import IGNORED, NONE_OF_MINE, CropParams, SceneViews, training_view
 
 
@@ -32,12 +32,12 @@ class MergeParams:
     """Fewest steps of a pair."""
     max_iterations: Count = 150
     """Most steps of a pair."""
-    global_iterations: Natural = 500
+    global_iterations: Natural = 1000
     """Steps of the last pass over the whole scene; 0 leaves it out."""
     global_mask_weight: NonNegative = 0.25
     """w_mask of the last pass."""
-    reset_opacity: bool = True
-    """Whether a pair starts from opacities of at most 0.01."""
+    reset_opacity: bool = False
+    """Whether what collides starts from opacities of at most 0.01, as in the paper."""
     prune_opacity: Fraction = 0.005
     """Fainter Gaussians are dropped in the end."""
     prune_contribution: Fraction = 1 / 255
@@ -52,6 +52,10 @@ class MergeParams:
     """Whether only what is inside the box of the smaller group is refined; False refines both groups whole."""
     collision_margin: NonNegative = 0.05
     """By how much that box is widened on every side, as a share of its diagonal."""
+    max_scale: NonNegative = 0.1
+    """No Gaussian becomes longer (one standard deviation) than this share of its instance's box diagonal; 0 = any."""
+    rates: LearningRates = LearningRates()
+    """How fast each parameter is learnt."""
     guard_iou: Fraction = 0.02
     """A refinement that lowers the mean IoU of the masks by more than this is undone."""
     guard_psnr: NonNegative = 1.0
@@ -129,12 +133,14 @@ def merge_pair(
         mask_weight=w_mask,
         prune_opacity=0.0,
         prune_contribution=0.0,
+        max_scale=params.max_scale,
+        rates=params.rates,
     )
     trained = train(
         started,
         views,
         params=settings,
-        extent=box_diagonal(_surface(colliding)),
+        extent=extents(colliding),
         seed=int(ids[0]),
         label_ids=ids.tolist(),
     ).gaussians
@@ -213,12 +219,14 @@ def global_pass(
         mask_weight=params.global_mask_weight,
         prune_opacity=params.prune_opacity,
         prune_contribution=params.prune_contribution,
+        max_scale=params.max_scale,
+        rates=params.rates,
     )
     refined = train(
         scene,
         views,
         params=settings,
-        extent=box_diagonal(scene.means),
+        extent=extents(scene),
         seed=0,
         label_ids=ids.tolist(),
     ).gaussians

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Gaussians
-from ss_flow.tasks.ranges import Fraction, NonNegative, Range
-from ss_flow.tasks.splat.collisions import MergePlan, collision_matrix, group_box, match_pairs
+from ss_flow.tasks.artifacts import Float64, Gaussians
+from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.ranges import Fraction, NonNegative, Positive, Range
+from ss_flow.tasks.splat.collisions import MergePlan, collision_matrix, group_box, match_pairs, voxel_collisions
 
 
 @dataclass(frozen=True)
 class PlanParams:
     """When two groups of instances count as colliding."""
 
+    overlap: Literal["box", "voxel"] = "box"
+    """What two groups must share: "box", as in the paper, or "voxel", cubes of space, which tells what touches a floor
+    from what stands in the room."""
+    voxel: Positive = 2.5
+    """Side of these cubes, in median distances from a Gaussian to the nearest other: 5 cm where that is 2 cm."""
+    pairing: Literal["disjoint", "collision_free"] = "disjoint"
+    """Which pairs are merged side by side: "disjoint" ones, or only those no groups of which collide ("collision_free",
+    the paper's words taken literally; a floor then lets one pair through at a time)."""
     min_opacity: Fraction = 0.1
     """Fainter Gaussians do not widen the box of their group."""
     bbox_quantile: Annotated[float, Range(0.0, 0.5, open_above=True)] = 0.005
@@ -35,8 +44,7 @@ def plan(groups: tuple[Gaussians, ...], *, params: PlanParams, round: int) -> Me
     reaches everywhere; it stays by itself until the pass over the whole scene. Merging is over when the plan has no
     pairs.
     """
-    boxes = np.array([group_box(g, min_opacity=params.min_opacity, quantile=params.bbox_quantile) for g in groups])
-    collisions = collision_matrix([g.means for g in groups], boxes)
+    collisions = _collisions(groups, params)
     background = [i for i, g in enumerate(groups) if len(g) and not g.instance_id.any()]
     collisions[background, :] = collisions[:, background] = 0
     sizes = np.array([len(g) for g in groups], np.int32)
@@ -44,7 +52,9 @@ def plan(groups: tuple[Gaussians, ...], *, params: PlanParams, round: int) -> Me
     ids = np.array(
         [int(g.instance_id.min()) if len(g) else np.iinfo(np.int32).max - i for i, g in enumerate(groups)], np.int32
     )
-    pairs, scores = match_pairs(collisions, sizes, ids, min_score=params.min_score)
+    pairs, scores = match_pairs(
+        collisions, sizes, ids, min_score=params.min_score, collision_free=params.pairing == "collision_free"
+    )
     return MergePlan(
         pairs=pairs,
         scores=scores.astype(np.float32),
@@ -52,3 +62,12 @@ def plan(groups: tuple[Gaussians, ...], *, params: PlanParams, round: int) -> Me
         mask_weight=params.mask_weights[min(round, len(params.mask_weights) - 1)],
         collisions=collisions.astype(np.float32),
     )
+
+
+def _collisions(groups: tuple[Gaussians, ...], params: PlanParams) -> Float64:
+    if params.overlap == "voxel":
+        means = np.concatenate([g.means for g in groups])
+        side = params.voxel * (nearest_spacing(means) if len(means) > 1 else 1.0)
+        return voxel_collisions(groups, min_opacity=params.min_opacity, voxel=side)
+    boxes = np.array([group_box(g, min_opacity=params.min_opacity, quantile=params.bbox_quantile) for g in groups])
+    return collision_matrix([g.means for g in groups], boxes)

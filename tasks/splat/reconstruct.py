@@ -10,12 +10,13 @@ import numpy as np
 from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import REFINED, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks, Int32
+from ss_flow.tasks.gaussians.densification import Schedule
 from ss_flow.tasks.gaussians.initialise import initialise
-from ss_flow.tasks.gaussians.trainer import TrainParams, train
+from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
 from ss_flow.tasks.geometry.clustering import nearest_spacing
-from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
 from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
-from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, mask_of, training_view
+from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, dilated, mask_of, training_view
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class ReconstructParams:
     max_gaussians: Count = 30_000
     """Most Gaussians of an instance."""
     background_scale: Positive = 2.0
-    """Factor on both limits for the background."""
+    """Factor on steps, points and Gaussians for the background, which is the largest by far."""
     background: Literal["random", "black"] = "random"
     """Colour behind the Gaussians: "random" in each step, or "black" as in the paper."""
     ignore_occluded: bool = True
@@ -47,6 +48,8 @@ class ReconstructParams:
     densify: Literal["classic", "mcmc", "none"] = "classic"
     """How their number grows: "classic" clones and splits where the picture is still wrong (3DGS), "mcmc" moves faint
     Gaussians to where opaque ones are and grows by 5 % at a time (for many views), "none" leaves it."""
+    schedule: Schedule = Schedule()
+    """When "classic" clones and splits."""
     plateau: Fraction = 0.0
     """Training ends early when the loss falls by less than this share from one stretch of at least 100 steps to the
     next, twice in a row; 0 = never."""
@@ -54,12 +57,23 @@ class ReconstructParams:
     """Weight of the depth loss at the first step."""
     depth_weight_final: NonNegative = 0.01
     """Weight of the depth loss at the last step."""
+    max_scale: NonNegative = 0.1
+    """No Gaussian becomes longer (one standard deviation) than this share of the instance's box diagonal; 0 = any."""
+    rates: LearningRates = LearningRates()
+    """How fast each parameter is learnt."""
+    dilation: Natural = 0
+    """Pixels by which masks are dilated for the first training; 1 in the code of the paper's authors."""
     crop: CropParams = CropParams()
     """The part of each view that is rendered."""
 
-    def iterations(self, num_views: int) -> int:
-        """Training steps for an instance with that many views (spec row 22)."""
-        return int(np.clip(self.iterations_per_view * num_views, self.min_iterations, self.max_iterations))
+    def iterations(self, instance: InstanceMasks) -> int:
+        """Training steps for an instance, by the number of its views (spec row 22)."""
+        wanted = self.iterations_per_view * len(instance.view)
+        return round(self.scale_of(instance) * float(np.clip(wanted, self.min_iterations, self.max_iterations)))
+
+    def scale_of(self, instance: InstanceMasks) -> float:
+        """The factor on all that an instance is given."""
+        return self.background_scale if instance.instance_id == 0 else 1.0
 
 
 @task(
@@ -92,7 +106,7 @@ def reconstruct(
         return NO_GAUSSIANS
     initial = _from_points(instance, params)
     scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
-    return _trained(scene, instance, initial, params, params.iterations(len(instance.view)))
+    return _trained(scene, dilated(instance, params.dilation), initial, params, params.iterations(instance))
 
 
 @task(
@@ -122,13 +136,12 @@ def retrain(
         return gaussians
     initial = gaussians if params.warm_start and len(gaussians) else _from_points(instance, params)
     scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
-    steps = max(1, round(params.retrain_share * params.iterations(len(instance.view))))
+    steps = max(1, round(params.retrain_share * params.iterations(instance)))
     return _trained(scene, instance, initial, params, steps)
 
 
 def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussians:
-    scale = params.background_scale if instance.instance_id == 0 else 1
-    rows = thin(instance.points, round(params.max_points * scale))
+    rows = thin(instance.points, round(params.max_points * params.scale_of(instance)))
     return initialise(
         instance.points[rows],
         instance.colors[rows],
@@ -177,7 +190,7 @@ def _trained(
     result = train(
         initial,
         views,
-        params=_settings(params, iterations, fills_scene),
+        params=_settings(params, iterations, params.scale_of(instance)),
         extent=max(box_diagonal(surface), spacing),
         seed=instance.instance_id,
     )
@@ -187,15 +200,17 @@ def _trained(
     return result.gaussians
 
 
-def _settings(params: ReconstructParams, iterations: int, fills_scene: bool) -> TrainParams:
-    limit = params.max_gaussians * (params.background_scale if fills_scene else 1)
+def _settings(params: ReconstructParams, iterations: int, scale: float) -> TrainParams:
     return TrainParams(
         iterations=iterations,
         sh_degree=params.sh_degree,
         background=params.background,
         densify=params.densify,
+        schedule=params.schedule,
         plateau=params.plateau,
-        max_gaussians=round(limit),
+        max_gaussians=round(params.max_gaussians * scale),
         depth_weight_start=params.depth_weight_start,
         depth_weight_final=params.depth_weight_final,
+        max_scale=params.max_scale,
+        rates=params.rates,
     )

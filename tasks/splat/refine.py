@@ -10,16 +10,16 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import DRAWN, REFINED, Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.artifacts import REFINED, Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
-from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Positive
 from ss_flow.tasks.splat.groups import box_diagonal, rasterizer, scene_views
-from ss_flow.tasks.splat.views import CropParams, SceneViews, crop_camera, mask_of, sample_depth
+from ss_flow.tasks.splat.views import CropParams, SceneViews, crop_camera, grown, mask_of, sample_depth
 
 Prompt = Callable[[Float32], tuple[Bool, float]]
 """Points [n, 2] in pixels of a photo -> the segmenter's mask and its score."""
@@ -45,6 +45,8 @@ class RefineParams:
     """Gaussians longer than this share of the instance's box diagonal are not rendered."""
     tau_iou: Fraction = 0.5
     """IoU with the rendered mask from which a mask is added to a view that had none; 0.95 in the paper."""
+    dilation: Natural = 0
+    """Pixels by which new masks of the segmenter are dilated; 1 in the code of the paper's authors."""
     min_support: Fraction = 0.7
     """Without a segmenter: share of the rendered mask that the view's depth must confirm for it to be added."""
     min_views: Count = 2
@@ -88,8 +90,8 @@ def refine(
     `tau_iou`.
 
     model: the segmenter; embeddings: its embeddings of all views, none without a segmenter. Without one (None) no mask
-    is replaced but those drawn from points; where one is missing or drawn, M^gs itself is taken when the view's depth
-    confirms at least `min_support` of it. New masks are marked as REFINED in `prompted`. The background (id 0) and an
+    is replaced; where one is missing, M^gs itself is taken when the view's depth confirms at least `min_support` of it.
+    New masks are marked as REFINED in `prompted`. The background (id 0) and an
     instance without Gaussians come back as they are.
     """
     if instance.instance_id == 0 or not len(gaussians):
@@ -102,9 +104,7 @@ def refine(
     for view, frame in enumerate(frames):
         old = mask_of(instance, held[view]) if view in held else None
         prompt = functools.partial(segmenter.predict_prompt, embeddings[view]) if segmenter else None
-        # A mask drawn from the points is worth less than one rendered from the Gaussians that grew out of them.
-        stays = old if segmenter or view not in held or instance.prompted[held[view]] != DRAWN else None
-        new = _replacement(scene, view, solid, stays, params, prompt)
+        new = _replacement(scene, view, solid, old, params, prompt)
         if new is not None:
             views.append(view)
             masks.append(np.packbits(new))
@@ -189,6 +189,7 @@ def _replacement(
     places = np.stack([column, row], axis=-1) + 0.5
     taken = greedy_farthest(places, params.prompts, alpha=params.prompt_alpha, drop_hull=params.drop_hull)
     candidate, _ = prompt(places[taken])
+    candidate = grown(candidate, params.dilation)
     agreement = iou(candidate, rendered.mask)
     if old is None:
         return candidate if agreement > params.tau_iou else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +11,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, InstanceMasks, Int32
 from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view
 from ss_flow.tasks.geometry.fusion import depth_at
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, pack_masks
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 from ss_flow.tasks.ranges import Count, Natural
 
@@ -58,6 +58,21 @@ def mask_of(instance: InstanceMasks, row: int) -> Bool:
     """The mask of `instance.view[row]`: [H, W]."""
     bits = np.unpackbits(instance.packed[row], count=instance.height * instance.width)
     return bits.reshape(instance.height, instance.width).astype(bool)
+
+
+def dilated(instance: InstanceMasks, pixels: int) -> InstanceMasks:
+    """The same with masks that reach so many pixels farther on all sides."""
+    if not pixels:
+        return instance
+    masks = [grown(mask, pixels) for mask in instance.dense()]
+    return replace(instance, packed=pack_masks(np.array(masks, bool).reshape(-1, instance.height, instance.width)))
+
+
+def grown(mask: Bool, pixels: int) -> Bool:
+    """A mask [H, W] with all within so many pixels of it, diagonals included."""
+    import cv2
+
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0
 
 
 def sample_depth(depth: DepthMap, full: Camera, crop: Camera) -> Float32:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from tiny_runs import run_tiny, ss_flow, write_room
 
+from ss_flow.cache.store import Store
 from ss_flow.flows.generated import RoomParams
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.deliver.ply import read_columns
@@ -95,7 +96,7 @@ def test_run_json_holds_what_was_asked_what_was_done_and_what_was_measured(tiny)
         "encoder": "colour words (no network)",
         "monodepth": None,
     }
-    assert set(document["metrics"]) == {"split", "splat"}
+    assert set(document["metrics"]) == {"split", "refined", "splat"}
     assert document["metrics"]["split"]["miou"] > 0.9
     nodes = document["nodes"]
     assert {"step", "item", "key", "outputs", "hit", "seconds", "peak_rss_mb"} <= nodes[0].keys()
@@ -211,6 +212,23 @@ def test_when_one_instance_fails_the_others_are_delivered_and_the_run_is_degrade
     mended = run_tiny(tiny.scene, tmp_path / "store", out=tmp_path / "out")
     assert (mended.code, mended.document()["status"]) == (0, "ok")
     assert mended.results() == tiny.called.results()
+
+
+def test_a_pair_and_a_last_pass_that_fail_leave_the_union_and_the_run_is_degraded(warm, monkeypatch):
+    def fail(*_, **__):
+        raise ArithmeticError("diverged")
+
+    monkeypatch.setattr("ss_flow.tasks.splat.merge.train", fail)
+    all_collide = ["--set", "plan.overlap=voxel", "--set", "plan.voxel=20", "--set", "merge.rates.color=0.02"]
+    called = run_tiny(warm.scene, warm.store, *all_collide, out=warm.out)
+    assert called.code == 3, called.err
+    document = called.document()
+    failed = {failure["label"].partition("[")[0] for failure in document["failures"]}
+    assert failed == {"splat.merge_pair", "splat.global_pass"}
+    scene = Store(warm.store).get(document["results"]["scene"])
+    groups = [Store(warm.store).get(digest) for digest in warm.called.results()["merge"]]
+    assert {*scene.instance_id.tolist()} == {i for group in groups for i in group.instance_id.tolist()}
+    assert (warm.out / "scene.ply").exists()
 
 
 def test_when_a_step_that_all_need_fails_the_run_fails_and_the_earlier_result_stays(warm, monkeypatch):

@@ -10,7 +10,7 @@ import ss_flow_toy as toy
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
-from ss_flow.graph import Flow, each, gather
+from ss_flow.graph import Flow, each, gather, otherwise
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
 
@@ -135,6 +135,35 @@ def test_when_every_item_failed_the_list_failed(store):
         return {"total": toy.total(each(toy.source(values=(-4.0, -1.0)), build=toy.half, on_error="skip"))}
 
     assert isinstance(run(store, build).values["total"], Failure)
+
+
+def test_what_stands_in_for_a_failed_node_is_computed_only_where_it_failed(store):
+    def build():
+        good, bad = (toy.source(values=(v,))[0] for v in (4.0, -1.0))
+        spare = toy.source(values=(9.0,))[0]
+        return {
+            "good": otherwise(toy.half(good), lambda: toy.square(spare)),
+            "bad": otherwise(toy.half(bad), lambda: toy.square(spare)),
+        }
+
+    report = run(store, build)
+    assert [value(store, report.values[name]) for name in ("good", "bad")] == [2.0, 81.0]
+    assert [failure.label for failure in report.failures] == ["ss_flow_toy.half"]
+    assert sum(node["step"] == "ss_flow_toy.square" for node in report.nodes) == 1
+
+
+def test_a_dry_run_replaces_nothing_and_leaves_nothing_out(store):
+    def build():
+        known = toy.half(toy.source(values=(4.0,))[0])
+        both = each(toy.source(values=(4.0, 6.0)), build=toy.half, on_error="skip")
+        return {"known": known, "total": toy.total(both), "spared": otherwise(toy.half(known), lambda: known)}
+
+    run(store, lambda: {"known": build()["known"], "source": toy.source(values=(4.0, 6.0))})
+    report = run(store, build, dry=True)
+    would = [node["label"] for node in report.nodes if node["event"] == "would run"]
+    assert would == ["ss_flow_toy.half", "ss_flow_toy.half[1]"]
+    assert isinstance(report.values["total"], Failure)
+    assert isinstance(report.values["spared"], Failure)
 
 
 def test_an_isolated_task_runs_in_a_process_of_its_own(store):

@@ -14,7 +14,14 @@ from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.mcmc import divide
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import TrainingDiverged, TrainParams, TrainView, auto_iterations, train
+from ss_flow.tasks.gaussians.trainer import (
+    LearningRates,
+    TrainingDiverged,
+    TrainParams,
+    TrainView,
+    auto_iterations,
+    train,
+)
 from ss_flow.tasks.geometry.cameras import Camera
 
 SIZE = 48
@@ -131,7 +138,9 @@ def test_bad_input_is_refused():
 
 def test_a_training_that_blows_up_says_so():
     with pytest.raises(TrainingDiverged, match="diverged"):
-        train(ball_points(), VIEWS, params=TrainParams(iterations=60, scale_lr=1e38), extent=1.6, seed=0)
+        train(
+            ball_points(), VIEWS, params=TrainParams(iterations=60, rates=LearningRates(scale=1e38)), extent=1.6, seed=0
+        )
 
 
 def test_iterations_follow_the_number_of_views():
@@ -169,7 +178,7 @@ def test_the_gradient_record_averages_over_the_views_that_saw():
 
 
 def test_a_long_training_densifies_as_3dgs_does():
-    assert Schedule.of(30_000) == Schedule(500, 15_000, 100, 3_000)
+    assert Schedule().of(30_000) == Schedule(500, 15_000, 100, 3_000)
 
 
 def test_initial_scales_are_the_root_mean_square_of_three_neighbours():

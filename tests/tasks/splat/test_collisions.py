@@ -147,3 +147,49 @@ def test_a_group_without_gaussians_collides_with_nothing():
 def test_pairs_below_the_least_score_stay_apart():
     a, b, *_ = table_cup_book_floor_lamp().values()
     assert not len(plan((a, b), params=PlanParams(bbox_quantile=0, min_score=0.95), round=0).pairs)
+
+
+def test_taken_literally_a_pair_waits_while_it_collides_with_another():
+    collisions = np.zeros((5, 5))
+    collisions[0, 1], collisions[1, 2], collisions[2, 3] = 0.9, 0.2, 0.8
+    sizes, ids = np.full(5, 10), np.arange(5)
+    assert match_pairs(collisions, sizes, ids)[0].tolist() == [[0, 1], [2, 3]]
+    assert match_pairs(collisions, sizes, ids, collision_free=True)[0].tolist() == [[0, 1]]
+    collisions[1, 2] = 0
+    assert match_pairs(collisions, sizes, ids, collision_free=True)[0].tolist() == [[0, 1], [2, 3]]
+
+
+def test_cubes_tell_what_touches_a_floor_from_what_hangs_over_a_step_of_it():
+    side = np.arange(0, 2, 0.02)
+    plane = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    low, high = plane[plane[:, 0] < 1], plane[plane[:, 0] >= 1]
+    steps = np.concatenate([np.c_[low, np.zeros(len(low))], np.c_[high, np.ones(len(high))]])
+    standing, hanging = (np.array([[0.5, 0.5, z], [0.52, 0.5, z]]) for z in (0.04, 0.5))
+    groups = (group(steps, 1), group(standing, 2), group(hanging, 3))
+    boxes = plan(groups, params=EXACT, round=0).collisions
+    assert boxes[1, 0] == boxes[2, 0] == 1
+    cubes = plan(groups, params=PlanParams(overlap="voxel"), round=0).collisions
+    assert cubes[1, 0] == 1 and cubes[0, 1] > 0 and not cubes[2].any() and not cubes[:, 2].any()
+
+
+def merged_to_the_end(groups: list[Gaussians], params: PlanParams) -> tuple[set[frozenset[int]], int]:
+    """Which instances end in one group, and after how many rounds."""
+    for rounds in range(len(groups) + 1):
+        found = plan(tuple(groups), params=params, round=rounds)
+        if not len(found.pairs):
+            return {frozenset(g.instance_id.tolist()) for g in groups}, rounds
+        groups = [union(groups[a], groups[b]) for a, b in found.pairs] + [groups[i] for i in found.singles]
+    raise AssertionError("merging does not end")
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.sampled_from(["box", "voxel"]), st.booleans())
+def test_merging_ends_and_the_order_of_the_instances_does_not_matter(seed, count, overlap, literal):
+    rng = np.random.default_rng(seed)
+    params = PlanParams(overlap=overlap, pairing="collision_free" if literal else "disjoint")
+    corners = rng.random((count, 3)) * 3
+    groups = [
+        group(corner + rng.random((rng.integers(1, 12), 3)), i + 1) for i, corner in enumerate(corners)
+    ]  # fmt: skip
+    ends, rounds = merged_to_the_end(groups, params)
+    assert rounds < max(count, 1)
+    assert merged_to_the_end([groups[i] for i in rng.permutation(count)], params) == (ends, rounds)

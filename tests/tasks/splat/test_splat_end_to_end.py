@@ -14,10 +14,12 @@ from ss_flow.tasks.gaussians.initialise import concatenate, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.splat import merge as module
+from ss_flow.tasks.splat.groups import box_diagonal, extents
 from ss_flow.tasks.splat.merge import MergeParams, assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
 from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
 from ss_flow.tasks.splat.refine import iou
+from ss_flow.tasks.splat.render_masks import render_masks
 
 TRAIN = ReconstructParams(min_iterations=300, max_iterations=300, max_points=900)
 MERGE = MergeParams(min_iterations=300, max_iterations=300, global_iterations=200)
@@ -157,3 +159,32 @@ def test_thinning_keeps_points_spread_over_the_whole_surface():
     assert 250 < len(rows) <= 500 and (np.diff(rows) > 0).all()
     cells = np.histogram2d(*points[rows, :2].T, bins=5, range=[[0, 1], [0, 1]])[0]
     assert cells.min() > 5
+
+
+def test_the_merged_scene_draws_the_masks_it_was_trained_with(built, whole):
+    found = render_masks(built.scene.cameras, whole, built.scene.maps)
+    for mine, truth in zip(found, built.scene.maps, strict=True):
+        assert mine.name == truth.name and mine.ids.dtype == np.uint16
+        assert all(iou(mine.ids == i, truth.ids == i) > 0.9 for i in (0, 1, 2) if (truth.ids == i).sum() > 100)
+
+
+def test_an_instance_without_gaussians_keeps_its_masks_where_the_scene_shows_background(built, whole):
+    without = select(whole, whole.instance_id != 2)
+    found = render_masks(built.scene.cameras, without, built.scene.maps)
+    for mine, truth in zip(found, built.scene.maps, strict=True):
+        np.testing.assert_array_equal(mine.ids == 2, (truth.ids == 2) & (mine.ids != 1))
+    assert not any((m.ids == 9).any() for m in render_masks(built.scene.cameras, whole, built.scene.maps))
+
+
+def test_no_gaussian_outgrows_its_instance(built):
+    for limit in (0.1, 0.02):
+        small = reconstruct(*built.views, built.scene.instance(1), params=replace(TRAIN, max_scale=limit))
+        points = built.scene.instance(1).points
+        assert np.exp(small.log_scales).max() <= limit * box_diagonal(points) * (1 + 1e-5)
+
+
+def test_each_instance_of_a_pair_moves_at_the_pace_of_its_own_size(built):
+    sizes = extents(concatenate([built.box, built.ball]))
+    assert np.unique(sizes).size == 2
+    assert sizes[0] == pytest.approx(box_diagonal(built.box.means))
+    assert sizes[-1] == pytest.approx(box_diagonal(built.ball.means))

@@ -1,0 +1,368 @@
+"""What Splat comes to on generated rooms and on captures, as tables: against plain 3DGS, against Split, and object by
+object.
+
+    python tests/bench/bench_splat.py room:10 room:50 CAPTURE [--presets default fast paper] [--set STEP.PARAM=VALUE]
+                                      [--jobs 1 2] [--plain] [--seed 0] [--look DIR] [--store DIR]
+
+room:N is a generated room of N objects with degraded masks. A line for each scene, preset and number of jobs: held-out
+PSNR and SSIM; mIoU of the masks after Split, after refinement, and as the merged scene renders them; dark fringes,
+floaters and what taking an object away changes elsewhere (of the mean and of the worst object); seconds, and instances
+a minute. --plain trains plain 3DGS from the same points to the same number of Gaussians: for as many steps as all of
+Splat's trainings took together, or for as many as their crops make whole photos; with our learning rates and 3DGS's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ss_flow.cache.store import Store
+from ss_flow.engine import Report, run_flow
+from ss_flow.flows import settings
+from ss_flow.flows.capture import capture
+from ss_flow.flows.cli.context import file_digests
+from ss_flow.flows.cli.prepare import RunOptions, prepare
+from ss_flow.flows.generated import RoomParams, generate, write_scene
+from ss_flow.flows.params import Params
+from ss_flow.running import Surroundings, running
+from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import REFINED, Cameras, DepthMap, Frame, Gaussians, InstanceMasks, LabelMap
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.evaluate.novel_view import psnr, ssim, to_8bit
+from ss_flow.tasks.evaluate.objects import change_elsewhere, floaters, fringe_share
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, TrainView, train
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
+from ss_flow.tasks.splat.groups import box_diagonal
+from ss_flow.tasks.splat.reconstruct import thin
+from ss_flow.tasks.splat.views import CropParams, crop_camera, mask_of
+
+SIZES = {10: (24, 320, 240), 50: (36, 480, 360), 200: (60, 640, 480)}
+"""Views, width and height of a room with so many objects."""
+SPLIT_STEP = "masks_split"
+RATES_OF_3DGS = LearningRates(1.6e-4, 1.6e-6, 2.5e-3, 0.05, 5e-3, 1e-3)
+MAGENTA = (1.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A finished run, read back."""
+
+    frames: list[Frame]
+    cameras: Cameras
+    depths: list[DepthMap]
+    instances: list[InstanceMasks]
+    """After refinement."""
+    split: list[InstanceMasks]
+    masks: list[LabelMap]
+    scene: Gaussians
+    metrics: dict[str, dict[str, float]]
+    held_out: tuple[list[Frame], Cameras] | None
+    report: Report
+    split_seconds: float
+    splat_seconds: float
+
+
+def folder_of(scene: str, seed: int, place: Path) -> Path:
+    """The capture that is meant; a room is written first."""
+    if not scene.startswith("room:"):
+        return Path(scene)
+    objects = int(scene.removeprefix("room:"))
+    views, width, height = SIZES[objects]
+    folder = place / f"room-{objects}-{seed}"
+    if not folder.exists():
+        room = generate(RoomParams(objects=objects, views=views, width=width, height=height, seed=seed))
+        write_scene(room, folder, masks="degraded", seed=seed)
+    return folder
+
+
+def outcome(folder: Path, params: Params, jobs: int, store: Store) -> Outcome:
+    """Run Split, then the rest, and read what came of it."""
+    reports, seconds = [], []
+    for until in (SPLIT_STEP, None):
+        options = RunOptions(until=until)
+        prepared = prepare(open_scene(folder), params, options, file_digests(store))
+        begun = time.perf_counter()
+        reports.append(run_flow(prepared.build, store, scene=prepared.name, header={}, until=options.target, jobs=jobs))
+        seconds.append(time.perf_counter() - begun)
+    values: dict[str, Any] = reports[1].values
+
+    def many(name: str) -> list[Any]:
+        return [store.get(digest) for digest in values[name]]
+
+    metrics = {
+        name: store.get(values[name]).values
+        for name in ("metrics_split", "metrics_refined", "metrics_splat", "novel_view")
+        if isinstance(values.get(name), str)
+    }
+    return Outcome(
+        many("ingest"), store.get(values["cameras"]), many("depth"), many("refine"), many("reproject"),
+        many("masks_refined"), store.get(values["scene"]), metrics, held_out_of(folder, params, store), reports[1],
+        *seconds,
+    )  # fmt: skip
+
+
+def held_out_of(folder: Path, params: Params, store: Store) -> tuple[list[Frame], Cameras] | None:
+    """The views kept back, as the run read them."""
+    place = folder / "held_out"
+    if not place.is_dir():
+        return None
+    digests = file_digests(store)
+
+    def build() -> dict[str, Any]:
+        nodes = capture(open_scene(place), lambda p: FileRef(p.absolute(), digests(p)), params.capture, None)
+        return {"frames": nodes.frames, "cameras": nodes.cameras}
+
+    values = run_flow(build, store, scene=str(place), header={}).values
+    return [store.get(d) for d in values["frames"]], store.get(values["cameras"])
+
+
+def cell(metrics: dict[str, dict[str, float]], group: str, name: str, scale: float = 100, digits: int = 1) -> str:
+    """A figure, "-" where it was not measured."""
+    return f"{scale * metrics[group][name]:.{digits}f}" if name in metrics.get(group, {}) else "-"
+
+
+def plain(found: Outcome, params: Params, steps: int, rates: LearningRates) -> tuple[Gaussians, float]:
+    """Plain 3DGS from the points that Splat starts from, to as many Gaussians as Splat came to; and seconds."""
+    settings_ = params.splat.reconstruct
+    starts = []
+    for instance in found.split:
+        if len(instance.points) and not instance.weak:
+            rows = thin(instance.points, round(settings_.max_points * settings_.scale_of(instance)))
+            starts.append(initialise(instance.points[rows], instance.colors[rows], 0, 1.0))
+    start = concatenate(starts)
+    views = []
+    for index, frame in enumerate(found.frames):
+        inside = decode_valid(frame)
+        image = decode_rgb(frame).astype(np.float32) / 255
+        camera = camera_of(found.cameras, index)
+        views.append(TrainView(camera, image, inside, np.zeros_like(inside), full_depth(found.depths[index], camera)))
+    most = len(found.scene)
+    if len(start) > most:
+        start = select(start, np.linspace(0, len(start) - 1, most).astype(int))
+    begun = time.perf_counter()
+    with running(Surroundings(cores=2)):
+        result = train(
+            start,
+            views,
+            params=TrainParams(
+                iterations=steps, sh_degree=params.splat.merge.sh_degree, max_gaussians=most, rates=rates
+            ),
+            extent=box_diagonal(start.means),
+            seed=0,
+        )
+    return result.gaussians, time.perf_counter() - begun
+
+
+def quality(scene: Gaussians, frames: list[Frame], cameras: Cameras) -> tuple[float, float]:
+    """Mean PSNR and SSIM over views."""
+    values = []
+    for view, frame in enumerate(frames):
+        image, photo, valid = (
+            to_8bit(render(scene, camera_of(cameras, view)).rgb),
+            decode_rgb(frame),
+            decode_valid(frame),
+        )
+        values.append((psnr(image, photo, valid), ssim(image, photo, valid)))
+    mean = np.mean(values, axis=0)
+    return float(mean[0]), float(mean[1])
+
+
+def full_depth(depth: DepthMap, camera: Any) -> np.ndarray:
+    import cv2
+
+    return cv2.resize(depth.depth, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+
+
+def total_steps(found: Outcome, params: Params) -> tuple[int, int]:
+    """Steps of all trainings of a run, and how many whole photos their crops make up.
+
+    A pair's steps count as if it were seen in all views, its crops as large as the mean of the instances'.
+    """
+    of, merge = params.splat.reconstruct, params.splat.merge
+    steps, photos, shares = 0, 0.0, []
+    for before, after in zip(found.split, found.instances, strict=True):
+        if before.weak or not len(before.view):
+            continue
+        share = float(np.mean([crop_share(found.cameras, before, row, of.crop) for row in range(len(before.view))]))
+        count = of.iterations(before)
+        if (after.prompted == REFINED).any():
+            count += max(1, round(of.retrain_share * of.iterations(after)))
+        steps, photos = steps + count, photos + share * count
+        shares.append(share)
+    pairs = sum(n["event"] in ("hit", "finished") and n["step"] == "splat.merge_pair" for n in found.report.nodes)
+    in_pairs = pairs * merge.iterations(len(found.frames))
+    together = merge.global_iterations
+    return steps + in_pairs + together, round(photos + np.mean(shares) * in_pairs + together)
+
+
+def crop_share(cameras: Cameras, instance: InstanceMasks, row: int, crop: CropParams) -> float:
+    """How much of a photo's pixels are rendered to train on one view of an instance."""
+    full = camera_of(cameras, int(instance.view[row]))
+    camera = crop_camera(full, mask_of(instance, row), instance.points, crop)
+    return camera.width * camera.height / (full.width * full.height)
+
+
+@dataclass(frozen=True)
+class Cleanliness:
+    """Of one object."""
+
+    instance_id: int
+    fringe: float
+    """Share of the object's pixels."""
+    floaters: float
+    """Share of its Gaussians."""
+    elsewhere: float
+    """What taking it away changes outside its masks, 0..1."""
+
+
+def cleanliness(found: Outcome) -> Iterator[Cleanliness]:
+    """Of every object of the merged scene, over the views that have a mask of it."""
+    for instance in found.instances:
+        own = select(found.scene, found.scene.instance_id == instance.instance_id)
+        if instance.instance_id == 0 or not len(own):
+            continue
+        dark = shown = 0
+        changes = []
+        for view in instance.view.tolist():
+            camera = camera_of(found.cameras, view)
+            fringe, pixels = fringe_share(own, camera)
+            dark, shown = dark + fringe, shown + pixels
+            mask = found.masks[view].ids == instance.instance_id
+            changes.append(change_elsewhere(found.scene, instance.instance_id, camera, mask))
+        points = instance.points
+        yield Cleanliness(
+            instance.instance_id,
+            dark / max(shown, 1),
+            float(floaters(own, points).mean()),
+            float(np.mean(changes or [0])),
+        )
+
+
+def look(found: Outcome, plainly: Gaussians | None, place: Path) -> None:
+    """Pictures to look at: photo, merged scene, plain scene, ids; and every object alone before magenta."""
+    import cv2
+
+    place.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for view in np.linspace(0, len(found.frames) - 1, 4).astype(int):
+        camera = camera_of(found.cameras, view)
+        row = [decode_rgb(found.frames[view])]
+        row += [picture(render(s, camera).rgb) for s in (found.scene, plainly) if s is not None]
+        row.append(np.random.default_rng(3).integers(0, 255, (65536, 3), np.uint8)[found.masks[view].ids])
+        rows.append(np.hstack(row))
+    (place / "scene.png").write_bytes(encode_png(np.vstack(rows)).tobytes())
+    tiles = []
+    for instance in found.instances:
+        own = select(found.scene, found.scene.instance_id == instance.instance_id)
+        if instance.instance_id and len(own) and len(instance.view):
+            largest = int(instance.view[instance.dense().sum(axis=(1, 2)).argmax()])
+            mask = instance.dense()[list(instance.view).index(largest)]
+            y, x = np.nonzero(mask)
+            margin = 20
+            box = np.s_[max(0, y.min() - margin) : y.max() + margin, max(0, x.min() - margin) : x.max() + margin]
+            both = [decode_rgb(found.frames[largest])[box]]
+            both.append(picture(render(own, camera_of(found.cameras, largest), background=MAGENTA).rgb)[box])
+            tiles.append(np.hstack([cv2.resize(tile, (240, 240)) for tile in both]))
+    across = 4
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % across)
+    sheet = np.vstack([np.hstack(tiles[i : i + across]) for i in range(0, len(tiles), across)])
+    (place / "objects.png").write_bytes(encode_png(sheet).tobytes())
+
+
+def picture(rgb: np.ndarray) -> np.ndarray:
+    return np.round(255 * np.clip(rgb, 0, 1)).astype(np.uint8)
+
+
+def seconds_by_step(report: Report) -> dict[str, tuple[int, float]]:
+    """How often each step of Splat ran, and its seconds in all."""
+    found: dict[str, list[float]] = defaultdict(list)
+    for node in report.nodes:
+        if node["event"] in ("hit", "finished") and node["step"].startswith("splat."):
+            found[node["step"]].append(node["seconds"])
+    return {step: (len(values), sum(values)) for step, values in found.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+")
+    parser.add_argument("--presets", nargs="+", default=["default"])
+    parser.add_argument("--set", nargs="*", default=[])
+    parser.add_argument("--jobs", type=int, nargs="+", default=[2])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--plain", nargs="*", choices=["steps", "photos"], default=[])
+    parser.add_argument("--objects", action="store_true", help="a line for every object")
+    parser.add_argument("--look", type=Path, help="a folder for pictures")
+    parser.add_argument("--store", type=Path, help="a store to keep; each line computes anew otherwise")
+    args = parser.parse_args()
+    print("| scene | preset | jobs | PSNR | SSIM | mIoU Split | refined | rendered | PQ rendered | fringe % | worst |"
+          " floaters % | elsewhere /255 | worst | Gaussians | rounds | Split s | Splat s | objects/min |")  # fmt: skip
+    print("|---" * 19 + "|")
+    with tempfile.TemporaryDirectory() as temporary:
+        for scene in args.scenes:
+            folder = folder_of(scene, args.seed, Path(args.store or temporary))
+            for preset in args.presets:
+                for jobs in args.jobs:
+                    with tempfile.TemporaryDirectory() as own:
+                        told(folder, preset, jobs, Store(args.store or Path(own)), args)
+
+
+def told(folder: Path, preset: str, jobs: int, store: Store, args: argparse.Namespace) -> None:
+    """Run, measure, print a line."""
+    params = settings.apply(settings.preset(Params(), preset), args.set)
+    known = replace(params.evaluate, zero_is_void=not folder.name.startswith("room-"))
+    found = outcome(folder, replace(params, evaluate=known), jobs, store)
+    clean = list(cleanliness(found))
+    metrics = found.metrics
+    steps = seconds_by_step(found.report)
+    rounds = steps.get("splat.plan", (1, 0))[0] - 1
+    objects = len(clean)
+    of = {name: [getattr(c, name) for c in clean] or [0.0] for name in ("fringe", "floaters", "elsewhere")}
+    print(
+        f"| {folder.name} | {preset} | {jobs} | {cell(metrics, 'novel_view', 'psnr', 1, 2)} | "
+        f"{cell(metrics, 'novel_view', 'ssim', 1, 3)} | {cell(metrics, 'metrics_split', 'miou')} | "
+        f"{cell(metrics, 'metrics_refined', 'miou')} | {cell(metrics, 'metrics_splat', 'miou')} | "
+        f"{cell(metrics, 'metrics_splat', 'pq')} | {100 * np.mean(of['fringe']):.2f} | {100 * max(of['fringe']):.2f} | "
+        f"{100 * np.mean(of['floaters']):.2f} | {255 * np.mean(of['elsewhere']):.3f} | "
+        f"{255 * max(of['elsewhere']):.3f} | {len(found.scene)} | {rounds} | {found.split_seconds:.0f} | "
+        f"{found.splat_seconds:.0f} | {60 * objects / max(found.splat_seconds, 1e-9):.1f} |",
+        flush=True,
+    )
+    print("  " + ", ".join(f"{step} {n} x {s / n:.1f} s" for step, (n, s) in steps.items()), file=sys.stderr)
+    peak = max(n["peak_rss_mb"] for n in found.report.nodes if "peak_rss_mb" in n)
+    print(f"  load {os.getloadavg()[0]:.1f}, peak {peak:.0f} MB", file=sys.stderr)
+    if args.objects:
+        for c in clean:
+            print(f"  {c.instance_id}: fringe {100 * c.fringe:.2f} %, floaters {100 * c.floaters:.2f} %, "
+                  f"elsewhere {255 * c.elsewhere:.3f}", file=sys.stderr)  # fmt: skip
+    scene = None
+    if args.plain:
+        kept_back = found.held_out or (found.frames, found.cameras)
+        merged = quality(found.scene, *kept_back)
+        print(f"  merged: PSNR {merged[0]:.2f}, SSIM {merged[1]:.3f}", flush=True)
+        for what in args.plain:
+            steps = total_steps(found, params)[what == "photos"]
+            for whose, rates in (("our", LearningRates()), ("3DGS's", RATES_OF_3DGS)):
+                scene, seconds = plain(found, params, steps, rates)
+                found_quality = quality(scene, *kept_back)
+                print(f"  plain 3DGS, as many {what}, {whose} rates: {steps} steps, {len(scene)} Gaussians, "
+                      f"{seconds:.0f} s, PSNR {found_quality[0]:.2f}, SSIM {found_quality[1]:.3f}",
+                      flush=True)  # fmt: skip
+    if args.look:
+        look(found, scene, args.look / f"{folder.name}-{preset}")
+
+
+if __name__ == "__main__":
+    main()
