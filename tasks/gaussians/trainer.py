@@ -68,6 +68,11 @@ class LearningRates:
     """Of the quaternions."""
 
 
+SLOW_RATES = LearningRates(position=1.6e-4, position_final=1.6e-6, scale=5e-3, rotation=1e-3)
+"""For trainings of thousands of steps, and where centres must not leave a surface without texture: 3DGS's but for the
+colours."""
+
+
 @dataclass(frozen=True)
 class TrainParams:
     """How to train."""

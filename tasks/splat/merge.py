@@ -32,7 +32,7 @@ class MergeParams:
     """Fewest steps of a pair."""
     max_iterations: Count = 150
     """Most steps of a pair."""
-    global_iterations: Natural = 1000
+    global_iterations: Natural = 2000
     """Steps of the last pass over the whole scene; 0 leaves it out."""
     global_mask_weight: NonNegative = 0.25
     """w_mask of the last pass."""
@@ -52,7 +52,7 @@ class MergeParams:
     """Whether only what is inside the box of the smaller group is refined; False refines both groups whole."""
     collision_margin: NonNegative = 0.05
     """By how much that box is widened on every side, as a share of its diagonal."""
-    max_scale: NonNegative = 0.1
+    max_scale: NonNegative = 0.05
     """No Gaussian becomes longer (one standard deviation) than this share of its instance's box diagonal; 0 = any."""
     rates: LearningRates = LearningRates()
     """How fast each parameter is learnt."""

@@ -23,11 +23,11 @@ from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, dila
 class ReconstructParams:
     """How an instance is trained."""
 
-    iterations_per_view: Count = 12
+    iterations_per_view: Count = 8
     """Training steps for each view of the instance, within the two limits below."""
-    min_iterations: Count = 300
+    min_iterations: Count = 200
     """Fewest steps."""
-    max_iterations: Count = 600
+    max_iterations: Count = 400
     """Most steps."""
     retrain_share: NonNegative = 0.3
     """Steps of training after refinement, as a share of the first training's."""
@@ -57,7 +57,7 @@ class ReconstructParams:
     """Weight of the depth loss at the first step."""
     depth_weight_final: NonNegative = 0.01
     """Weight of the depth loss at the last step."""
-    max_scale: NonNegative = 0.1
+    max_scale: NonNegative = 0.05
     """No Gaussian becomes longer (one standard deviation) than this share of the instance's box diagonal; 0 = any."""
     rates: LearningRates = LearningRates()
     """How fast each parameter is learnt."""

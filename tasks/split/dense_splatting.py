@@ -11,7 +11,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud
 from ss_flow.tasks.gaussians.initialise import SH_ZERO, initialise
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, TrainView, train
+from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, TrainView, train
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.fusion import VoxelSums, sum_by_voxel
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
@@ -23,9 +23,6 @@ from ss_flow.tasks.split.dense import DenseParams, consistent_cloud, depth_sampl
 _WIDTH = 0.25
 """Of the first Gaussians, in distances to their neighbours. Wider ones reach out in front of a surface that is seen at
 an angle, and the depth loss, which knows their centres only, pushes them behind it."""
-
-_SLOW = LearningRates(position=1.6e-4, position_final=1.6e-6, scale=5e-3, rotation=1e-3)
-"""As 3DGS learns: at a higher pace, centres leave their surface where that has no texture."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ def dense_splatting(
             depth_weight_start=splatting.depth_weight_start,
             depth_weight_final=splatting.depth_weight_final,
             max_gaussians=splatting.max_gaussians,
-            rates=_SLOW,
+            rates=SLOW_RATES,
         ),
         extent=max(box_diagonal(initial.means), voxel),
         seed=0,

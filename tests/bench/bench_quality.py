@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,7 @@ from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.evaluate.novel_view import psnr, ssim, to_8bit
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import TrainParams, TrainView, train
+from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, TrainView, train
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.models.catalogue import blake3_of
@@ -92,9 +91,13 @@ def main() -> None:
     for strategy in args.densify:
         for iterations in args.iterations:
             params = TrainParams(
-                iterations=iterations, sh_degree=args.sh_degree, densify=strategy, max_gaussians=args.most
+                iterations=iterations,
+                sh_degree=args.sh_degree,
+                densify=strategy,
+                max_gaussians=args.most,
+                plateau=args.plateau,
+                rates=SLOW_RATES,
             )
-            params = replace(params, plateau=args.plateau)
             start = time.perf_counter()
             with running(Surroundings(cores=args.cores)):
                 result = train(initial, training, params=params, extent=box_diagonal(cloud.points), seed=0)

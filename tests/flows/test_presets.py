@@ -96,9 +96,9 @@ TABLE = {
     "split.reproject.min_views": (2, 2, 2),
     "splat.refine.min_views": (2, 2, 2),
     # 22: ours is for a machine without a GPU; "thorough" has the table's clip(40 K, 600, 10,000), tested below.
-    "splat.reconstruct.iterations_per_view": (12, 12, 12),
-    "splat.reconstruct.min_iterations": (1000, 1000, 300),
-    "splat.reconstruct.max_iterations": (1000, 1000, 600),
+    "splat.reconstruct.iterations_per_view": (8, 8, 8),
+    "splat.reconstruct.min_iterations": (1000, 1000, 200),
+    "splat.reconstruct.max_iterations": (1000, 1000, 400),
     # 23
     "splat.reconstruct.densify": ("classic", "classic", "classic"),
     "splat.reconstruct.max_gaussians": (30_000, 30_000, 30_000),
@@ -135,8 +135,8 @@ TABLE = {
     # 28: the reference's filter drops the most opaque Gaussians, a slip; all presets have ours.
     "splat.refine.min_opacity": (0.05, 0.05, 0.05),
     "splat.refine.max_scale": (0.5, 0.5, 0.5),
-    "splat.reconstruct.max_scale": (0.0, 0.0, 0.1),
-    "splat.merge.max_scale": (0.0, 0.0, 0.1),
+    "splat.reconstruct.max_scale": (0.0, 0.0, 0.05),
+    "splat.merge.max_scale": (0.0, 0.0, 0.05),
     # 29
     "splat.refine.tau_iou": (0.95, 0.05, 0.5),
     # 30: which of two equal masks stays is a rule.
@@ -197,7 +197,8 @@ def test_a_machine_with_time_gets_the_training_that_the_table_calls_our_default(
     params = settings.preset(Params(), "thorough").splat
     first = params.reconstruct
     assert (first.iterations_per_view, first.min_iterations, first.max_iterations) == (40, 600, 10_000)
-    assert (params.merge.max_iterations, params.merge.global_iterations) == (1000, 2000)
+    assert (params.merge.max_iterations, params.merge.global_iterations) == (1000, 7000)
+    assert Params().splat.merge.global_iterations == 2000
 
 
 def test_every_preset_says_where_it_comes_from():
