@@ -114,7 +114,8 @@ class TrainParams:
     prune_contribution: Fraction = 1 / 255
     """Gaussians with no larger weight in any view are dropped at the end; 0 keeps them."""
     max_scale: NonNegative = 0.0
-    """No standard deviation exceeds this share of the extent; 0 = no limit."""
+    """No standard deviation exceeds this share of the extent, or the largest it starts with where that is more; 0 = no
+    limit."""
     antialias: bool = False
     """Whether to lower the opacity of Gaussians smaller than a pixel."""
 
@@ -207,6 +208,8 @@ class _Training:
             self.parameters.limit_opacity(0.01)
         self._channels = channels_of(initial.instance_id, label_ids)
         self._extent = float(extents.max())
+        # A few sparse points of a small thing must be let fill the space between them.
+        self._longest = np.maximum(np.float32(params.max_scale) * extents, np.exp(initial.log_scales.max(axis=1)))
         self._strategy = _strategy(params, len(initial), self._extent)
         self.step = 0
         self.losses = np.zeros(params.iterations, np.float32)
@@ -242,7 +245,7 @@ class _Training:
         means_rate = _decay(params.rates.position, params.rates.position_final, done_share)
         parameters.step(found.gradients, _by_name(params.rates), self.step, degree, np.float32(means_rate) * extents)
         if params.max_scale:
-            parameters.limit_scale(np.float32(params.max_scale) * extents)
+            parameters.limit_scale(self._longest[parameters.origin])
         seen = Seen(found.gradients, found.radii, target.pixels, means_rate * self._extent)
         self._strategy.after(self.step, parameters, seen, self._generator)
 

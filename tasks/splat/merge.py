@@ -53,7 +53,8 @@ class MergeParams:
     collision_margin: NonNegative = 0.05
     """By how much that box is widened on every side, as a share of its diagonal."""
     max_scale: NonNegative = 0.05
-    """No Gaussian becomes longer (one standard deviation) than this share of its instance's box diagonal; 0 = any."""
+    """No Gaussian becomes longer (one standard deviation) than this share of its instance's box diagonal, or than it
+    starts where that is more; 0 = any."""
     rates: LearningRates = LearningRates()
     """How fast each parameter is learnt."""
     guard_iou: Fraction = 0.02

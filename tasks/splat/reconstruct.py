@@ -58,7 +58,8 @@ class ReconstructParams:
     depth_weight_final: NonNegative = 0.01
     """Weight of the depth loss at the last step."""
     max_scale: NonNegative = 0.05
-    """No Gaussian becomes longer (one standard deviation) than this share of the instance's box diagonal; 0 = any."""
+    """No Gaussian becomes longer (one standard deviation) than this share of the instance's box diagonal, or than it
+    starts where that is more; 0 = any."""
     rates: LearningRates = LearningRates()
     """How fast each parameter is learnt."""
     dilation: Natural = 0
