@@ -107,8 +107,6 @@ class TrainParams:
     plateau: Fraction = 0.0
     """Training ends early when, once the number of Gaussians is settled, the mean loss over all views falls by less
     than this share twice in a row; 0 = never."""
-    reset_opacity: bool = False
-    """Whether to start with no opacity above 0.01 (spec A23)."""
     prune_opacity: Fraction = 0.005
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
@@ -130,11 +128,6 @@ class TrainResult:
     iterations: int
     loss: Float32
     """[iterations] of each step."""
-
-
-def auto_iterations(num_views: int) -> int:
-    """Iterations for an instance seen in so many views (spec row 22)."""
-    return int(np.clip(40 * num_views, 600, 10_000))
 
 
 def train(
@@ -204,8 +197,6 @@ class _Training:
         self.parameters = Parameters(initial, self._last_degree)
         if not self.parameters.finite():
             raise ValueError("the initial Gaussians hold values that are not finite")
-        if params.reset_opacity:
-            self.parameters.limit_opacity(0.01)
         self._channels = channels_of(initial.instance_id, label_ids)
         self._extent = float(extents.max())
         # A few sparse points of a small thing must be let fill the space between them.
