@@ -134,6 +134,10 @@ def _this_machine() -> Resources:
     )
 
 
+def _digests(value: Value) -> list[str]:
+    return [value] if isinstance(value, str) else list(value)
+
+
 def _stop(workers: Executor, run: _Run, *, patiently: bool) -> None:
     """Let what runs finish or keep what it has; at the next interrupt do not wait."""
     workers.cancel()
@@ -212,7 +216,8 @@ class _Run:
             position = flows.index(flow)
             values = {name: scheduler.value(node) for name, node in targets[position].items()}
             failures = scheduler.failures[flow]
-            self._reporters[position].event("run ended", failed=len(failures))
+            results = {name: _digests(value) for name, value in values.items() if not isinstance(value, Failure)}
+            self._reporters[position].event("run ended", failed=len(failures), results=results)
             report = Report(values, settled(self._recorders[position].events), failures, self._folders[position])
             if position not in self._reported:
                 self._done(position, report)

@@ -49,6 +49,11 @@ class Run:
         except FileNotFoundError:
             return
 
+    def results(self) -> dict[str, list[str]]:
+        """The digests of the flow's outputs by name; none for a run that has not ended."""
+        ended = [event for event in self.events() if event["event"] == "run ended"]
+        return dict(ended[-1].get("results", {})) if ended else {}
+
     def nodes(self) -> list[dict[str, Any]]:
         """The events of the nodes that have a result."""
         return [event for event in settled(self.events()) if event["event"] in DONE]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import time
@@ -100,7 +101,7 @@ class Why:
     def run(self) -> int:
         run = latest_run(self.store.existing_store(), self.scene)
         nodes = [e for e in run.events() if e["event"] in ("hit", "finished", "failed", "started")]
-        asked = [n for n in nodes if is_named(n, self.step)]
+        asked = named(run, nodes, self.step)
         if not asked:
             known = sorted({n["step"] for n in nodes})
             raise InputError(f"the latest run of {run.scene} has no step {self.step!r}; it has {', '.join(known)}.")
@@ -119,11 +120,13 @@ class Why:
         return 0
 
 
-def is_named(node: dict[str, Any], name: str) -> bool:
-    """Whether a user may mean this node by a name: propagate, split.propagate, segment[0003]."""
-    return (
-        name in (node["label"], node["step"]) or node["label"].endswith(f".{name}") or node["step"].endswith(f".{name}")
-    )
+def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    """The nodes of a run that a user may mean: propagate, split.propagate, segment[0003], or a result, as masks."""
+    steps = [n for n in nodes if any(t == name or t.endswith(f".{name}") for t in (n["label"], n["step"]))]
+    if steps:
+        return steps
+    digests = set(run.results().get(name, ()))
+    return [n for n in nodes if not digests.isdisjoint(n.get("outputs", ()))]
 
 
 def _times(nodes: list[dict[str, Any]]) -> str:
@@ -240,12 +243,10 @@ class CacheShow:
         return 0
 
     def _digests(self, store: Store) -> list[str]:
-        try:
-            nodes = [n for n in latest_run(store, self.scene).nodes() if is_named(n, self.what)]
-        except InputError:
-            nodes = []
-        if nodes:
-            return [digest for node in nodes for digest in node["outputs"]]
+        with contextlib.suppress(InputError):
+            run = latest_run(store, self.scene)
+            if nodes := named(run, run.nodes(), self.what):
+                return run.results().get(self.what) or [digest for node in nodes for digest in node["outputs"]]
         found = store.find(self.what)
         if len(found) == 1:
             return found

@@ -19,7 +19,7 @@ from ss_flow.cache.store import Store
 from ss_flow.cache.survey import Survey
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import StoreOptions, console
-from ss_flow.flows.cli.inspect import is_named, latest_run
+from ss_flow.flows.cli.inspect import latest_run, named
 from ss_flow.runs import Run, latest_runs
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -54,7 +54,7 @@ class CachePin:
         run = None
         with contextlib.suppress(InputError):  # there is none: then it is a digest
             run = latest_run(store, self.scene)
-        nodes = [node for node in run.nodes() if is_named(node, what)] if run else []
+        nodes = named(run, run.nodes(), what) if run else []
         if run and nodes:
             return _pin_results(store, what, run, nodes)
         found = store.find(what)

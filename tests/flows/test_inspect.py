@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from tiny_runs import ss_flow
 
+from ss_flow.cache.store import Store
+
 
 def test_status_counts_what_each_step_did(tiny):
     words = ss_flow("status", "--cache", tiny.store)
@@ -58,6 +60,16 @@ def test_cache_show_describes_a_result_by_step_or_by_digest(tiny):
     assert "num_labels: 5" in shown
     digest = tiny.called.results()["propagate"]
     assert ss_flow("cache", "show", digest[:10], "--cache", tiny.store).out == shown
+
+
+@pytest.mark.parametrize("name", ["masks", "masks_refined", "scene", "merge", "depth", "cameras"])
+def test_a_result_is_found_by_the_name_that_until_takes(tiny, name):
+    wanted = tiny.called.results()[name]
+    shown = ss_flow("cache", "show", name, "--cache", tiny.store)
+    assert shown.code == 0, shown.err
+    kind = type(Store(tiny.store).get(wanted if isinstance(wanted, str) else wanted[0])).__name__
+    assert shown.out.startswith(kind)
+    assert ss_flow("why", name, "--cache", tiny.store).code == 0
 
 
 def test_cache_show_describes_the_items_of_a_list(tiny):
