@@ -27,6 +27,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from bench_instances import SIZES
+from bench_quality import view_of
 
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, run_flow
@@ -40,19 +42,17 @@ from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import REFINED, Cameras, DepthMap, Frame, Gaussians, InstanceMasks, LabelMap
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.evaluate.novel_view import psnr, ssim, to_8bit
+from ss_flow.tasks.evaluate.novel_view import novel_view, to_8bit
 from ss_flow.tasks.evaluate.objects import change_elsewhere, floaters, fringe_share
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, TrainView, train
+from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
 from ss_flow.tasks.geometry.cameras import camera_of
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
+from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 from ss_flow.tasks.splat.groups import box_diagonal
 from ss_flow.tasks.splat.reconstruct import thin
 from ss_flow.tasks.splat.views import CropParams, crop_camera, mask_of
 
-SIZES = {10: (24, 320, 240), 50: (36, 480, 360), 200: (60, 640, 480)}
-"""Views, width and height of a room with so many objects."""
 Masks = Literal["degraded", "truth", "none"]
 SPLIT_STEP = "masks_split"
 RATES_OF_3DGS = LearningRates(1.6e-4, 1.6e-6, 2.5e-3, 0.05, 5e-3, 1e-3)
@@ -72,7 +72,7 @@ class Outcome:
     masks: list[LabelMap]
     scene: Gaussians
     metrics: dict[str, dict[str, float]]
-    held_out: tuple[list[Frame], Cameras] | None
+    held_out: tuple[tuple[Frame, ...], Cameras] | None
     report: Report
     split_seconds: float
     splat_seconds: float
@@ -117,7 +117,7 @@ def outcome(folder: Path, params: Params, jobs: int, store: Store) -> Outcome:
     )  # fmt: skip
 
 
-def held_out_of(folder: Path, params: Params, store: Store) -> tuple[list[Frame], Cameras] | None:
+def held_out_of(folder: Path, params: Params, store: Store) -> tuple[tuple[Frame, ...], Cameras] | None:
     """The views kept back, as the run read them."""
     place = folder / "held_out"
     if not place.is_dir():
@@ -129,7 +129,7 @@ def held_out_of(folder: Path, params: Params, store: Store) -> tuple[list[Frame]
         return {"frames": nodes.frames, "cameras": nodes.cameras}
 
     values = run_flow(build, store, scene=str(place), header={}).values
-    return [store.get(d) for d in values["frames"]], store.get(values["cameras"])
+    return tuple(store.get(d) for d in values["frames"]), store.get(values["cameras"])
 
 
 def cell(metrics: dict[str, dict[str, float]], group: str, name: str, scale: float = 100, digits: int = 1) -> str:
@@ -146,12 +146,11 @@ def plain(found: Outcome, params: Params, steps: int, rates: LearningRates) -> t
             rows = thin(instance.points, round(settings_.max_points * settings_.scale_of(instance)))
             starts.append(initialise(instance.points[rows], instance.colors[rows], 0, 1.0))
     start = concatenate(starts)
-    views = []
-    for index, frame in enumerate(found.frames):
-        inside = decode_valid(frame)
-        image = decode_rgb(frame).astype(np.float32) / 255
-        camera = camera_of(found.cameras, index)
-        views.append(TrainView(camera, image, inside, np.zeros_like(inside), full_depth(found.depths[index], camera)))
+    full = int(found.cameras.sizes.max())
+    views = [
+        view_of(frame, found.cameras, depth, index, full)
+        for index, (frame, depth) in enumerate(zip(found.frames, found.depths, strict=True))
+    ]
     most = len(found.scene)
     if len(start) > most:
         start = select(start, np.linspace(0, len(start) - 1, most).astype(int))
@@ -167,26 +166,6 @@ def plain(found: Outcome, params: Params, steps: int, rates: LearningRates) -> t
             seed=0,
         )
     return result.gaussians, time.perf_counter() - begun
-
-
-def quality(scene: Gaussians, frames: list[Frame], cameras: Cameras) -> tuple[float, float]:
-    """Mean PSNR and SSIM over views."""
-    values = []
-    for view, frame in enumerate(frames):
-        image, photo, valid = (
-            to_8bit(render(scene, camera_of(cameras, view)).rgb),
-            decode_rgb(frame),
-            decode_valid(frame),
-        )
-        values.append((psnr(image, photo, valid), ssim(image, photo, valid)))
-    mean = np.mean(values, axis=0)
-    return float(mean[0]), float(mean[1])
-
-
-def full_depth(depth: DepthMap, camera: Any) -> np.ndarray:
-    import cv2
-
-    return cv2.resize(depth.depth, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
 
 
 def total_steps(found: Outcome, params: Params) -> tuple[int, int]:
@@ -263,7 +242,7 @@ def look(found: Outcome, plainly: Gaussians | None, place: Path) -> None:
     for view in np.linspace(0, len(found.frames) - 1, 4).astype(int):
         camera = camera_of(found.cameras, view)
         row = [decode_rgb(found.frames[view])]
-        row += [picture(render(s, camera).rgb) for s in (found.scene, plainly) if s is not None]
+        row += [to_8bit(render(s, camera).rgb) for s in (found.scene, plainly) if s is not None]
         row.append(np.random.default_rng(3).integers(0, 255, (65536, 3), np.uint8)[found.masks[view].ids])
         rows.append(np.hstack(row))
     (place / "scene.png").write_bytes(encode_png(np.vstack(rows)).tobytes())
@@ -277,16 +256,12 @@ def look(found: Outcome, plainly: Gaussians | None, place: Path) -> None:
             margin = 20
             box = np.s_[max(0, y.min() - margin) : y.max() + margin, max(0, x.min() - margin) : x.max() + margin]
             both = [decode_rgb(found.frames[largest])[box]]
-            both.append(picture(render(own, camera_of(found.cameras, largest), background=MAGENTA).rgb)[box])
+            both.append(to_8bit(render(own, camera_of(found.cameras, largest), background=MAGENTA).rgb)[box])
             tiles.append(np.hstack([cv2.resize(tile, (240, 240)) for tile in both]))
     across = 4
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % across)
     sheet = np.vstack([np.hstack(tiles[i : i + across]) for i in range(0, len(tiles), across)])
     (place / "objects.png").write_bytes(encode_png(sheet).tobytes())
-
-
-def picture(rgb: np.ndarray) -> np.ndarray:
-    return np.round(255 * np.clip(rgb, 0, 1)).astype(np.uint8)
 
 
 def seconds_by_step(report: Report) -> dict[str, tuple[int, float]]:
@@ -353,16 +328,16 @@ def told(folder: Path, preset: str, jobs: int, store: Store, args: argparse.Name
                   f"elsewhere {255 * c.elsewhere:.3f}", file=sys.stderr)  # fmt: skip
     scene = None
     if args.plain:
-        kept_back = found.held_out or (found.frames, found.cameras)
-        merged = quality(found.scene, *kept_back)
-        print(f"  merged: PSNR {merged[0]:.2f}, SSIM {merged[1]:.3f}", flush=True)
+        kept_back = found.held_out or (tuple(found.frames), found.cameras)
+        merged = novel_view(*kept_back, found.scene).values
+        print(f"  merged: PSNR {merged['psnr']:.2f}, SSIM {merged['ssim']:.3f}", flush=True)
         for what in args.plain:
             steps = total_steps(found, params)[what == "photos"]
             for whose, rates in (("our", LearningRates()), ("3DGS's", RATES_OF_3DGS)):
                 scene, seconds = plain(found, params, steps, rates)
-                found_quality = quality(scene, *kept_back)
+                kept = novel_view(*kept_back, scene).values
                 print(f"  plain 3DGS, as many {what}, {whose} rates: {steps} steps, {len(scene)} Gaussians, "
-                      f"{seconds:.0f} s, PSNR {found_quality[0]:.2f}, SSIM {found_quality[1]:.3f}",
+                      f"{seconds:.0f} s, PSNR {kept['psnr']:.2f}, SSIM {kept['ssim']:.3f}",
                       flush=True)  # fmt: skip
     if args.look:
         look(found, scene, args.look / f"{folder.name}-{preset}")
