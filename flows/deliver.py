@@ -105,7 +105,7 @@ def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
     split_maps, maps = several("masks_split"), several("masks")
     instances = instances_document(several("refine"), scene, one("names"), frames)
     write_scene(folder, scene, instances)
-    write_cloud(folder, one("dense"), one("propagate"), one("parts"))
+    write_cloud(folder, one("dense"), one("cut"), one("parts"))
     write_masks(folder / "masks_split", frames, split_maps)
     write_masks(folder / "masks", frames, maps)
     pictures = report_pictures(frames, cameras, several("depth"), split_maps, maps, scene)

@@ -10,7 +10,7 @@ from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.sfm import SfmParams
-from ss_flow.tasks.ranges import Count, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams
 from ss_flow.tasks.splat.merge import MergeParams
@@ -19,6 +19,7 @@ from ss_flow.tasks.splat.reconstruct import ReconstructParams
 from ss_flow.tasks.splat.refine import RefineParams
 from ss_flow.tasks.split.dense import DenseParams
 from ss_flow.tasks.split.dense_splatting import DenseSplattingParams
+from ss_flow.tasks.split.hierarchy import HierarchyParams
 from ss_flow.tasks.split.observe import ObserveParams
 from ss_flow.tasks.split.parts import PartsParams
 from ss_flow.tasks.split.propagate import PropagateParams
@@ -72,6 +73,10 @@ class SplitParams:
     observe: ObserveParams = field(default_factory=ObserveParams)
     propagate: PropagateParams = field(default_factory=PropagateParams)
     parts: PartsParams = field(default_factory=PartsParams)
+    hierarchy: HierarchyParams = field(default_factory=HierarchyParams)
+    granularity: Fraction = 0.5
+    """How far pieces are put together: those that more than this share of the views show as one thing are one instance.
+    1 leaves every part on its own, 0.3 gives groups of things."""
     reprompt: RepromptParams = field(default_factory=RepromptParams)
     reproject: ReprojectParams = field(default_factory=ReprojectParams)
 

@@ -23,9 +23,11 @@ from ss_flow.tasks.splat.refine import refine
 from ss_flow.tasks.splat.render_masks import render_masks
 from ss_flow.tasks.splat.resolve import exclusive, resolve
 from ss_flow.tasks.split import hints
+from ss_flow.tasks.split.cut import cut, cut_parts
 from ss_flow.tasks.split.dense import dense
 from ss_flow.tasks.split.dense_splatting import dense_splatting
 from ss_flow.tasks.split.embed import embed
+from ss_flow.tasks.split.hierarchy import hierarchy
 from ss_flow.tasks.split.observe import observe
 from ss_flow.tasks.split.parts import find_parts
 from ss_flow.tasks.split.propagate import propagate
@@ -33,6 +35,7 @@ from ss_flow.tasks.split.reproject import reproject
 from ss_flow.tasks.split.reprompt import reprompt
 from ss_flow.tasks.split.segment import segment
 from ss_flow.tasks.split.segment_rgbd import segment_rgbd
+from ss_flow.tasks.split.tally import tally
 from ss_flow.tasks.split.visibility import visibility
 
 
@@ -52,7 +55,11 @@ class Split:
     points: Any
     visibility: Any
     masks: Any
+    pieces: Any
+    """PointLabels: the leaves of the tree."""
+    tree: Any
     labels: Any
+    """PointLabels: the instances, which the cut through the tree leaves."""
     parts: Any
     instances: Any
     """tuple[InstanceMasks, ...], the background first."""
@@ -73,7 +80,9 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         "depth": capture.depths,
         "dense": halved.points,
         "segment": halved.masks,
-        "propagate": halved.labels,
+        "propagate": halved.pieces,
+        "hierarchy": halved.tree,
+        "cut": halved.labels,
         "parts": halved.parts,
         "reproject": halved.instances,
         "masks_split": masks_split,
@@ -151,10 +160,14 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         names=capture.names,
         build=lambda visible, pool: observe(points, visible, pool, params=params.observe),
     )
-    # What was clicked as two objects stays two.
-    propagating = replace(params.propagate, touching_merge=False) if capture.clicks is not None else params.propagate
-    labels = propagate(points, seen, observed, params=propagating)
-    parts = find_parts(observed, masks, labels, params=params.parts)
+    propagating, granularity = params.propagate, params.granularity
+    if capture.clicks is not None:  # what was clicked as two objects stays two
+        propagating, granularity = replace(propagating, touching_merge=False), 1.0
+    pieces = propagate(points, seen, observed, params=propagating)
+    counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
+    tree = hierarchy(points, capture.cameras, pieces, counted, params=params.hierarchy)
+    labels = cut(pieces, tree, granularity=granularity)
+    parts = cut_parts(pieces, find_parts(observed, masks, pieces, params=params.parts), labels)
     prompted: Any = ()
     if segmenter is not None and capture.masks is None:
         prompted = each(
@@ -175,7 +188,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
             ),
         )
     instances = reproject(points, seen, masks, labels, parts, prompted, params=params.reproject)
-    return Split(points, seen, masks, labels, parts, instances, embeddings, hinted)
+    return Split(points, seen, masks, pieces, tree, labels, parts, instances, embeddings, hinted)
 
 
 def _masks_of_hints(

@@ -183,6 +183,39 @@ class PointLabels:
 
 
 @dataclass(frozen=True)
+class Tally:
+    """How many of each label's points every mask of one view holds; a point under nested masks counts in each."""
+
+    name: str
+    label: Int32
+    """[V] the labels that the view sees, ascending."""
+    seen: Int32
+    """[V] points of each that the view sees."""
+    held: Int32
+    """[M, V] those of them under each mask of the view's MaskSet."""
+    quality: Float32
+    """[M] how sure the segmenter is of each mask: its own estimate of the IoU, times the mask's stability."""
+
+
+@dataclass(frozen=True)
+class Hierarchy:
+    """What is part of what, over all views: a tree for each thing, with the labels of `split.propagate` as leaves."""
+
+    node: Int32
+    """[T] id of each node: the labels, ascending, then higher numbers for what they make up, children first."""
+    parent: Int32
+    """[T] id of the smallest node that holds it, 0 at the top."""
+    agreement: Float32
+    """[T] share of the views which show it as one thing, of those that could; 1 for the leaves."""
+    stuff: Bool
+    """[T] whether it is a wall, a floor or the like rather than a thing."""
+
+    def row_of(self) -> dict[int, int]:
+        """The row of each node."""
+        return {int(node): row for row, node in enumerate(self.node)}
+
+
+@dataclass(frozen=True)
 class PointParts:
     """Which part of its object each dense point belongs to."""
 

@@ -55,9 +55,48 @@ def drop_duplicates(masks: Bool, scores: Float32, max_iou: float) -> Int32:
 
     masks: [N, H, W], none empty. scores: [N]. Returns the rows that stay, ascending.
     """
+    return suppress(mask_iou(masks), scores, max_iou)
+
+
+def mask_iou(masks: Bool) -> Float32:
+    """IoU of masks [N, H, W], none empty, two by two: [N, N]."""
     shared = intersections(masks)
     areas = np.diag(shared)
-    return suppress(shared / (areas[:, None] + areas[None] - shared), scores, max_iou)
+    return shared / (areas[:, None] + areas[None] - shared)
+
+
+def whole_pictures(masks: Bool, valid: Bool, max_area: float) -> Bool:
+    """[N] which masks are the picture rather than a thing in it: they fill more than the share `max_area` of the valid
+    pixels, or what they leave free is another mask (IoU above `max_area`) and smaller than they are.
+
+    masks: [N, H, W], on valid pixels only. valid: [H, W].
+    """
+    shared, total = intersections(masks), float(valid.sum())
+    areas = np.diag(shared)
+    # The rest of mask i shares areas[j] - shared[i, j] pixels with mask j.
+    both = areas[None] - shared
+    iou_of_rest = both / np.maximum(total - areas[:, None] + areas[None] - both, 1)
+    complement = (iou_of_rest > max_area) & (areas[None] < areas[:, None])
+    return (areas > max_area * total) | complement.any(axis=1)
+
+
+def without_speckles(mask: Bool, share: float) -> Bool:
+    """A mask [H, W] without its small islands and holes: pieces below this share of its largest piece are taken off,
+    and holes as small are filled. What lies open to the image's border is no hole."""
+    import cv2
+
+    if not share or not mask.any():
+        return mask
+    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    least = share * area.max()
+    _, gap, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    x, y, w, h, size = stats[:, :5].T
+    inside = (x > 0) & (y > 0) & (x + w < mask.shape[1]) & (y + h < mask.shape[0])
+    hole = inside & (size < least)
+    hole[0] = False  # the mask itself
+    return (area >= least)[piece] & mask | hole[gap]
 
 
 def suppress(overlap: Float32 | Float64, scores: Float32, threshold: float) -> Int32:

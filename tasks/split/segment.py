@@ -20,9 +20,12 @@ from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
 from ss_flow.tasks.split.mask_pool import (
     canonical_order,
     drop_duplicates,
+    mask_iou,
     mask_tree,
     merge_union,
     suppress,
+    whole_pictures,
+    without_speckles,
 )
 
 
@@ -44,8 +47,18 @@ class SegmentParams:
     """Distance of those two cuts from the threshold, in logits (row 4)."""
     mask_threshold: tuple[float, ...] = (0.5, 0.5, 0.3, 0.3)
     """Logit above which a pixel belongs to a mask (row 5)."""
+    suppression: Literal["masks", "boxes"] = "masks"
+    """What two masks of one grid are compared by before the worse is dropped. A wall and what hangs on it may have
+    nearly the same bounding box."""
+    mask_nms: Fraction = 0.8
+    """With "masks": IoU of two masks of one grid above which the worse is dropped."""
     box_nms: tuple[Fraction, ...] = (0.3, 0.3, 0.5, 0.3)
-    """IoU of bounding boxes above which the worse of two masks of one grid is dropped (row 6)."""
+    """With "boxes": the same for their bounding boxes (row 6)."""
+    max_area: Fraction = 0.8
+    """Largest mask, as a share of the valid image: what fills nearly all of it is no object, nor is a mask the rest of
+    whose image is another mask. 1 keeps them all."""
+    speckle: Fraction = 0.05
+    """Pieces of a mask smaller than this share of its largest one are taken off, and holes as small are filled."""
     min_area: Fraction = 0.0025
     """Smallest mask, as a share of the image (row 7); dense scenes want 0.0005."""
     min_pixels: Natural = 64
@@ -130,10 +143,12 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
 
     if params.merge == "child":
         found = found[drop_duplicates(found.masks, found.predicted_iou, params.duplicate_iou)]
+    if params.max_area < 1:
+        found = found[np.flatnonzero(~whole_pictures(found.masks, valid_low, params.max_area)).astype(np.int32)]
     thresholds = np.array(params.mask_threshold, np.float32)[found.grid]
     masks = np.empty((len(thresholds), frame.height, frame.width), bool)
     for mask, logits, threshold in zip(masks, found.logits, thresholds, strict=True):
-        mask[:] = (sam.upsample(embedding, logits[None])[0] > threshold) & valid
+        mask[:] = without_speckles(sam.upsample(embedding, logits[None])[0] > threshold, params.speckle) & valid
     if params.merge == "union":
         large = np.flatnonzero(_large_enough(masks, params)).astype(np.int32)
         masks, origin = merge_union(masks[large], found.grid[large], params.duplicate_overlap, params.union_overlap)
@@ -180,6 +195,8 @@ def _ask(
         smallest[prompt[largest_first]] = largest_first
         held += passed.masks[smallest[smallest >= 0]].sum(axis=0, dtype=np.int32)
     found = _Candidates.joined(parts)
+    if params.suppression == "masks":
+        return found[suppress(mask_iou(found.masks), found.predicted_iou, params.mask_nms)], held
     return found[suppress(_box_iou(found.masks), found.predicted_iou, params.box_nms[level])], held
 
 

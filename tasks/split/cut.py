@@ -1,0 +1,53 @@
+"""The cut through the hierarchy: which of its levels are the instances. Beyond Split&Splat."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Hierarchy, Int32, PointLabels, PointParts
+
+
+@task(name="split.cut")
+def cut(labels: PointLabels, tree: Hierarchy, *, granularity: float) -> PointLabels:
+    """The labels of points and masks at one level of the hierarchy.
+
+    labels: those that are the leaves of the tree. granularity: pieces on which the views agree more than this
+    are one instance (0..1); the highest such node counts, so that 1 leaves the labels as they are, and lower values
+    give things, then groups of things. Ids are those of the nodes.
+    """
+    instance = instances_of(tree, labels.num_labels, granularity)
+    highest = max(labels.num_labels, int(tree.node.max(initial=0)))
+    return replace(labels, label=instance[labels.label], match_label=instance[labels.match_label], num_labels=highest)
+
+
+@task(name="split.cut_parts")
+def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) -> PointParts:
+    """The parts of the instances: the labels that each is made of, and the parts of those.
+
+    labels: the leaves; parts: theirs; instances: the same points after the cut. Numbered from the largest part on in
+    each instance. An instance that is a single label keeps its parts as they are.
+    """
+    pair = np.stack([instances.label, labels.label, parts.part], axis=1)
+    found, row, size = np.unique(pair, axis=0, return_inverse=True, return_counts=True)
+    alone = np.isin(found[:, 0], np.unique(labels.label))
+    number = np.where(alone, found[:, 2], 0)
+    for name in np.unique(found[~alone, 0]):
+        rows = np.flatnonzero(found[:, 0] == name)
+        number[rows[np.argsort(-size[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
+    return PointParts(number[row].astype(np.int32))
+
+
+def instances_of(tree: Hierarchy, num_labels: int, granularity: float) -> Int32:
+    """[num_labels + 1] the instance that each label belongs to; labels that no point carries stay as they are."""
+    row = tree.row_of()
+    instance = np.arange(num_labels + 1, dtype=np.int32)
+    for leaf in np.flatnonzero(~np.isin(tree.node, tree.parent)):
+        above = int(leaf)
+        while parent := int(tree.parent[above]):
+            above = row[parent]
+            if tree.agreement[above] > granularity:
+                instance[tree.node[leaf]] = parent
+    return instance

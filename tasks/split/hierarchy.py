@@ -1,0 +1,208 @@
+"""Which labels are pieces of one thing: a tree over all views, from how often a mask shows several of them as one.
+
+A segmenter shows the box, its faces and the label printed on it, and often the box with what stands beside it. The
+level that is a thing is the one that the views repeat: most views which see two pieces of it have a mask with just
+these pieces, and the segmenter is as sure of that mask as of those of the pieces. Beyond Split&Splat.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels, Tally
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.split.stuff import StuffParams, find_stuff
+
+_IOU = (0.6, 0.85)
+"""IoU of a mask with the pieces from which on it begins to show them as one, and from which it does."""
+_REST = (0.3, 0.7)
+"""The same for the share that it holds of all but the largest piece, which alone may make up most of the IoU."""
+_OWN = 0.75
+"""IoU with a single piece from which a mask is the piece's own."""
+_BALANCED = 0.1
+"""Share of the smaller pieces in what a view sees of all, from which on the view counts in full."""
+_MOST_SETS = 2000
+"""Sets of pieces that are weighed in a round: those that the most masks show."""
+
+
+@dataclass(frozen=True)
+class HierarchyParams:
+    """What counts as being shown as one thing."""
+
+    doubt: Fraction = 0.2
+    """By how much the segmenter may be surer of a piece than of the whole (predicted IoU times stability) before the
+    whole no longer counts; from nothing to this, it counts less and less."""
+    prior: NonNegative = 0.5
+    """Views that are taken to speak against each union, so that one view alone does not decide."""
+    min_agreement: Fraction = 0.2
+    """Agreement below which pieces are not united even to a group."""
+    min_points: Count = 10
+    """Points of a piece that a view must see to count."""
+    min_visible: Fraction = 0.2
+    """Share of the points that any view sees of a piece, which a view must see to count."""
+    stuff: StuffParams = field(default_factory=StuffParams)
+    """What is a wall or a floor rather than a thing."""
+
+
+@task(name="split.hierarchy", uses=("scipy",))
+def hierarchy(
+    points: PointCloud,
+    cameras: Cameras,
+    labels: PointLabels,
+    tallies: Sequence[Tally],
+    *,
+    params: HierarchyParams,
+) -> Hierarchy:
+    """The tree of what the labels make up.
+
+    labels: of `points`. tallies: one a view, of these labels. Round by round the sets of pieces with the highest
+    agreement are united, each piece once a round, until none reaches `min_agreement`; a thing and stuff never are. The
+    order of the views does not matter, nor that of the masks.
+    """
+    names = np.unique(labels.label[labels.label > 0]).astype(np.int32)
+    is_stuff = find_stuff(points, cameras, labels, params.stuff)
+    pieces = _Pieces(names, tallies, is_stuff, params)
+    node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
+    top = list(range(len(names)))  # the tree's row of each piece
+    while True:
+        united = pieces.best_unions()
+        if not united:
+            break
+        for members, share in united:
+            row = len(node)
+            node.append(labels.num_labels + 1 + row - len(names))
+            parent.append(0)
+            agreement.append(share)
+            stuff.append(stuff[top[members[0]]])
+            for piece in members:
+                parent[top[piece]] = node[row]
+            top.append(row)
+        left = sorted(set(range(len(top))) - {piece for members, _ in united for piece in members})
+        pieces = pieces.united([members for members, _ in united])
+        top = [top[piece] for piece in left]
+    return Hierarchy(
+        np.array(node, np.int32), np.array(parent, np.int32), np.array(agreement, np.float32), np.array(stuff, bool)
+    )
+
+
+@dataclass(frozen=True)
+class _View:
+    """One view's counts, a column for each piece; 0 where it sees too little of a piece."""
+
+    seen: Float64
+    """[G]."""
+    held: Float64
+    """[M, G]."""
+    quality: Float64
+    """[M] how sure the segmenter is of each mask."""
+    own: Float64
+    """[G] quality of the best mask that is a piece's own, 0 where there is none."""
+
+
+class _Pieces:
+    """Pieces that may be united, and what the views say about sets of them."""
+
+    def __init__(self, names: Int32, tallies: Sequence[Tally], stuff: Bool, params: HierarchyParams) -> None:
+        seen, held = [], []
+        for tally in tallies:
+            column = np.searchsorted(names, tally.label)
+            seen.append(np.zeros(len(names)))
+            seen[-1][column] = tally.seen
+            held.append(np.zeros((len(tally.held), len(names))))
+            held[-1][:, column] = tally.held
+        self._set(seen, held, [tally.quality.astype(np.float64) for tally in tallies], stuff, params)
+
+    def _set(
+        self,
+        seen: list[Float64],
+        held: list[Float64],
+        quality: list[Float64],
+        stuff: Bool,
+        params: HierarchyParams,
+    ) -> None:
+        self._seen, self._held, self._quality, self._stuff, self._params = seen, held, quality, stuff, params
+        most = np.max(seen, axis=0, initial=0)
+        self._views = []
+        for of_view, under, sure in zip(seen, held, quality, strict=True):
+            enough = (of_view >= params.min_points) & (of_view >= params.min_visible * most)
+            count, inside = of_view * enough, under * enough
+            iou = inside / np.maximum(inside.sum(axis=1, keepdims=True) + count - inside, 1)
+            own = np.where(iou >= _OWN, sure[:, None], 0).max(axis=0, initial=0)
+            self._views.append(_View(count, inside, sure, own))
+
+    def united(self, unions: list[tuple[int, ...]]) -> _Pieces:
+        """What is left when each of these sets has become one piece: the others first, then the unions."""
+        count = len(self._stuff)
+        gone = {piece for members in unions for piece in members}
+        groups = [(piece,) for piece in range(count) if piece not in gone] + unions
+        joined = np.zeros((count, len(groups)))
+        for column, members in enumerate(groups):
+            joined[list(members), column] = 1
+        after = _Pieces.__new__(_Pieces)
+        after._set(
+            [seen @ joined for seen in self._seen],
+            [held @ joined for held in self._held],
+            self._quality,
+            self._stuff[[members[0] for members in groups]],
+            self._params,
+        )
+        return after
+
+    def best_unions(self) -> list[tuple[tuple[int, ...], float]]:
+        """The sets of pieces to unite now, each with its agreement: of sets that share a piece, the best alone."""
+        sets = self._sets()
+        if not sets:
+            return []
+        agreement = np.round(self._agreement(sets), 6)
+        taken: set[int] = set()
+        chosen = []
+        for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
+            if agreement[row] < max(self._params.min_agreement, 1e-6):
+                break
+            if not taken & set(sets[row]):
+                chosen.append((sets[row], float(agreement[row])))
+            taken |= set(sets[row])
+        return chosen
+
+    def _sets(self) -> list[tuple[int, ...]]:
+        """The sets of pieces that masks show: those of which a mask holds at least half."""
+        shown: Counter[tuple[int, ...]] = Counter()
+        for view in self._views:
+            for held in (view.held >= 0.5 * view.seen) & (view.seen > 0):
+                members = tuple(np.flatnonzero(held).tolist())
+                if len(members) > 1 and len(set(self._stuff[list(members)].tolist())) == 1:
+                    shown[members] += 1
+        return [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
+
+    def _agreement(self, sets: list[tuple[int, ...]]) -> Float64:
+        """[S] share of the views that show each set of pieces as one, of those that see at least two of them."""
+        member = np.zeros((len(sets), len(self._stuff)))
+        for row, members in enumerate(sets):
+            member[row, list(members)] = 1
+        agreed, asked = np.zeros(len(sets)), np.zeros(len(sets))
+        for view in self._views:
+            seen = member * view.seen
+            total, largest = seen.sum(axis=1), seen.max(axis=1)
+            weight = np.minimum((1 - largest / np.maximum(total, 1)) / _BALANCED, 1)
+            rows = np.flatnonzero((total > 0) & (weight > 0))
+            asked[rows] += weight[rows]
+            if not rows.size or not len(view.held):
+                continue
+            total, largest, seen = total[rows, None], largest[rows, None], seen[rows]
+            inside = member[rows] @ view.held.T
+            iou = inside / np.maximum(view.held.sum(axis=1) + total - inside, 1)
+            rest = (inside - view.held[:, seen.argmax(axis=1)].T) / (total - largest)
+            surest_piece = np.where(seen > 0, view.own, 0).max(axis=1)
+            doubt = (surest_piece[:, None] - view.quality) / max(self._params.doubt, 1e-9)
+            fit = _ramp(iou, *_IOU) * _ramp(rest, *_REST) * np.clip(1 - doubt, 0, 1)
+            agreed[rows] += weight[rows] * fit.max(axis=1)
+        return agreed / np.maximum(asked + self._params.prior, 1e-9)
+
+
+def _ramp(value: Float64, low: float, high: float) -> Float64:
+    return np.clip((value - low) / (high - low), 0, 1)
