@@ -142,7 +142,7 @@ def tube(path: Float64, radius: float, segments: int = 12) -> Mesh:
     here = np.arange((len(path) - 1) * segments)
     beside = here // segments * segments + (here + 1) % segments
     triangles = np.concatenate(
-        [np.stack([here, beside, beside + segments], 1), np.stack([here, beside + segments, here + segments], 1)]
+        [np.stack([here, beside + segments, beside], 1), np.stack([here, here + segments, beside + segments], 1)]
     )
     return Mesh(vertices, normals.reshape(-1, 3), vertices, triangles.astype(np.int32))
 
