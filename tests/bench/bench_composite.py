@@ -21,6 +21,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,7 +43,7 @@ from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 ROOM = RoomParams(composite=True, views=24, width=480, height=360, held_out=0)
 COLUMNS = ("whole", "miou", "pq", "over_segmentation", "under_segmentation")
 COUNTS = ("num_predicted", "num_truth")
-STEP = "masks_split"
+STEPS = "ingest", "masks_split"
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,15 @@ def folder_of(room: RoomParams, place: Path) -> Path:
 
 def outcome(folder: Path, params: Params, store: Store) -> Outcome:
     """Run Split on a capture and read what came of it."""
-    options = RunOptions(until=STEP)
-    prepared = prepare(open_scene(folder), params, options, file_digests(store))
+    prepared = prepare(open_scene(folder), params, RunOptions(), file_digests(store))
+
+    def build() -> dict[str, Any]:
+        return {name: node for name, node in prepared.build().items() if name in STEPS}
+
     begun = time.perf_counter()
-    values = run_flow(prepared.build, store, scene=prepared.name, header={}, until=STEP).values
+    values: dict[str, Any] = run_flow(build, store, scene=prepared.name, header={}).values
     seconds = time.perf_counter() - begun
-    frames, predicted = (tuple(store.get(digest) for digest in values[name]) for name in ("ingest", STEP))
+    frames, predicted = (tuple(store.get(digest) for digest in values[name]) for name in STEPS)
     truth = tuple(LabelMap(frame.name, _ids(folder / "instance" / f"{frame.name}.png")) for frame in frames)
     return Outcome(frames, truth, predicted, seconds)
 
