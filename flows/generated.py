@@ -1,25 +1,27 @@
 """The built-in scene: a generated room with exact poses, depth and instance ids, as arrays or as an ordinary capture.
 
 The room is 4 m wide, z up, in metres. A table, a shelf, a sofa and small things of distinct names ("red mug") stand
-in it; the camera goes once round, looking inwards, near and far, high and low.
+in it; the camera goes once round, looking inwards, near and far, high and low. In a composite room everything is made
+of differently coloured parts, and every second view is a close one.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
+from ss_flow.flows.generated_composite_room import GAZE, close_up, furnish_composites, gripper
 from ss_flow.flows.generated_layout import Thing, furnish
 from ss_flow.flows.generated_masks import DegradeParams, degrade
 from ss_flow.flows.generated_render import Renderer
-from ss_flow.tasks.artifacts import Cameras, Float32, Float64, Int32, UInt8
-from ss_flow.tasks.geometry.cameras import backproject, camera_of
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, UInt8
+from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of
 from ss_flow.tasks.geometry.images import encode_png
 
 __all__ = ["DegradeParams", "Room", "RoomParams", "SceneObject", "Views", "degrade", "generate", "write_scene"]
@@ -28,6 +30,8 @@ _FOCAL = 0.9
 """Focal length in image widths: 58 degrees across."""
 _JPEG_QUALITY = 95
 _POINT_VOXEL = 0.02
+_GAZE = 0.5
+"""Height that the views look at, metres."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,7 @@ class RoomParams:
     """What the generated room is like."""
 
     objects: int = 10
-    """Number of small things, besides table, shelf and sofa."""
+    """Number of small things, besides table, shelf and sofa; a composite room always holds the same dozen."""
     views: int = 24
     """Number of views round the room."""
     width: int = 320
@@ -46,18 +50,29 @@ class RoomParams:
     """Another seed is another room."""
     held_out: int = 4
     """Number of further views between the others, kept back for novel-view evaluation."""
+    composite: bool = False
+    """Whether to furnish with things of several, differently coloured parts; 480 x 360 pixels show them well."""
+    gripper: bool = False
+    """Whether a gripper moves along in front of the lens; the valid masks leave it out."""
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One instance of the room: a piece of furniture or a small thing."""
+    """One instance of the room: a piece of furniture or a small thing; or its structure."""
 
     instance_id: int
-    """1.. in the order of the table."""
+    """1.. in the order of the table; 0 is the structure."""
     name: str
     """Unique in the room: colour word and noun, such as "red mug"."""
     color: str
     """The colour word."""
+    parts: tuple[str, ...] = ()
+    """What its parts 1.. are called; none where it is of one piece."""
+
+    @property
+    def kind(self) -> Literal["thing", "stuff"]:
+        """Walls, floor and ceiling are stuff."""
+        return "thing" if self.instance_id else "stuff"
 
 
 @dataclass(frozen=True)
@@ -70,6 +85,10 @@ class Views:
     """[K, H, W] exact z-depth at pixel centres, metres; known everywhere."""
     ids: NDArray[np.uint16]
     """[K, H, W] exact instance ids at pixel centres; 0 = structure (walls, floor, ceiling)."""
+    parts: UInt8
+    """[K, H, W] exact part ids within the instance; 0 where it has no parts."""
+    valid: Bool
+    """[K, H, W] False where something that moves with the camera hides the room; ids and parts are 0 there."""
     cameras: Cameras
 
     def __len__(self) -> int:
@@ -82,6 +101,9 @@ class Room(Views):
 
     held_out: Views
     objects: tuple[SceneObject, ...]
+    """The things, by their ids 1.."""
+    structure: SceneObject
+    """Walls, floor and ceiling together."""
     points: Float32
     """[N, 3] surface points that some view sees, one in each cube of 2 cm, world."""
     point_colors: UInt8
@@ -98,19 +120,25 @@ def generate(params: RoomParams) -> Room:
     if params.views < 2 or params.held_out < 0 or min(params.width, params.height) < 16:
         raise InputError("A generated room needs at least 2 views, 0 held-out views and 16 x 16 pixels.")
     rng = np.random.default_rng(params.seed)
-    things = furnish(params.objects, rng)
+    things, stations = furnish_composites(rng) if params.composite else (furnish(params.objects, rng), ())
+    gaze = GAZE if params.composite else _GAZE
     renderer = Renderer(things, params.seed)
     phase, jitter = rng.uniform(0, 2 * np.pi, 3), rng.uniform(-1, 1, (params.views, 2))
     turn = np.arange(params.views) / params.views
     between = (
         np.floor((np.arange(params.held_out) + 0.5) * params.views / max(params.held_out, 1)) + 0.5
     ) / params.views
-    poses = np.stack([_pose(t, phase, j) for t, j in zip(turn, jitter, strict=True)])
-    extra = np.array([_pose(t, phase, np.zeros(2)) for t in between]).reshape(-1, 4, 4)
+    poses = np.stack([_pose(t, phase, j, gaze) for t, j in zip(turn, jitter, strict=True)])
+    extra = np.array([_pose(t, phase, np.zeros(2), gaze) for t in between]).reshape(-1, 4, 4)
+    if stations:
+        for i in range(1, params.views, 2):
+            poses[i] = _looking(*close_up(stations[i // 2 % len(stations)], rng))
     views = _photograph(renderer, poses, params, rng)
     held_out = _photograph(renderer, extra, params, rng)
-    points, colors, ids = _surface_points(views)
-    return Room(views.rgb, views.depth, views.ids, views.cameras, held_out, _objects(things), points, colors, ids)
+    if params.gripper:
+        views, held_out = _gripped(views, params, rng), _gripped(held_out, params, rng)
+    structure, *objects = _objects(things)
+    return Room(**vars(views), held_out=held_out, objects=tuple(objects), structure=structure, **_points(views))
 
 
 def write_scene(
@@ -125,7 +153,9 @@ def write_scene(
     `color/NNNN.jpg`, `depth/NNNN.png` (uint16 millimetres), `pose/NNNN.txt` (camera-to-world), `intrinsic/` (4 x 4,
     integer pixel centres), `instance/NNNN.png` (uint16 ground truth) and `instances.json` (id -> name, whose first
     word is the colour); the same in `held_out/` for the views kept back. With `masks`, also `instance_masks/NNNN.png`
-    (uint16, 0 = no mask): the true masks, or masks degraded with `degradation` and `seed`.
+    (uint16, 0 = no mask): the true masks, or masks degraded with `degradation` and `seed`. Where things have parts,
+    also `part/NNNN.png` (uint8, ids within the instance) and `parts.json` (instance id -> name, kind "thing" or
+    "stuff", parts by id; the structure is 0); where something stands before the lens, `valid/NNNN.png` (0 = ignore).
 
     Raises InputError when `folder` already holds something.
     """
@@ -136,20 +166,31 @@ def write_scene(
         _write_views(room.held_out, folder / "held_out")
     names = {str(o.instance_id): o.name for o in room.objects}
     (folder / "instances.json").write_text(json.dumps(names, indent=1) + "\n", encoding="utf-8")
+    if room.parts.any():
+        tree = {
+            o.instance_id: {"name": o.name, "kind": o.kind, "parts": dict(enumerate(o.parts, 1))}
+            for o in (room.structure, *room.objects)
+        }
+        (folder / "parts.json").write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
     if masks is not None:
         ids = room.ids if masks == "truth" else degrade(room.ids, degradation, seed=seed)
         for name, image in zip(room.cameras.names, ids, strict=True):
             _write_bytes(folder / "instance_masks" / f"{name}.png", encode_png(image))
 
 
-def _pose(turn: float, phase: Float64, jitter: Float64) -> Float64:
-    """World-to-camera of the view at a place (0..1) of the way round."""
+def _pose(turn: float, phase: Float64, jitter: Float64, gaze: float) -> Float64:
+    """World-to-camera of the view at a place (0..1) of the way round, looking at about the height `gaze`."""
     angle = 2 * np.pi * turn + 0.05 * jitter[0]
     outwards = np.array([np.cos(angle), np.sin(angle), 0.0])
     radius = 1.2 + 0.3 * np.cos(4 * angle + phase[0])
     height = 1.55 + 0.25 * np.sin(3 * angle + phase[1]) + 0.03 * jitter[1]
     eye = radius * outwards + (0, 0, height)
-    target = -(0.5 + 0.6 * (1.2 - radius)) * outwards + (0, 0, 0.5 + 0.08 * np.sin(5 * angle + phase[2]))
+    target = -(0.5 + 0.6 * (1.2 - radius)) * outwards + (0, 0, gaze + 0.08 * np.sin(5 * angle + phase[2]))
+    return _looking(eye, target)
+
+
+def _looking(eye: Float64, target: Float64) -> Float64:
+    """World-to-camera of an upright camera at `eye` that looks at `target`."""
     forward = target - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -170,24 +211,54 @@ def _photograph(renderer: Renderer, poses: Float64, params: RoomParams, rng: np.
         metric=True,
     )
     rgb, depth = np.empty((k, h, w, 3), np.uint8), np.empty((k, h, w), np.float32)
-    ids = np.empty((k, h, w), np.uint16)
+    ids, parts = np.empty((k, h, w), np.uint16), np.empty((k, h, w), np.uint8)
     for i in range(k):
-        rgb[i], depth[i], ids[i] = renderer.render(camera_of(cameras, i), rng)
-    return Views(rgb, depth, ids, cameras)
+        rgb[i], depth[i], ids[i], parts[i] = renderer.render(camera_of(cameras, i), rng)
+    return Views(rgb, depth, ids, parts, np.ones((k, h, w), bool), cameras)
 
 
-def _objects(things: tuple[Thing, ...]) -> tuple[SceneObject, ...]:
-    return tuple(SceneObject(t.instance_id, t.name, t.color) for t in things if t.instance_id)
+def _gripped(views: Views, params: RoomParams, rng: np.random.Generator) -> Views:
+    """The views with the gripper before the lens, the same in all of them."""
+    focal = _FOCAL * params.width
+    camera = Camera(params.width, params.height, focal, focal, params.width / 2, params.height / 2, np.eye(4))
+    rgb, depth, ids, _ = Renderer(gripper(), params.seed).render(camera, rng)
+    clear = ids == 0
+    return replace(
+        views,
+        rgb=np.where(clear[..., None], views.rgb, rgb),
+        depth=np.where(clear, views.depth, depth),
+        ids=views.ids * clear,
+        parts=views.parts * clear,
+        valid=views.valid & clear,
+    )
 
 
-def _surface_points(views: Views) -> tuple[Float32, UInt8, Int32]:
-    """One point of each occupied cube: the first that a view sees."""
+def _objects(things: tuple[Thing, ...]) -> list[SceneObject]:
+    """The instances by rising id, the structure first."""
+    names: dict[int, tuple[str, str]] = {}
+    parts: dict[int, dict[int, str]] = {}
+    for t in things:
+        names.setdefault(t.instance_id, (t.name, t.color))
+        parts.setdefault(t.instance_id, {})[t.part_id] = t.part
+    return [
+        SceneObject(i, *names[i], tuple(name for part_id, name in sorted(parts[i].items()) if part_id)) for i in names
+    ]
+
+
+def _points(views: Views) -> dict[str, Any]:
+    """A room's points: one of each occupied cube, the first that a view sees."""
     points = np.concatenate([backproject(views.depth[i], camera_of(views.cameras, i)) for i in range(len(views))])
+    clear = np.flatnonzero(views.valid)
+    points = points[clear]
     cell = np.floor((points - points.min(axis=0)) / _POINT_VOXEL).astype(np.int64)
     _, first = np.unique(np.ravel_multi_index(cell.T, cell.max(axis=0) + 1), return_index=True)
     first.sort()
-    colors, ids = views.rgb.reshape(-1, 3)[first], views.ids.ravel()[first].astype(np.int32)
-    return points[first].astype(np.float32), colors, ids
+    pixel = clear[first]
+    return {
+        "points": points[first].astype(np.float32),
+        "point_colors": views.rgb.reshape(-1, 3)[pixel],
+        "point_ids": views.ids.ravel()[pixel].astype(np.int32),
+    }
 
 
 def _write_views(views: Views, folder: Path) -> None:
@@ -201,6 +272,10 @@ def _write_views(views: Views, folder: Path) -> None:
         millimetres = np.round(1000 * views.depth[i]).astype(np.uint16)
         _write_bytes(folder / "depth" / f"{name}.png", encode_png(millimetres))
         _write_bytes(folder / "instance" / f"{name}.png", encode_png(views.ids[i]))
+        if views.parts.any():
+            _write_bytes(folder / "part" / f"{name}.png", encode_png(views.parts[i]))
+        if not views.valid.all():
+            _write_bytes(folder / "valid" / f"{name}.png", encode_png(np.uint8(255) * views.valid[i]))
         _write_matrix(folder / "pose" / f"{name}.txt", np.linalg.inv(views.cameras.world_to_camera[i]))
     fx, fy, cx, cy = views.cameras.intrinsics[0]
     # Other programs count pixels from their centres: theirs is half a pixel less than ours.

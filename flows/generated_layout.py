@@ -54,7 +54,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Thing:
-    """One connected piece of the room."""
+    """A piece of the room of one material; an instance is one of them, or several with the same id."""
 
     instance_id: int
     """0 for walls, floor and ceiling."""
@@ -63,6 +63,10 @@ class Thing:
     """The word for its colour; the first word of its name."""
     mesh: Mesh
     material: Material
+    part_id: int = 0
+    """1.. within the instance; 0 where it has no parts."""
+    part: str = ""
+    """What the part is called."""
 
 
 @dataclass(frozen=True)

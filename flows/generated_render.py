@@ -1,4 +1,4 @@
-"""Ray casting of a generated room: colour with shadows, exact depth, exact instance ids."""
+"""Ray casting of a generated room: colour with shadows, exact depth, exact instance and part ids."""
 
 from __future__ import annotations
 
@@ -54,6 +54,7 @@ class Renderer:
         self._normals = np.concatenate([t.mesh.normals for t in things])
         self._texture = np.concatenate([t.mesh.texture for t in things])
         self._ids = np.array([t.instance_id for t in things], np.uint16)
+        self._parts = np.array([t.part_id for t in things], np.uint8)
         vertices = np.concatenate([t.mesh.vertices for t in things]).astype(np.float32)
         self._scene = _scene(o3d, vertices, self._triangles)
         # The sun shines through the walls and the ceiling.
@@ -66,8 +67,8 @@ class Renderer:
         self._lattice = rng.random((32, 32, 32)).astype(np.float32)
         self._offset = rng.uniform(0, 7, (len(things), 3))
 
-    def render(self, camera: Camera, rng: np.random.Generator) -> tuple[UInt8, Float32, NDArray[np.uint16]]:
-        """One view: rgb [H, W, 3], z-depth [H, W] in metres, instance ids [H, W], all through pixel centres.
+    def render(self, camera: Camera, rng: np.random.Generator) -> tuple[UInt8, Float32, NDArray[np.uint16], UInt8]:
+        """One view: rgb [H, W, 3], z-depth [H, W] in metres, instance ids and part ids [H, W], through pixel centres.
 
         Colour is averaged over five rays where a pixel holds an edge; depth and ids are those of the centre.
         """
@@ -81,7 +82,8 @@ class Renderer:
         color[edge] /= 5
         image = 255 * np.clip(color, 0, 1) ** (1 / _GAMMA) + rng.normal(0, _SENSOR_NOISE, color.shape)
         rgb = np.clip(np.round(image), 0, 255).astype(np.uint8).reshape(h, w, 3)
-        return rgb, hits.depth.reshape(h, w), self._ids[hits.thing].reshape(h, w)
+        thing = hits.thing.reshape(h, w)
+        return rgb, hits.depth.reshape(h, w), self._ids[thing], self._parts[thing]
 
     def _cast(self, camera: Camera, u: Float64, v: Float64) -> _Hits:
         local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=1)

@@ -36,6 +36,7 @@ _METRIC_NAMES = {
     "ap50": "AP @ 0.5",
     "ap25": "AP @ 0.25",
     "hungarian_miou": "mIoU, one-to-one",
+    "whole": "Instances in one piece",
     "over_segmentation": "Instances split up",
     "under_segmentation": "Predictions that mix instances",
     "num_truth": "True instances",

@@ -16,6 +16,7 @@ from ss_flow.tasks.evaluate.panoptic import (
     over_segmentation,
     panoptic_quality,
     under_segmentation,
+    whole,
 )
 
 
@@ -104,20 +105,22 @@ def evaluate_masks(
         sides, and a prediction most of which lies on them is no false positive.
     Returns, on the pixels of all views pooled: miou, the mean over the true instances of the best IoU with any
     predicted id; macc25, macc50; pq, sq, rq (class-agnostic video panoptic quality over the whole scene);
-    hungarian_miou (one-to-one); over_segmentation, under_segmentation; and the counts num_truth, num_predicted.
+    hungarian_miou (one-to-one); whole, the share of the true instances that are exactly one predicted id (IoU at
+    least 0.5, and no second id on more than a tenth of it); over_segmentation, under_segmentation; and the counts
+    num_truth, num_predicted.
     Raises InputError when a view lacks its prediction, sizes differ, or nothing is annotated.
     """
     true_ids, ids = pooled(predicted, truth)
-    whole = contingency(true_ids, ids)
+    everything = contingency(true_ids, ids)
     ignored = None
     if zero_is_void:
         annotated = true_ids > 0
         table = contingency(true_ids[annotated], ids[annotated]).without(predicted=0)
         # A prediction that lies on void alone is not in the table at all, hence it is no false positive either.
-        kept = np.isin(whole.predicted_ids, table.predicted_ids)
-        ignored = table.predicted_area < 0.5 * whole.predicted_area[kept]
+        kept = np.isin(everything.predicted_ids, table.predicted_ids)
+        ignored = table.predicted_area < 0.5 * everything.predicted_area[kept]
     else:
-        table = whole.without(truth=0, predicted=0)
+        table = everything.without(truth=0, predicted=0)
     if not len(table.truth_ids):
         raise InputError("The ground truth masks hold no instance; at least one view with one is needed to evaluate.")
     quality = panoptic_quality(table, ignored)
@@ -128,10 +131,11 @@ def evaluate_masks(
             "sq": quality.sq,
             "rq": quality.rq,
             "hungarian_miou": hungarian_miou(table),
+            "whole": float(whole(table).mean()),
             "over_segmentation": over_segmentation(table),
             "under_segmentation": under_segmentation(table),
             "num_truth": float(len(table.truth_ids)),
-            "num_predicted": float((whole.predicted_ids > 0).sum()),
+            "num_predicted": float((everything.predicted_ids > 0).sum()),
         }
     )
 

@@ -1,5 +1,5 @@
 """One-to-one measures of a segmentation: panoptic quality, average precision, Hungarian mIoU, over- and
-under-segmentation.
+under-segmentation, whole instances.
 
 All take the contingency table of instances only (label 0 taken out with `Contingency.without`).
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Float64
-from ss_flow.tasks.evaluate.contingency import Contingency
+from ss_flow.tasks.evaluate.contingency import Contingency, Counts
 
 _MATCH = 0.5
 _COVER = 0.1
@@ -91,3 +91,14 @@ def under_segmentation(table: Contingency) -> float:
     """Share of the predictions of which more than one instance makes up at least 10 % each."""
     made_of = table.intersection >= _COVER * table.predicted_area[None, :]
     return float((made_of.sum(axis=0) > 1).mean()) if made_of.size else 0.0
+
+
+def pieces(table: Contingency) -> Counts:
+    """[G] of how many predictions each covers more than a tenth of the instance."""
+    return (table.intersection > _COVER * table.truth_area[:, None]).sum(axis=1)
+
+
+def whole(table: Contingency) -> NDArray[np.bool_]:
+    """[G] which instances are exactly one prediction: one has an IoU of at least 0.5, and no second covers more than
+    a tenth of the instance."""
+    return (table.best_iou() >= _MATCH) & (pieces(table) == 1)

@@ -138,6 +138,14 @@ def test_predictions_on_void_count_neither_for_nor_against() -> None:
     assert on_it.values["num_predicted"] == 2
 
 
+def test_the_share_of_whole_instances_is_that_counted_by_hand() -> None:
+    truth = _maps([[1, 1, 1, 1, 2, 2, 2, 2, 0, 0, 0, 0]], [[1, 1, 1, 1, 3, 3, 3, 3, 0, 0, 0, 0]])
+    # 1 is 5 in one view and 6 in the other; 2 is 7; 3 is 8, which reaches far into 0.
+    predicted = _maps([[5, 5, 5, 5, 7, 7, 7, 0, 0, 0, 0, 8]], [[6, 6, 6, 6, 8, 8, 8, 8, 8, 8, 8, 8]])
+    assert evaluate_masks(predicted, truth).values["whole"] == pytest.approx(1 / 3)
+    assert evaluate_masks(predicted, truth, zero_is_void=True).values["whole"] == pytest.approx(2 / 3)
+
+
 def test_an_unmatched_prediction_is_a_false_positive_only_when_it_lies_mostly_on_annotated_pixels() -> None:
     truth = _maps([[1, 1, 1, 1, 1, 1, 0, 0, 0, 0]])
     good = [5, 5, 5, 5]

@@ -16,7 +16,9 @@ from ss_flow.tasks.evaluate.panoptic import (
     hungarian_miou,
     over_segmentation,
     panoptic_quality,
+    pieces,
     under_segmentation,
+    whole,
 )
 
 _IDS = hnp.arrays(np.int64, 24, elements=st.integers(0, 4))
@@ -67,10 +69,33 @@ def test_over_and_under_segmentation_count_shares_of_a_tenth_and_more() -> None:
     assert under_segmentation(_table(truth, [3] * 40)) == 1
 
 
+def test_a_thing_is_whole_when_one_prediction_fits_it_and_no_second_covers_more_than_a_tenth() -> None:
+    truth = np.repeat([1, 2, 3, 4, 5, 0], 10)
+    predicted = [5] * 9 + [6] + [7] * 8 + [8] * 2 + [9] * 4 + [0] * 6 + [10] * 20 + [11] * 10
+    table = _table(truth, predicted)
+    assert pieces(table).tolist() == [1, 2, 1, 1, 1], "exactly a tenth is not yet a piece"
+    # 1: IoU 0.9; 2: 0.8, but a fifth of it is another id; 3: IoU 0.4; 4 and 5: one id on both, IoU 0.5 each.
+    assert whole(table).tolist() == [True, False, False, True, True]
+    assert whole(_table([1] * 10 + [0], [5] * 11)).tolist() == [True], "10/11"
+    assert whole(_table([1] * 9 + [2] * 11, [5] * 20)).tolist() == [False, True], "what is merged into more is not"
+
+
+@given(_IDS.filter(lambda x: x.any()), _IDS, st.permutations(range(1, 6)))
+def test_whole_things_are_matched_ones_and_the_names_of_predictions_do_not_matter(
+    truth: np.ndarray, predicted: np.ndarray, names: list[int]
+) -> None:
+    table = _table(truth, predicted)
+    assert whole(_table(truth, truth)).all()
+    assert (whole(table) <= (table.best_iou() >= 0.5)).all() and (whole(table) <= (pieces(table) == 1)).all()
+    renamed = np.where(predicted > 0, np.array([0, *names])[predicted], 0)
+    assert whole(_table(truth, renamed)).tolist() == whole(table).tolist()
+
+
 def test_an_empty_prediction_scores_zero_everywhere() -> None:
     table = _table([1, 2], [0, 0])
     assert panoptic_quality(table) == (0, 0, 0, 0, 0, 2)
     assert hungarian_miou(table) == over_segmentation(table) == under_segmentation(table) == 0
+    assert not whole(table).any() and not pieces(table).any()
 
 
 def test_average_precision_is_the_area_under_the_monotone_precision() -> None:

@@ -1,0 +1,138 @@
+"""How many things are exactly one instance: Split with a segmenter's masks on generated rooms of composite things.
+
+    python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...] [--gripper]
+                                          [--store DIR] [--look DIR]
+
+SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
+whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
+a tenth), mIoU, PQ, over- and under-segmentation, in per cent; the predicted ids, the true things, seconds. Then for
+each thing its best IoU, and of how many predicted ids each covers more than a tenth of it. With --store, rooms and
+results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
+shades) and prediction of some views.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+from ss_flow.flows import settings
+from ss_flow.flows.cli.context import file_digests
+from ss_flow.flows.cli.prepare import RunOptions, prepare
+from ss_flow.flows.generated import RoomParams, generate, write_scene
+from ss_flow.flows.params import Params
+from ss_flow.tasks.artifacts import Frame, LabelMap
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.evaluate.contingency import Contingency, contingency
+from ss_flow.tasks.evaluate.instances import evaluate_masks, pooled
+from ss_flow.tasks.evaluate.panoptic import pieces, whole
+from ss_flow.tasks.geometry.images import decode_rgb, encode_png
+
+ROOM = RoomParams(composite=True, views=24, width=480, height=360, held_out=0)
+COLUMNS = ("whole", "miou", "pq", "over_segmentation", "under_segmentation")
+COUNTS = ("num_predicted", "num_truth")
+STEPS = "ingest", "masks_split"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What Split made of a room, and what is in it."""
+
+    frames: tuple[Frame, ...]
+    truth: tuple[LabelMap, ...]
+    predicted: tuple[LabelMap, ...]
+    seconds: float
+
+
+def folder_of(room: RoomParams, place: Path) -> Path:
+    """The capture of a room; it is written first where it is not there."""
+    folder = place / f"composite-{room.seed}{'-gripper' * room.gripper}"
+    if not folder.exists():
+        write_scene(generate(room), folder)
+    return folder
+
+
+def outcome(folder: Path, params: Params, store: Store) -> Outcome:
+    """Run Split on a capture and read what came of it."""
+    prepared = prepare(open_scene(folder), params, RunOptions(), file_digests(store))
+
+    def build() -> dict[str, Any]:
+        return {name: node for name, node in prepared.build().items() if name in STEPS}
+
+    begun = time.perf_counter()
+    values: dict[str, Any] = run_flow(build, store, scene=prepared.name, header={}).values
+    seconds = time.perf_counter() - begun
+    frames, predicted = (tuple(store.get(digest) for digest in values[name]) for name in STEPS)
+    truth = tuple(LabelMap(frame.name, _ids(folder / "instance" / f"{frame.name}.png")) for frame in frames)
+    return Outcome(frames, truth, predicted, seconds)
+
+
+def things(folder: Path, table: Contingency) -> list[str]:
+    """A line for each thing: best IoU, predicted ids on more than a tenth of it, whether it is whole."""
+    names = json.loads((folder / "instances.json").read_text())
+    columns = zip(table.truth_ids, table.best_iou(), pieces(table), whole(table), strict=True)
+    return [
+        f"| {names[str(i)]} | {100 * iou:.1f} | {count} | {'whole' if one else ''} |" for i, iou, count, one in columns
+    ]
+
+
+def look(found: Outcome, folder: Path, place: Path) -> None:
+    """Photo, truth and prediction of every fourth view, and of the close view after it."""
+    place.mkdir(parents=True, exist_ok=True)
+    colors = np.random.default_rng(3).integers(40, 255, (65536, 3)).astype(np.uint8)
+    colors[0] = 0
+    rows = []
+    for i in [i for i in range(len(found.frames)) if i % 4 < 2]:
+        parts = _ids(folder / "part" / f"{found.frames[i].name}.png")
+        truth = colors[found.truth[i].ids] * (1 - 0.12 * (parts % 6))[..., None]
+        row = [decode_rgb(found.frames[i]), truth.astype(np.uint8), colors[found.predicted[i].ids]]
+        rows.append(np.hstack(row))
+    for page in range(0, len(rows), 4):
+        path = place / f"{folder.name}-{page // 4}.png"
+        path.write_bytes(encode_png(np.vstack(rows[page : page + 4])).tobytes())
+
+
+def _ids(path: Path) -> np.ndarray:
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--set", nargs="*", default=[])
+    parser.add_argument("--gripper", action="store_true", help="with a gripper before the lens")
+    parser.add_argument("--store", type=Path, help="a store to keep")
+    parser.add_argument("--look", type=Path, help="a folder for pictures")
+    args = parser.parse_args()
+    params = settings.apply(settings.preset(Params(), args.preset), args.set)
+    with nullcontext(args.store) if args.store else tempfile.TemporaryDirectory() as kept:
+        for seed in args.seeds:
+            folder = folder_of(replace(ROOM, seed=seed, gripper=args.gripper), Path(kept))
+            found = outcome(folder, params, Store(Path(kept)))
+            values = evaluate_masks(found.predicted, found.truth).values
+            cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]
+            print(f"\n| seed | {' | '.join(COLUMNS + COUNTS)} | seconds |")
+            print("|---" * (len(cells) + 2) + "|")
+            print(f"| {seed} | {' | '.join(cells)} | {found.seconds:.0f} | (load {os.getloadavg()[0]:.1f})\n")
+            table = contingency(*pooled(found.predicted, found.truth)).without(truth=0, predicted=0)
+            print("| thing | best IoU | ids on it | |\n|---|---|---|---|")
+            print("\n".join(things(folder, table)), flush=True)
+            if args.look:
+                look(found, folder, args.look)
+
+
+if __name__ == "__main__":
+    main()
