@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Float32, Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.artifacts import Float32, Frame, Gaussians, Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.semantics.name import InstanceNames
+
+_CRUMB = 0.001
+"""Share of the views that show an instance which it must fill not to be a crumb."""
 
 
 def instances_document(
@@ -17,34 +20,40 @@ def instances_document(
     gaussians: Gaussians | None,
     names: InstanceNames | None,
     frames: Sequence[Frame],
-    *,
-    parents: Mapping[int, int] | None = None,
+    tree: Hierarchy | None = None,
 ) -> dict[str, Any]:
     """The content of instances.json, ready for `json.dumps`.
 
     instances: after Split or refinement; the background (id 0) is left out. gaussians: the whole scene; without them an
     instance has no Gaussians and its box is that of its points. names: without them, or where they know nothing, an
-    instance is "object 7" by its id. frames: of all views, in the scene's order. parents: id of a part -> id of the
-    whole.
+    instance is "object 7" by its id. frames: of all views, in the scene's order. tree: what the instances are parts of
+    and which are stuff; without it, all are things on their own.
 
-    Each instance has: id, name, named_by (the encoder, "hints" for a name of the user's own, or null), color [r, g, b],
-    parent (id or null), bbox {min, max} and centroid in world units (null without points and Gaussians), views (names),
-    confidence, num_parts, num_points, num_gaussians, weak, and file ("instances/0007.ply", null without Gaussians).
-    Names are unique: of several "red object" the later ones, by id, are "red object 2" and so on; the user's own stay.
+    Each instance has: id, name, named_by (the encoder, "hints" for a name of the user's own, or null), kind ("thing" or
+    "stuff"), color [r, g, b], parent (the smallest group that holds it, or null), parts (part_id, num_points, bbox and
+    centroid of each), bbox {min, max} and centroid in world units (null without points and Gaussians), views (names),
+    confidence, num_parts, num_points, num_gaussians, weak, crumb (weak, or it hardly fills anything of the views that
+    show it), and file ("instances/0007.ply", null for a crumb and without Gaussians). Names are unique: of several
+    "red object" the later ones, by id, are "red object 2" and so on; the user's own stay. The groups follow: id,
+    parent, agreement (share of the views which show it as one thing), instances (ids).
     """
     known = sorted((i for i in instances if i.instance_id != 0), key=lambda i: i.instance_id)
     called = _unique_names([i.instance_id for i in known], names)
     rows_of = _rows_by_instance(gaussians)
+    stuff, parents = _kinds_and_parents(tree)
     entries = []
     for instance in known:
         rows = rows_of.get(instance.instance_id, np.zeros(0, np.intp))
         places = gaussians.means[rows] if gaussians is not None and len(rows) else instance.points
+        crumb = _is_crumb(instance)
         entry = {
             "id": instance.instance_id,
             "name": called[instance.instance_id],
             "named_by": _named_by(instance.instance_id, names),
+            "kind": "stuff" if instance.instance_id in stuff else "thing",
             "color": list(instance_color(instance.instance_id)),
-            "parent": (parents or {}).get(instance.instance_id),
+            "parent": parents.get(instance.instance_id),
+            "parts": _parts(instance),
             **_place(places),
             "views": [frames[view].name for view in instance.view],
             "confidence": round(float(instance.confidence), 4),
@@ -52,15 +61,64 @@ def instances_document(
             "num_points": len(instance.points),
             "num_gaussians": len(rows),
             "weak": bool(instance.weak),
-            "file": instance_file(instance.instance_id) if len(rows) else None,
+            "crumb": crumb,
+            "file": instance_file(instance.instance_id) if len(rows) and not crumb else None,
         }
         entries.append(entry)
-    return {"version": 1, "background_id": 0, "instances": entries}
+    return {
+        "version": 1,
+        "background_id": 0,
+        "num_crumbs": sum(entry["crumb"] for entry in entries),
+        "instances": entries,
+        "groups": _groups([entry["id"] for entry in entries], tree, parents),
+    }
 
 
 def instance_file(instance_id: int) -> str:
     """Where an instance's own PLY lies in the output folder: "instances/0007.ply"."""
     return f"instances/{instance_id:04d}.ply"
+
+
+def _kinds_and_parents(tree: Hierarchy | None) -> tuple[set[int], dict[int, int]]:
+    if tree is None:
+        return set(), {}
+    parents = {int(node): int(parent) for node, parent in zip(tree.node, tree.parent, strict=True) if parent}
+    return set(tree.node[tree.stuff].tolist()), parents
+
+
+def _groups(ids: Sequence[int], tree: Hierarchy | None, parents: dict[int, int]) -> list[dict[str, Any]]:
+    """What the instances are parts of, the smallest groups first."""
+    members: dict[int, list[int]] = {}
+    for instance_id in ids:
+        above = parents.get(instance_id)
+        while above is not None:
+            members.setdefault(above, []).append(instance_id)
+            above = parents.get(above)
+    if tree is None:
+        return []
+    return [
+        {
+            "id": int(node),
+            "parent": parents.get(int(node)),
+            "agreement": round(float(share), 4),
+            "instances": members[int(node)],
+        }
+        for node, share in zip(tree.node, tree.agreement, strict=True)
+        if int(node) in members
+    ]
+
+
+def _parts(instance: InstanceMasks) -> list[dict[str, Any]]:
+    found = []
+    for part in range(1, int(instance.point_part.max(initial=0)) + 1):
+        own = instance.points[instance.point_part == part]
+        found.append({"part_id": part, "num_points": len(own), **_place(own)})
+    return found
+
+
+def _is_crumb(instance: InstanceMasks) -> bool:
+    pixels = instance.height * instance.width * len(instance.view)
+    return instance.weak or int(np.bitwise_count(instance.packed).sum()) < _CRUMB * pixels
 
 
 def _named_by(instance_id: int, names: InstanceNames | None) -> str | None:

@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap, PointCloud, PointLabels, PointParts
 from ss_flow.tasks.deliver import ply
@@ -71,17 +69,17 @@ def replacing(folder: Path) -> Iterator[Path]:
 
 
 def write_scene(folder: Path, scene: Gaussians, instances: Mapping[str, Any]) -> None:
-    """Write scene.ply, scene_labeled.ply, instances.json, and a PLY file for every instance."""
+    """Write scene.ply, scene_labeled.ply, instances.json, and a PLY file for every instance that it names one for."""
     ply.write_gaussians(folder / "scene.ply", scene)
     ply.write_gaussians(folder / "scene_labeled.ply", scene, labelled=True)
     (folder / "instances.json").write_text(json.dumps(instances, indent=1), encoding="utf-8")
     (folder / "instances").mkdir()
     from ss_flow.tasks.gaussians.initialise import select
 
-    for instance_id in np.unique(scene.instance_id):
-        if instance_id > 0:
-            one = select(scene, scene.instance_id == instance_id)
-            ply.write_gaussians(folder / "instances" / f"{instance_id:04d}.ply", one, labelled=True)
+    for entry in instances["instances"]:
+        if entry["file"]:
+            one = select(scene, scene.instance_id == entry["id"])
+            ply.write_gaussians(folder / entry["file"], one, labelled=True)
 
 
 def write_cloud(folder: Path, cloud: PointCloud, labels: PointLabels, parts: PointParts) -> None:

@@ -62,6 +62,8 @@ def report_html(
     template = resources.files(__package__ or "").joinpath("report.html.jinja").read_text(encoding="utf-8")
     views, others = _views(pictures)
     nodes = list(run.get("nodes") or ())
+    # Large things first, walls and floors after them.
+    listed = sorted((instances or {}).get("instances", []), key=lambda e: (e["kind"] == "stuff", -e["num_points"]))
     return environment.from_string(template).render(
         scene=PurePath(str(run.get("scene") or "")).name or "scene",
         status=run.get("status") or "unknown",
@@ -76,7 +78,8 @@ def report_html(
         peak=max((float(node.get("peak_rss_mb") or 0) for node in nodes), default=0.0),
         views=views,
         others=others,
-        instances=(instances or {}).get("instances", []),
+        instances=[entry for entry in listed if not entry["crumb"]],
+        crumbs=[entry for entry in listed if entry["crumb"]],
     )
 
 

@@ -18,7 +18,7 @@ def tally(visibility: Visibility, masks: MaskSet, labels: PointLabels) -> Tally:
     label = labels.label[visibility.point_index]
     pixel, label = visibility.pixel[label > 0], label[label > 0]
     names, column = np.unique(label, return_inverse=True)
-    under = masks.dense().reshape(len(masks), -1)[:, pixel]
+    under = masks.dense().reshape(len(masks), masks.height * masks.width)[:, pixel]
     held = np.array([np.bincount(column[mask], minlength=len(names)) for mask in under], np.int32)
     return Tally(
         name=visibility.name,

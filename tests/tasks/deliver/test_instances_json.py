@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.artifacts import Frame, Gaussians, Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.instances_json import instance_file, instances_document
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.semantics.name import InstanceNames
@@ -11,12 +11,12 @@ NOTHING = np.zeros(0, np.uint8)
 FRAMES = tuple(Frame(name, 4, 2, NOTHING, NOTHING, 4, 2) for name in "abc")
 
 
-def instance(instance_id: int, points, views=(0, 2), weak: bool = False) -> InstanceMasks:
+def instance(instance_id: int, points, views=(0, 2), weak: bool = False, shown: int = 0b11110000) -> InstanceMasks:
     points = np.asarray(points, np.float32).reshape(-1, 3)
     n, v = len(points), len(views)
     return InstanceMasks(
         instance_id, points, np.zeros((n, 3), np.uint8), np.ones(n, np.float32), np.arange(n, dtype=np.int32),
-        0.87654321, 2, 4, np.array(views, np.int32), np.zeros((v, 1), np.uint8), np.zeros(v, np.uint8), weak,
+        0.87654321, 2, 4, np.array(views, np.int32), np.full((v, 1), shown, np.uint8), np.zeros(v, np.uint8), weak,
     )  # fmt: skip
 
 
@@ -34,13 +34,18 @@ def test_an_instance_is_described_by_its_points():
     assert json.loads(json.dumps(document)) == {
         "version": 1,
         "background_id": 0,
+        "num_crumbs": 0,
         "instances": [
             {
                 "id": 7,
                 "name": "object 7",
                 "named_by": None,
+                "kind": "thing",
                 "color": list(instance_color(7)),
                 "parent": None,
+                "parts": [
+                    {"part_id": 1, "num_points": 1, "bbox": {"min": [2, 4, 6], "max": [2, 4, 6]}, "centroid": [2, 4, 6]}
+                ],
                 "bbox": {"min": [0, 0, 0], "max": [2, 4, 6]},
                 "centroid": [1, 2, 3],
                 "views": ["a", "c"],
@@ -49,9 +54,11 @@ def test_an_instance_is_described_by_its_points():
                 "num_points": 2,
                 "num_gaussians": 0,
                 "weak": False,
+                "crumb": False,
                 "file": None,
             }
         ],
+        "groups": [],
     }
 
 
@@ -91,10 +98,29 @@ def test_names_that_the_user_gave_stay_and_are_told_from_those_of_the_encoder():
     assert found == [("mug 2", "clip"), ("mug", "hints"), ("my lamp", "hints")]
 
 
-def test_the_background_is_no_instance_and_parts_know_their_whole():
-    three = [instance(i, [[0, 0, 0]]) for i in (0, 1, 2)]
-    entries = instances_document(three, None, None, FRAMES, parents={2: 1})["instances"]
-    assert [(e["id"], e["parent"]) for e in entries] == [(1, None), (2, 1)]
+def test_the_background_is_no_instance_and_instances_know_their_groups_and_kind():
+    # 5 = {1, 2} is no instance but a group; so is 6 = {5, 3}. 4 is a wall.
+    tree = Hierarchy(
+        np.array([1, 2, 3, 4, 5, 6], np.int32),
+        np.array([5, 5, 6, 0, 6, 0], np.int32),
+        np.array([1, 1, 1, 1, 0.4, 0.25], np.float32),
+        np.array([False, False, False, True, False, False]),
+    )
+    known = [instance(i, [[0, 0, 0]]) for i in (0, 1, 2, 3, 4)]
+    document = instances_document(known, None, None, FRAMES, tree)
+    found = [(e["id"], e["parent"], e["kind"]) for e in document["instances"]]
+    assert found == [(1, 5, "thing"), (2, 5, "thing"), (3, 6, "thing"), (4, None, "stuff")]
+    assert document["groups"] == [
+        {"id": 5, "parent": 6, "agreement": 0.4, "instances": [1, 2]},
+        {"id": 6, "parent": None, "agreement": 0.25, "instances": [1, 2, 3]},
+    ]
+
+
+def test_crumbs_are_counted_and_have_no_file():
+    scene = gaussians([[1, 0, 0], [1, 0, 0]], [7, 8])
+    document = instances_document([instance(7, [[0, 0, 0]], shown=0), instance(8, [[0, 0, 0]])], scene, None, FRAMES)
+    assert [(e["crumb"], e["file"]) for e in document["instances"]] == [(True, None), (False, "instances/0008.ply")]
+    assert document["num_crumbs"] == 1
 
 
 def test_an_instance_without_points_has_no_place():

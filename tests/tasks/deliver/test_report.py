@@ -26,7 +26,15 @@ RUN = {
 }
 INSTANCE = {
     **{"id": 3, "name": "red <b>mug</b>", "color": [1, 2, 3], "views": ["a", "b"], "num_points": 12345},
-    **{"num_gaussians": 0, "confidence": 0.9, "weak": True, "file": None},
+    **{
+        "num_gaussians": 0,
+        "confidence": 0.9,
+        "weak": True,
+        "file": None,
+        "kind": "thing",
+        "num_parts": 0,
+        "crumb": False,
+    },
 }
 
 
@@ -68,6 +76,15 @@ def test_what_the_run_says_is_on_the_page():
         "red <b>mug</b> (weak: points only)", "12,345", "812 MB", "Nodes computed 2", "From the cache 1",
     ):  # fmt: skip
         assert text in page.text, text
+
+
+def test_crumbs_are_folded_away_and_stuff_comes_after_things():
+    def entry(name: str, **changes):
+        return INSTANCE | {"name": name, "weak": False} | changes
+
+    listed = [entry("wall", kind="stuff", num_points=9), entry("speck", crumb=True), entry("mug", num_points=5)]
+    text = Page(report_html(RUN, pictures={}, instances={"instances": listed})).text
+    assert text.index("mug") < text.index("wall") < text.index("1 crumbs") < text.index("speck")
 
 
 def test_metrics_read_as_words_and_counts_as_whole_numbers():

@@ -1,0 +1,60 @@
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ss_flow.tasks.artifacts import Hierarchy, PointLabels, PointParts
+from ss_flow.tasks.split.cut import cut, cut_parts
+
+# 6 = {1, 2} is a thing, 7 = {6, 3} a group; 4 stands alone, label 5 has lost its points.
+TREE = Hierarchy(
+    np.array([1, 2, 3, 4, 6, 7], np.int32),
+    np.array([6, 6, 7, 0, 7, 0], np.int32),
+    np.array([1, 1, 1, 1, 0.8, 0.3], np.float32),
+    np.zeros(6, bool),
+)
+LABELS = PointLabels(
+    label=np.array([1, 1, 1, 2, 2, 3, 4, 0], np.int32),
+    confidence=np.linspace(0, 1, 8, dtype=np.float32),
+    num_labels=5,
+    match_view=np.array([0, 0, 1, 1], np.int32),
+    match_mask=np.array([0, 1, 0, 1], np.int32),
+    match_label=np.array([1, 2, 5, 4], np.int32),
+    match_purity=np.ones(4, np.float32),
+)
+
+
+def test_granularity_moves_the_cut_from_parts_to_things_to_groups():
+    assert cut(LABELS, TREE, granularity=1.0).label.tolist() == LABELS.label.tolist()
+    assert cut(LABELS, TREE, granularity=0.5).label.tolist() == [6, 6, 6, 6, 6, 3, 4, 0]
+    assert cut(LABELS, TREE, granularity=0.2).label.tolist() == [7, 7, 7, 7, 7, 7, 4, 0]
+
+
+def test_masks_follow_their_labels_and_ids_are_those_of_the_tree():
+    things = cut(LABELS, TREE, granularity=0.5)
+    assert things.match_label.tolist() == [6, 6, 5, 4] and things.num_labels == 7
+    assert things.confidence.tolist() == LABELS.confidence.tolist()
+
+
+def test_a_group_on_which_the_views_agree_more_than_on_its_things_is_taken_whole():
+    odd = Hierarchy(TREE.node, TREE.parent, np.array([1, 1, 1, 1, 0.3, 0.8], np.float32), TREE.stuff)
+    assert cut(LABELS, odd, granularity=0.5).label.tolist() == [7, 7, 7, 7, 7, 7, 4, 0]
+
+
+def test_parts_are_what_an_instance_is_made_of_the_largest_first():
+    parts = PointParts(np.array([1, 0, 0, 0, 0, 2, 1, 0], np.int32))
+    things = cut(LABELS, TREE, granularity=0.5)
+    # Of instance 6: two points of label 1, two of label 2, and the one that is a part of label 1.
+    assert cut_parts(LABELS, parts, things).part.tolist() == [3, 1, 1, 2, 2, 2, 1, 0]
+
+
+def test_labels_left_as_they_are_keep_their_parts():
+    parts = PointParts(np.array([1, 0, 0, 0, 0, 2, 1, 0], np.int32))
+    assert cut_parts(LABELS, parts, cut(LABELS, TREE, granularity=1.0)).part.tolist() == parts.part.tolist()
+
+
+@given(st.floats(0, 1), st.floats(0, 1))
+@settings(deadline=None)
+def test_a_lower_granularity_never_takes_apart(a, b):
+    fine, coarse = (cut(LABELS, TREE, granularity=g).label for g in (max(a, b), min(a, b)))
+    for name in np.unique(fine):
+        assert len(np.unique(coarse[fine == name])) == 1

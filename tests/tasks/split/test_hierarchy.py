@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels, Tally
+from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+
+SEES = 100
+"""Points that a view sees of each label."""
+
+
+def tally(masks: list[tuple[set[int], float]], sees: set[int], name: str = "a") -> Tally:
+    """A view that sees some labels, and masks that hold all points of theirs: (labels, quality)."""
+    label = np.array(sorted(sees), np.int32)
+    held = np.array([[SEES * (i in of) for i in label] for of, _ in masks], np.int32).reshape(len(masks), len(label))
+    quality = np.array([q for _, q in masks], np.float32)
+    return Tally(name, label, np.full(len(label), SEES, np.int32), held, quality)
+
+
+def tree(tallies: list[Tally], labels: int, **changes) -> Hierarchy:
+    """Labels 1.., each a ball of points far from the others, so that none is flat."""
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(20 * labels, 3)).astype(np.float32)
+    places[:, 0] += 9 * np.repeat(np.arange(labels), 20)
+    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.1)
+    label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), 20)
+    nothing = np.zeros(0, np.int32)
+    given = PointLabels(
+        label, np.ones(len(label), np.float32), labels, nothing, nothing, nothing, np.zeros(0, np.float32)
+    )
+    sizes, intrinsics = np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]])
+    cameras = Cameras(("a",), sizes, intrinsics, np.eye(4)[None], True)
+    return hierarchy(cloud, cameras, given, tallies, params=HierarchyParams(prior=0.0, **changes))
+
+
+def unions(found: Hierarchy) -> dict[frozenset[int], float]:
+    """The leaves of each union, and its agreement."""
+    children: dict[int, list[int]] = {}
+    for node, parent in zip(found.node.tolist(), found.parent.tolist(), strict=True):
+        children.setdefault(parent, []).append(node)
+
+    def leaves(node: int) -> set[int]:
+        return set().union(*map(leaves, children[node])) if node in children else {node}
+
+    agreement = dict(zip(found.node.tolist(), found.agreement.tolist(), strict=True))
+    return {frozenset(leaves(n)): pytest.approx(agreement[n], abs=1e-4) for n in children if n}
+
+
+def test_what_most_views_show_under_one_mask_is_one():
+    faces = [({1, 2}, 0.9), ({1}, 0.9), ({2}, 0.9)]
+    apart = [({1}, 0.9), ({2}, 0.9)]
+    found = tree([tally(faces, {1, 2, 3}), tally(faces, {1, 2, 3}), tally(apart, {1, 2})], 3)
+    assert unions(found) == {frozenset({1, 2}): 2 / 3}
+    assert found.node.tolist() == [1, 2, 3, 4] and found.parent.tolist() == [4, 4, 0, 0]
+
+
+def test_views_that_see_one_piece_alone_have_no_say():
+    views = [tally([({1, 2}, 0.9)], {1, 2})] + [tally([({1}, 0.9)], {1})] * 5
+    assert unions(tree(views, 2)) == {frozenset({1, 2}): 1.0}
+
+
+def test_a_box_is_whole_though_no_view_sees_all_its_faces():
+    views = [tally([(set(pair), 0.9), ({pair[0]}, 0.9)], set(pair)) for pair in ((1, 2), (2, 3), (3, 4), (4, 1))]
+    assert frozenset({1, 2, 3, 4}) in unions(tree(views, 4))
+
+
+def test_a_mask_of_two_things_of_which_the_segmenter_is_less_sure_is_a_group_at_most():
+    # Sure of each thing (0.95) and in doubt of both together (0.8): with a doubt of 0.2, a quarter remains.
+    views = [tally([({1, 2}, 0.8), ({1}, 0.95), ({2}, 0.95)], {1, 2})] * 3
+    assert unions(tree(views, 2, doubt=0.2)) == {frozenset({1, 2}): 0.25}
+    assert unions(tree(views, 2, doubt=0.2, min_agreement=0.3)) == {}
+
+
+def test_the_best_union_comes_first_and_becomes_a_piece_of_the_next():
+    masks = [({1, 2}, 0.9), ({1, 2, 3}, 0.9)]
+    views = [tally(masks, {1, 2, 3}), tally(masks[:1], {1, 2, 3})]
+    found = tree(views, 3)
+    assert unions(found) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.5}
+    assert found.parent.tolist() == [4, 4, 5, 5, 0]
+
+
+def test_a_crumb_that_a_view_hardly_sees_neither_speaks_for_nor_against():
+    tiny = Tally("a", np.array([1, 2], np.int32), np.array([SEES, 3], np.int32), np.array([[SEES, 0]], np.int32),
+                 np.array([0.9], np.float32))  # fmt: skip
+    assert unions(tree([tally([({1, 2}, 0.9)], {1, 2}), tiny, tiny], 2)) == {frozenset({1, 2}): 1.0}
+
+
+def test_without_views_or_labels_there_is_no_union():
+    assert unions(tree([], 3)) == {}
+    assert len(tree([tally([], set())], 0).node) == 0
+
+
+subsets = st.sets(st.integers(1, 5), min_size=1)
+masks = st.lists(st.tuples(subsets, st.sampled_from([0.7, 0.8, 0.9])), max_size=5)
+
+
+@given(st.lists(st.tuples(masks, subsets), min_size=1, max_size=5), st.randoms())
+@settings(deadline=None, max_examples=60)
+def test_neither_the_order_of_views_nor_that_of_masks_matters(views, random):
+    def of(views):
+        made = [tally([(m & sees, q) for m, q in of if m & sees], sees) for of, sees in views]
+        return tree(made, 5)
+
+    before = of(views)
+    mixed = [(random.sample(of, len(of)), sees) for of, sees in random.sample(views, len(views))]
+    after = of(mixed)
+    assert before.node.tolist() == after.node.tolist() and before.parent.tolist() == after.parent.tolist()
+    assert np.allclose(before.agreement, after.agreement)

@@ -1,0 +1,31 @@
+import numpy as np
+
+from ss_flow.tasks.artifacts import PointLabels, Visibility
+from ss_flow.tasks.split.mask_pool import mask_set
+from ss_flow.tasks.split.tally import tally
+
+
+def labelled(label) -> PointLabels:
+    nothing = np.zeros(0, np.int32)
+    label = np.array(label, np.int32)
+    return PointLabels(
+        label, np.ones(len(label), np.float32), int(label.max()), nothing, nothing, nothing, np.zeros(0, np.float32)
+    )
+
+
+def test_a_point_counts_under_every_mask_that_holds_it():
+    # A row of six pixels, a point on each; points 1 and 5 are not seen, point 4 has no label.
+    labels = labelled([3, 3, 3, 8, 0, 8, 8])
+    seen = np.array([0, 2, 3, 4, 6], np.int32)
+    view = Visibility("a", seen, np.array([0, 1, 2, 3, 4], np.int32), np.ones(5, np.float32), 1, 6)
+    masks = np.array([[[1, 1, 1, 1, 1, 0]], [[0, 1, 0, 0, 0, 0]]], bool)
+    counted = tally(view, mask_set("a", masks, np.array([0.9, 1.2], np.float32), "test"), labels)
+    assert counted.label.tolist() == [3, 8] and counted.seen.tolist() == [2, 2]
+    assert counted.held.tolist() == [[2, 2], [1, 0]]
+    assert np.allclose(counted.quality, [0.9, 1.0])
+
+
+def test_a_view_without_masks_still_says_what_it_sees():
+    view = Visibility("a", np.array([0], np.int32), np.array([0], np.int32), np.ones(1, np.float32), 1, 2)
+    counted = tally(view, mask_set("a", np.zeros((0, 1, 2), bool), np.zeros(0, np.float32), "test"), labelled([1]))
+    assert counted.seen.tolist() == [1] and counted.held.shape == (0, 1)
