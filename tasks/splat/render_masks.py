@@ -15,6 +15,7 @@ from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.images import decode_valid, depth_at_frame_size
+from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.splat.groups import rasterizer
 
 _LABELS_AT_ONCE = 16
@@ -32,6 +33,8 @@ _FRINGE = 5.0
 class RenderMasksParams:
     """When the finished scene overrules a refined mask."""
 
+    share: Fraction = 0.65
+    """How much of a pixel an instance must make up to take it, as a share of its alpha; 0 = more than any other."""
     background: Literal["fringe", "anywhere"] = "fringe"
     """Where the background may take a pixel of a mask: "fringe" - near the mask's border, if the depth is known there,
     as what an instance lacks Gaussians for shows background too; or "anywhere"."""
@@ -55,15 +58,15 @@ def render_masks(
     """The instance that weighs most in each pixel of each view, all Gaussians composited together (spec P5).
 
     0 where that is the background, where the scene leaves a hole, and where a frame is not valid. A pixel keeps its
-    refined id where that weighs half as much or more, and where `params` keeps the background from it; an instance that
-    has masks but no Gaussians keeps what the scene calls background.
+    refined id where that weighs half as much or more, and where `params` holds the other instance or the background
+    off; an instance that has masks but no Gaussians keeps what the scene calls background.
 
     refined: the exclusive masks after refinement. frames, depths, refined: of all views.
     """
     absent = np.setdiff1d(np.arange(np.iinfo(np.uint16).max + 1), scene.instance_id)
     maps = []
     for view, (frame, depth, known) in enumerate(zip(frames, depths, refined, strict=True)):
-        ids = _ids_of_view(scene, camera_of(cameras, view), known)
+        ids = _ids_of_view(scene, camera_of(cameras, view), known, params.share)
         keeps = np.isin(known.ids, absent)
         if params.background == "fringe":
             keeps |= ~(_at_border(known.ids) & (depth_at_frame_size(depth, frame) > 0))
@@ -83,7 +86,7 @@ def _at_border(ids: np.ndarray) -> Bool:
     return cv2.erode(ids, window) != cv2.dilate(ids, window)
 
 
-def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap) -> np.ndarray:
+def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap, share: float) -> np.ndarray:
     """[H, W] uint16."""
     whole = render(scene, camera)
     shown = select(scene, whole.visible)
@@ -99,4 +102,5 @@ def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap) -> np.ndarra
             np.copyto(of_known, weight, where=known.ids == label)
     ids[whole.alpha < _SOLID] = 0
     keeps = (of_known > 0) & (of_known >= _BENEFIT * heaviest)
+    keeps |= (ids > 0) & (heaviest < share * whole.alpha)
     return np.where(keeps, known.ids, ids)

@@ -149,6 +149,7 @@ TABLE = {
     "splat.reconstruct.warm_start": (False, False, True),
     # Masks made exclusive again, the smaller on top (P4), and those of the finished scene.
     "splat.resolve.contested": ("smaller", "smaller", "points"),
+    "splat.masks.share": (0.0, 0.0, 0.65),
     "splat.masks.background": ("anywhere", "anywhere", "fringe"),
     "splat.plan.bbox_quantile": (0.0, 0.0, 0.005),
     # 32, 33: both also as the specification words its options (A20, A21).

@@ -163,7 +163,7 @@ def test_thinning_keeps_points_spread_over_the_whole_surface():
     assert cells.min() > 5
 
 
-def drawn(built, scene, maps=None, frames=None, depths=None, background="fringe"):
+def drawn(built, scene, maps=None, frames=None, depths=None, **params):
     """The masks that a finished scene shows."""
     return render_masks(
         frames or built.scene.frames,
@@ -171,7 +171,7 @@ def drawn(built, scene, maps=None, frames=None, depths=None, background="fringe"
         depths or built.scene.depths,
         scene,
         maps or built.scene.maps,
-        params=RenderMasksParams(background),
+        params=RenderMasksParams(**params),
     )
 
 
@@ -205,6 +205,19 @@ def test_the_background_takes_no_more_of_a_mask_than_its_fringe_and_only_where_d
         assert not (taken & (cv2.erode(maps.ids, np.ones((3, 3))) == cv2.dilate(maps.ids, np.ones((3, 3))))).any()
     blind = tuple(replace(d, depth=np.zeros_like(d.depth)) for d in built.scene.depths)
     assert not any(m.any() for m in lost(depths=blind))
+
+
+def test_an_instance_takes_a_pixel_from_another_only_where_it_makes_up_most_of_it(built, whole):
+    nothing = [replace(m, ids=np.zeros_like(m.ids)) for m in built.scene.maps]
+    left = 0
+    for view, (sure, any_) in enumerate(
+        zip(drawn(built, whole, nothing), drawn(built, whole, nothing, share=0.0), strict=True)
+    ):
+        rendering = render(whole, camera_of(built.scene.cameras, view), label_ids=[1, 2])
+        strong = (rendering.label_masks >= 0.65 * rendering.alpha).any(axis=0)
+        np.testing.assert_array_equal(sure.ids, np.where(strong, any_.ids, 0))
+        left += (any_.ids != sure.ids).sum()
+    assert left
 
 
 def test_no_mask_covers_what_a_frame_excludes(built, whole):
