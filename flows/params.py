@@ -17,6 +17,8 @@ from ss_flow.tasks.splat.merge import MergeParams
 from ss_flow.tasks.splat.plan import PlanParams
 from ss_flow.tasks.splat.reconstruct import ReconstructParams
 from ss_flow.tasks.splat.refine import RefineParams
+from ss_flow.tasks.splat.render_masks import RenderMasksParams
+from ss_flow.tasks.splat.resolve import ResolveParams
 from ss_flow.tasks.split.dense import DenseParams
 from ss_flow.tasks.split.dense_splatting import DenseSplattingParams
 from ss_flow.tasks.split.hierarchy import HierarchyParams
@@ -87,8 +89,10 @@ class SplatParams:
 
     reconstruct: ReconstructParams = field(default_factory=ReconstructParams)
     refine: RefineParams = field(default_factory=RefineParams)
+    resolve: ResolveParams = field(default_factory=ResolveParams)
     plan: PlanParams = field(default_factory=PlanParams)
     merge: MergeParams = field(default_factory=MergeParams)
+    masks: RenderMasksParams = field(default_factory=RenderMasksParams)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from ss_flow.tasks.splat.plan import plan
 from ss_flow.tasks.splat.reconstruct import reconstruct, retrain
 from ss_flow.tasks.splat.refine import refine
 from ss_flow.tasks.splat.render_masks import render_masks
-from ss_flow.tasks.splat.resolve import exclusive, resolve
+from ss_flow.tasks.splat.resolve import exclusive, resolve, resolve_refined
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.cut import cut, cut_parts
 from ss_flow.tasks.split.dense import dense
@@ -251,7 +251,7 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
 
     first, better = each(halved.instances, build=build, outputs=2, on_error="skip")
     with labelled("splat"):
-        masks = resolve(capture.cameras, better)
+        masks = resolve_refined(*views, better, params=settings.resolve, **tau)
     groups = each(better, first, build=again, on_error="skip")
     merged = merge_rounds(views, groups, masks, params, 0)
     assembled = assemble(merged)
@@ -262,7 +262,7 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
         "masks_refined": masks,
         "merge": merged,
         "scene": scene,
-        "masks": render_masks(capture.cameras, scene, masks),
+        "masks": render_masks(*views, scene, masks, params=settings.masks),
     }
 
 

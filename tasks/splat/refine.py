@@ -10,10 +10,11 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import REFINED, Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.artifacts import DRAWN, REFINED, Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
@@ -45,6 +46,14 @@ class RefineParams:
     """Gaussians longer than this share of the instance's box diagonal are not rendered."""
     tau_iou: Fraction = 0.5
     """IoU with the rendered mask from which a mask is added to a view that had none; 0.95 in the paper."""
+    pred_iou: Fraction = 0.8
+    """IoU that the segmenter predicts for its mask, below which the mask is not taken; 0 = any, as in the paper."""
+    margin: Fraction = 0.1
+    """How much better the segmenter's mask must agree with the rendered one to replace a mask that the view's photo
+    gave; one drawn from points is replaced by any that agrees better. 0 in the paper."""
+    max_change: NonNegative = 1.5
+    """A mask that the view's photo gave is only replaced by one of at most so many times its area, and of no less than
+    the inverse of that; 0 = any, as in the paper."""
     dilation: Natural = 0
     """Pixels by which new masks of the segmenter are dilated; 1 in the code of the paper's authors."""
     min_support: Fraction = 0.7
@@ -86,8 +95,9 @@ def refine(
 
     In each view that sees at least `min_visible` of the Gaussians' centres, M^gs is rendered from the instance alone
     and the segmenter is prompted at visible centres (spec row 26). Where the view has a mask, it stays unless the
-    segmenter's agrees better with M^gs; where it has none, the segmenter's is added when its IoU with M^gs exceeds
-    `tau_iou`.
+    segmenter's agrees better with M^gs: by `margin`, and without a change of size beyond `max_change`, where the mask
+    came from the photo, whose borders are finer than the Gaussians'. Where the view has none, the segmenter's is added
+    when its IoU with M^gs exceeds `tau_iou`.
 
     model: the segmenter; embeddings: its embeddings of all views, none without a segmenter. Without one (None) no mask
     is replaced; where one is missing, M^gs itself is taken when the view's depth confirms at least `min_support` of it.
@@ -103,8 +113,9 @@ def refine(
     views, masks, prompted = [], [], []
     for view, frame in enumerate(frames):
         old = mask_of(instance, held[view]) if view in held else None
+        drawn = old is not None and instance.prompted[held[view]] == DRAWN
         prompt = functools.partial(segmenter.predict_prompt, embeddings[view]) if segmenter else None
-        new = _replacement(scene, view, solid, old, params, prompt)
+        new = _replacement(scene, view, solid, old, drawn, params, prompt)
         if new is not None:
             views.append(view)
             masks.append(np.packbits(new))
@@ -170,27 +181,43 @@ def _solid(gaussians: Gaussians, params: RefineParams) -> Gaussians:
 
 
 def _replacement(
-    scene: SceneViews, view: int, gaussians: Gaussians, old: Bool | None, params: RefineParams, prompt: Prompt | None
+    scene: SceneViews,
+    view: int,
+    gaussians: Gaussians,
+    old: Bool | None,
+    drawn: bool,
+    params: RefineParams,
+    prompt: Prompt | None,
 ) -> Bool | None:
     """The mask that takes the place of `old` in a view, None where nothing changes.
 
-    prompt: gives the segmenter's mask of the view, and its score, for points in the photo.
+    drawn: whether `old` was made of points. prompt: gives the segmenter's mask of the view, and its score, for points
+    in the photo.
     """
     if prompt is None and old is not None:
         return None
     rows, column, row = scene.surface_rows(view, gaussians.means)
     if len(rows) < params.min_visible:
         return None
+    valid = decode_valid(scene.frames[view])
     rendered = render_mask(gaussians, scene, view, params.alpha_threshold)
-    if not rendered.mask.any():
+    shown = rendered.mask & valid
+    if not shown.any():
         return None
     if prompt is None:
-        return rendered.mask if rendered.support >= params.min_support else None
+        return shown if rendered.support >= params.min_support else None
     places = np.stack([column, row], axis=-1) + 0.5
     taken = greedy_farthest(places, params.prompts, alpha=params.prompt_alpha, drop_hull=params.drop_hull)
-    candidate, _ = prompt(places[taken])
-    candidate = grown(candidate, params.dilation)
-    agreement = iou(candidate, rendered.mask)
+    candidate, score = prompt(places[taken])
+    candidate = grown(candidate, params.dilation) & valid
+    agreement = iou(candidate, shown)
+    if params.pred_iou and score < params.pred_iou:
+        return None
     if old is None:
         return candidate if agreement > params.tau_iou else None
-    return candidate if agreement > iou(old, rendered.mask) else None
+    if drawn:
+        return candidate if agreement > iou(old, shown) else None
+    before, after = int(old.sum()), int(candidate.sum())
+    if params.max_change and max(before, after) > params.max_change * min(before, after):
+        return None
+    return candidate if agreement > iou(old, shown) + params.margin else None

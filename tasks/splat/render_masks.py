@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.geometry.images import decode_valid, depth_at_frame_size
+from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.splat.groups import rasterizer
 
 _LABELS_AT_ONCE = 16
@@ -21,27 +25,68 @@ _SOLID = 0.5
 _BENEFIT = 0.5
 """A pixel keeps its refined id while that weighs at least this share of the heaviest: borders of good masks are finer
 than Gaussians, and those of bad masks are off by more than that."""
+_FRINGE = 5.0
+"""How far a mask's border may be off, in pixels of an image with a diagonal of 800."""
 
 
-@task(name="splat.render_masks", resources=Resources(cores=1, memory_mb=1000), environment=rasterizer)
-def render_masks(cameras: Cameras, scene: Gaussians, refined: Sequence[LabelMap]) -> tuple[LabelMap, ...]:
+@dataclass(frozen=True)
+class RenderMasksParams:
+    """When the finished scene overrules a refined mask."""
+
+    share: Fraction = 0.65
+    """How much of a pixel an instance must make up to take it, as a share of its alpha; 0 = more than any other."""
+    background: Literal["fringe", "anywhere"] = "fringe"
+    """Where the background may take a pixel of a mask: "fringe" - near the mask's border, if the depth is known there,
+    as what an instance lacks Gaussians for shows background too; or "anywhere"."""
+
+
+@task(
+    name="splat.render_masks",
+    resources=Resources(cores=1, memory_mb=1000),
+    uses=("opencv-contrib-python-headless",),
+    environment=rasterizer,
+)
+def render_masks(
+    frames: Sequence[Frame],
+    cameras: Cameras,
+    depths: Sequence[DepthMap],
+    scene: Gaussians,
+    refined: Sequence[LabelMap],
+    *,
+    params: RenderMasksParams,
+) -> tuple[LabelMap, ...]:
     """The instance that weighs most in each pixel of each view, all Gaussians composited together (spec P5).
 
-    0 where that is the background, and where the scene leaves a hole. A pixel keeps its refined id where that weighs
-    half as much or more; an instance that has masks but no Gaussians keeps what the scene calls background.
+    0 where that is the background, where the scene leaves a hole, and where a frame is not valid. A pixel keeps its
+    refined id where that weighs half as much or more, and where `params` holds the other instance or the background
+    off; an instance that has masks but no Gaussians keeps what the scene calls background.
 
-    refined: the exclusive masks after refinement, of all views.
+    refined: the exclusive masks after refinement. frames, depths, refined: of all views.
     """
     absent = np.setdiff1d(np.arange(np.iinfo(np.uint16).max + 1), scene.instance_id)
     maps = []
-    for view, known in enumerate(refined):
-        ids = _ids_of_view(scene, camera_of(cameras, view), known)
-        maps.append(LabelMap(known.name, np.where((ids == 0) & np.isin(known.ids, absent), known.ids, ids)))
+    for view, (frame, depth, known) in enumerate(zip(frames, depths, refined, strict=True)):
+        ids = _ids_of_view(scene, camera_of(cameras, view), known, params.share)
+        keeps = np.isin(known.ids, absent)
+        if params.background == "fringe":
+            keeps |= ~(_at_border(known.ids) & (depth_at_frame_size(depth, frame) > 0))
+        ids = np.where((ids == 0) & keeps, known.ids, ids)
+        ids[~decode_valid(frame)] = 0
+        maps.append(LabelMap(known.name, ids))
         progress(view + 1, len(refined), known.name)
     return tuple(maps)
 
 
-def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap) -> np.ndarray:
+def _at_border(ids: np.ndarray) -> Bool:
+    """[H, W] which pixels have another id within `_FRINGE` of them."""
+    import cv2
+
+    reach = round(_FRINGE * float(np.hypot(*ids.shape)) / 800)
+    window = np.ones((2 * reach + 1,) * 2, np.uint8)
+    return cv2.erode(ids, window) != cv2.dilate(ids, window)
+
+
+def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap, share: float) -> np.ndarray:
     """[H, W] uint16."""
     whole = render(scene, camera)
     shown = select(scene, whole.visible)
@@ -57,4 +102,5 @@ def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap) -> np.ndarra
             np.copyto(of_known, weight, where=known.ids == label)
     ids[whole.alpha < _SOLID] = 0
     keeps = (of_known > 0) & (of_known >= _BENEFIT * heaviest)
+    keeps |= (ids > 0) & (heaviest < share * whole.alpha)
     return np.where(keeps, known.ids, ids)

@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import REFINED, Cameras, InstanceMasks, LabelMap
-from ss_flow.tasks.geometry.images import pack_masks
-from ss_flow.tasks.splat.views import mask_of
+from ss_flow.tasks.artifacts import REFINED, Cameras, DepthMap, Float32, Frame, InstanceMasks, Int32, LabelMap
+from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
+from ss_flow.tasks.geometry.images import decode_valid, pack_masks
+from ss_flow.tasks.geometry.zbuffer import paint
+from ss_flow.tasks.splat.groups import scene_views
+from ss_flow.tasks.splat.views import SceneViews, mask_of
+from ss_flow.tasks.split.selection import PaintedView, nearest_labels
+
+_REACH = 8.0
+"""How far from a pixel a point may lie that decides it, in pixels of an image with a diagonal of 800."""
+
+
+@dataclass(frozen=True)
+class ResolveParams:
+    """How masks that refinement made overlap become exclusive again."""
+
+    contested: Literal["points", "smaller"] = "points"
+    """Whose a pixel under several masks is: "points" - the instance's whose labelled point is nearest; where none is
+    near, a mask's that refinement left as it was, and the smaller one's of two such; "smaller" - always the smaller
+    one's, as in the paper."""
 
 
 @task()
@@ -20,8 +38,60 @@ def resolve(cameras: Cameras, instances: tuple[InstanceMasks, ...]) -> tuple[Lab
     instances: in any order; the background (id 0) is what remains. Equal areas: the lower id is on top.
     Raises InputError when masks and frames differ in size.
     """
+    return _painted(cameras, instances, kept_on_top=False)
+
+
+@task(uses=("opencv-contrib-python-headless",))
+def resolve_refined(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    instances: tuple[InstanceMasks, ...],
+    *,
+    params: ResolveParams,
+    tau_depth: float = 0.02,
+    tau_relative: float = 0.0,
+) -> tuple[LabelMap, ...]:
+    """The instance ids of every view after refinement; as `resolve`, but by `params`, 0 where a frame is not valid.
+
+    Split's masks are exclusive, so of two masks that overlap at least one is new, made from this photo alone, while the
+    labels of points have the votes of all views. frames, depths: of all views. tau_depth, tau_relative: as in `refine`.
+    """
+    by_points = params.contested == "points"
+    maps = _painted(cameras, instances, kept_on_top=by_points)
+    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
+    points = np.concatenate([instance.points for instance in instances])
+    labels = np.repeat([i.instance_id for i in instances], [len(i.points) for i in instances]).astype(np.int32)
+    for view, (frame, label_map) in enumerate(zip(frames, maps, strict=True)):
+        if by_points:
+            nearest = _nearest(scene, view, points, labels)
+            for instance in instances:
+                for row in np.flatnonzero((instance.view == view) & (instance.instance_id > 0)):
+                    label_map.ids[mask_of(instance, row) & (nearest == instance.instance_id)] = instance.instance_id
+        label_map.ids[~decode_valid(frame)] = 0
+    return maps
+
+
+def _nearest(scene: SceneViews, view: int, points: Float32, labels: Int32) -> Int32:
+    """The label of the nearest point that a view sees, within reach: [H, W], 0 where that is none.
+
+    points: [N, 3] world; labels: [N].
+    """
+    camera = camera_of(scene.cameras, view)
+    seen, _, _ = scene.surface_rows(view, points)
+    rows, column, row, z = pixels_in_view(points[seen], camera)
+    image = paint(labels[seen[rows]] + 1, row * camera.width + column, z, camera.height * camera.width)
+    pixel = np.flatnonzero(image).astype(np.int32)
+    if not len(pixel):
+        return image.reshape(camera.height, camera.width)
+    reach = _REACH * float(np.hypot(camera.height, camera.width)) / 800
+    return nearest_labels(PaintedView(pixel, image[pixel] - 1), camera.height, camera.width, reach)
+
+
+def _painted(cameras: Cameras, instances: tuple[InstanceMasks, ...], *, kept_on_top: bool) -> tuple[LabelMap, ...]:
+    """All masks painted one over the other, smaller ones on top; kept_on_top: of those that no refinement changed."""
     maps = [np.zeros((int(height), int(width)), np.uint16) for width, height in cameras.sizes]
-    seen: list[list[tuple[int, int, InstanceMasks, int]]] = [[] for _ in maps]
+    seen: list[list[tuple[bool, int, int, InstanceMasks, int]]] = [[] for _ in maps]
     for instance in instances:
         if instance.instance_id == 0:
             continue
@@ -33,9 +103,10 @@ def resolve(cameras: Cameras, instances: tuple[InstanceMasks, ...]) -> tuple[Lab
                     "both must have one size."
                 )
             area = int(mask_of(instance, row).sum())
-            seen[view].append((-area, -instance.instance_id, instance, row))
+            on_top = kept_on_top and instance.prompted[row] != REFINED
+            seen[view].append((on_top, -area, -instance.instance_id, instance, row))
     for ids, layers in zip(maps, seen, strict=True):
-        for _, _, instance, row in sorted(layers, key=lambda layer: layer[:2]):
+        for *_, instance, row in sorted(layers, key=lambda layer: layer[:3]):
             ids[mask_of(instance, row)] = instance.instance_id
     return tuple(LabelMap(name, ids) for name, ids in zip(cameras.names, maps, strict=True))
 

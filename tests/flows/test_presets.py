@@ -139,11 +139,18 @@ TABLE = {
     "splat.merge.max_scale": (0.0, 0.0, 0.05),
     # 29
     "splat.refine.tau_iou": (0.95, 0.05, 0.5),
-    # 30: which of two equal masks stays is a rule.
+    # 30: which of two equal masks stays is a rule. Ours replaces a mask of the photo only by one that is much better.
+    "splat.refine.pred_iou": (0.0, 0.0, 0.8),
+    "splat.refine.margin": (0.0, 0.0, 0.1),
+    "splat.refine.max_change": (0.0, 0.0, 1.5),
     "splat.refine.dilation": (0, 1, 0),
     # 31: as many steps again, from scratch; ours goes on from the first training, with fewer.
     "splat.reconstruct.retrain_share": (1.0, 1.0, 0.3),
     "splat.reconstruct.warm_start": (False, False, True),
+    # Masks made exclusive again, the smaller on top (P4), and those of the finished scene.
+    "splat.resolve.contested": ("smaller", "smaller", "points"),
+    "splat.masks.share": (0.0, 0.0, 0.65),
+    "splat.masks.background": ("anywhere", "anywhere", "fringe"),
     "splat.plan.bbox_quantile": (0.0, 0.0, 0.005),
     # 32, 33: both also as the specification words its options (A20, A21).
     "splat.plan.overlap": ("box", "box", "box"),
@@ -151,6 +158,10 @@ TABLE = {
     # 34
     "splat.merge.min_iterations": (1000, 1000, 60),
     "splat.merge.max_iterations": (1000, 1000, 150),
+    # The guard of P4
+    "splat.merge.guard_iou": (0.02, 0.02, 0.02),
+    "splat.merge.guard_psnr": (1.0, 1.0, 1.0),
+    "splat.merge.guard_trade": (0.0, 0.0, 2.0),
     # 35
     "splat.plan.mask_weights": ((0.05, 0.15, 0.25), (0.05, 0.1, 0.25), (0.05, 0.15, 0.25)),
     # 36

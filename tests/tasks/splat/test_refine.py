@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import cv2
@@ -7,8 +8,9 @@ import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
 
-from ss_flow.tasks.artifacts import REFINED, Gaussians, InstanceMasks
+from ss_flow.tasks.artifacts import DRAWN, REFINED, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import initialise, select
+from ss_flow.tasks.geometry.images import encode_png, pack_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.splat import refine as module
 from ss_flow.tasks.splat.refine import RefineParams, refine, render_mask
@@ -35,12 +37,13 @@ class Scripted:
     """A segmenter that answers a prompt by what the test says of the view; a view's embedding is its number."""
 
     answer = staticmethod(lambda view, points: np.zeros((0, 0), bool))
+    score = 1.0
 
     def __init__(self, model):
         pass
 
     def predict_prompt(self, embedding, points):
-        return type(self).answer(embedding, points), 1.0
+        return type(self).answer(embedding, points), type(self).score
 
 
 def refined(small: SmallScene, box: Gaussians, instance: InstanceMasks, monkeypatch=None, answer=None, **params):
@@ -85,6 +88,11 @@ def test_without_a_segmenter_masks_stay_and_missing_ones_are_drawn_where_depth_c
     assert 2 not in again.view
 
 
+def moved(instance: InstanceMasks, pixels: int, **fields) -> InstanceMasks:
+    """With masks shifted to the right."""
+    return replace(instance, packed=pack_masks(np.roll(instance.dense(), pixels, axis=2)), **fields)
+
+
 def test_a_mask_stays_unless_the_segmenters_agrees_better(small, box, monkeypatch):
     truth = small.instance(1)
     same = refined(small, box, truth, monkeypatch, lambda view, _: small.ids[view] == 1)
@@ -94,10 +102,56 @@ def test_a_mask_stays_unless_the_segmenters_agrees_better(small, box, monkeypatc
     worse = refined(small, box, truth, monkeypatch, lambda view, _: np.roll(small.ids[view] == 1, 6, axis=1))
     np.testing.assert_array_equal(worse.packed, truth.packed)
 
-    shifted = replace(truth, packed=np.packbits(np.roll(truth.dense(), 6, axis=2).reshape(VIEWS, -1), axis=1))
-    better = refined(small, box, shifted, monkeypatch, lambda view, _: small.ids[view] == 1)
+    better = refined(small, box, moved(truth, 6), monkeypatch, lambda view, _: small.ids[view] == 1)
     np.testing.assert_array_equal(better.packed, truth.packed)
     assert (better.prompted == REFINED).all()
+
+
+def test_a_mask_of_the_photo_gives_way_only_by_a_margin_and_one_drawn_from_points_to_anything_better(
+    small, box, monkeypatch
+):
+    nearly = moved(small.instance(1), 1)
+    right = lambda view, _: small.ids[view] == 1  # noqa: E731
+    kept = refined(small, box, nearly, monkeypatch, right)
+    np.testing.assert_array_equal(kept.packed, nearly.packed)
+    for instance, params in (
+        (replace(nearly, prompted=np.full(VIEWS, DRAWN, np.uint8)), {}),
+        (nearly, {"margin": 0.0}),
+    ):
+        replaced = refined(small, box, instance, monkeypatch, right, **params)
+        assert (replaced.prompted == REFINED).any()
+
+
+def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small, box, monkeypatch):
+    truth = small.instance(1)
+    half = truth.dense() & (np.cumsum(truth.dense(), axis=2) <= truth.dense().sum(axis=2, keepdims=True) // 2)
+    part = replace(truth, packed=pack_masks(half))
+    right = lambda view, _: small.ids[view] == 1  # noqa: E731
+    np.testing.assert_array_equal(refined(small, box, part, monkeypatch, right).packed, part.packed)
+    np.testing.assert_array_equal(refined(small, box, part, monkeypatch, right, max_change=0.0).packed, truth.packed)
+    drawn = replace(part, prompted=np.full(VIEWS, DRAWN, np.uint8))
+    np.testing.assert_array_equal(refined(small, box, drawn, monkeypatch, right).packed, truth.packed)
+
+
+def test_an_answer_that_the_segmenter_itself_doubts_is_not_taken(small, box, monkeypatch):
+    monkeypatch.setattr(Scripted, "score", 0.7)
+    right = lambda view, _: small.ids[view] == 1  # noqa: E731
+    few = moved(small.instance(1, views=(0, 1)), 6)
+    doubted = refined(small, box, few, monkeypatch, right)
+    np.testing.assert_array_equal(doubted.packed, few.packed)
+    assert len(refined(small, box, few, monkeypatch, right, pred_iou=0.7).view) == VIEWS
+
+
+def test_new_masks_leave_out_what_is_not_valid(small, box, monkeypatch):
+    valid = np.full(small.ids[0].shape, 255, np.uint8)
+    valid[:, 48:] = 0
+    masked = copy.copy(small)
+    masked.frames = tuple(replace(frame, valid=encode_png(valid)) for frame in small.frames)
+    part = small.instance(1, views=(0, 1))
+    for answer in (None, lambda view, _: small.ids[view] == 1):
+        result = refined(masked, box, part, monkeypatch, answer)
+        new = result.dense()[result.prompted == REFINED]
+        assert len(new) and new.any() and not new[:, :, 48:].any()
 
 
 def test_a_missing_mask_is_added_only_above_tau_iou(small, box, monkeypatch):

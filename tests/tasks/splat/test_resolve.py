@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from ball_and_box import VIEWS, SmallScene
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import REFINED, Cameras, InstanceMasks, LabelMap
-from ss_flow.tasks.geometry.images import pack_masks
-from ss_flow.tasks.splat.resolve import exclusive, resolve
+from ss_flow.tasks.artifacts import REFINED, Cameras, Frame, InstanceMasks, LabelMap
+from ss_flow.tasks.geometry.images import encode_png, pack_masks
+from ss_flow.tasks.splat.resolve import ResolveParams, exclusive, resolve, resolve_refined
 
 CAMERAS = Cameras(
     ("a", "b"), np.array([[4, 3], [4, 3]], np.int32), np.ones((2, 4)), np.tile(np.eye(4), (2, 1, 1)), metric=True
@@ -62,3 +65,62 @@ def test_the_background_gets_all_that_no_instance_has():
     after = exclusive(before, resolve(CAMERAS, (SMALL, LARGE)))
     assert after.dense()[0].astype(int).tolist() == [[0, 0, 0, 0], [0, 0, 0, 1], [1, 1, 1, 1]]
     assert after.prompted.tolist() == [REFINED, 0]
+
+
+@pytest.fixture(scope="module")
+def small() -> SmallScene:
+    return SmallScene()
+
+
+def settled(small: SmallScene, *instances: InstanceMasks, contested: str = "points", frames=None) -> np.ndarray:
+    """[VIEWS, H, W] ids after refinement."""
+    views = frames or small.frames, small.cameras, small.depths
+    maps = resolve_refined(*views, instances, params=ResolveParams(contested))
+    return np.stack([m.ids for m in maps])
+
+
+def grown_over(instance: InstanceMasks, other: InstanceMasks) -> InstanceMasks:
+    """What refinement may make of an instance: its masks with those of another one."""
+    masks = instance.dense() | other.dense()
+    return replace(instance, packed=pack_masks(masks), prompted=np.full(VIEWS, REFINED, np.uint8))
+
+
+def test_a_contested_pixel_goes_to_the_instance_whose_points_are_near_whatever_the_sizes(small):
+    box, ball, background = grown_over(small.instance(1), small.instance(1)), small.instance(2), small.instance(0)
+    truth = np.stack(small.ids)
+    # The box is the larger one, so its side would go to a ball that has grown over a part of it.
+    part = replace(box, packed=pack_masks(box.dense() & (np.arange(truth.shape[2]) % 48 < 24)))
+    grown = grown_over(ball, part)
+    assert (grown.dense().sum() < box.dense().sum()) and (grown.dense() & box.dense()).any()
+    rest = (background, box)
+    assert (settled(small, *rest, grown) == truth).mean() > 0.99
+    assert (settled(small, grown, *rest[::-1]) == settled(small, *rest, grown)).all()
+    wrong = settled(small, *rest, grown, contested="smaller")
+    assert (wrong[truth == 1] == 2).mean() > 0.2
+    assert all((a.ids == b).all() for a, b in zip(resolve(small.cameras, (*rest, grown)), wrong, strict=True))
+
+
+def test_without_points_a_kept_mask_is_above_a_refined_one_and_of_two_refined_the_smaller(small):
+    box, ball = (replace(small.instance(i), points=np.zeros((0, 3), np.float32)) for i in (1, 2))
+    truth = np.stack(small.ids)
+    for kept, other in ((box, ball), (ball, box)):
+        ids = settled(small, kept, grown_over(other, kept))
+        assert (ids == truth).all()
+    both = settled(small, grown_over(box, ball), replace(ball, prompted=np.full(VIEWS, REFINED, np.uint8)))
+    assert (both == truth).all()
+
+
+def test_masks_that_do_not_overlap_stay_as_they_are(small):
+    instances = [small.instance(i) for i in range(3)]
+    assert (settled(small, *instances) == np.stack(small.ids)).all()
+
+
+@pytest.mark.parametrize("contested", ["points", "smaller"])
+def test_what_is_not_valid_belongs_to_nobody(small, contested):
+    valid = np.full(small.ids[0].shape, 255, np.uint8)
+    valid[30:] = 0
+    frames: tuple[Frame, ...] = tuple(replace(f, valid=encode_png(valid)) for f in small.frames)
+    ids = settled(small, small.instance(1), small.instance(2), frames=frames, contested=contested)
+    truth = np.stack(small.ids)
+    truth[:, 30:] = 0
+    assert truth.any() and (ids == truth).all()

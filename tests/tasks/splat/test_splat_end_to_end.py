@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
@@ -13,13 +14,14 @@ from ss_flow.tasks.artifacts import REFINED, Gaussians
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.splat import merge as module
 from ss_flow.tasks.splat.groups import box_diagonal, extents
-from ss_flow.tasks.splat.merge import MergeParams, assemble, global_pass, merge_pair
+from ss_flow.tasks.splat.merge import MergeParams, Quality, acceptable, assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
 from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
 from ss_flow.tasks.splat.refine import iou
-from ss_flow.tasks.splat.render_masks import render_masks
+from ss_flow.tasks.splat.render_masks import RenderMasksParams, render_masks
 
 TRAIN = ReconstructParams(min_iterations=300, max_iterations=300, max_points=900)
 MERGE = MergeParams(min_iterations=300, max_iterations=300, global_iterations=200)
@@ -161,19 +163,89 @@ def test_thinning_keeps_points_spread_over_the_whole_surface():
     assert cells.min() > 5
 
 
+def drawn(built, scene, maps=None, frames=None, depths=None, **params):
+    """The masks that a finished scene shows."""
+    return render_masks(
+        frames or built.scene.frames,
+        built.scene.cameras,
+        depths or built.scene.depths,
+        scene,
+        maps or built.scene.maps,
+        params=RenderMasksParams(**params),
+    )
+
+
 def test_the_merged_scene_draws_the_masks_it_was_trained_with(built, whole):
-    found = render_masks(built.scene.cameras, whole, built.scene.maps)
-    for mine, truth in zip(found, built.scene.maps, strict=True):
+    for mine, truth in zip(drawn(built, whole), built.scene.maps, strict=True):
         assert mine.name == truth.name and mine.ids.dtype == np.uint16
         assert all(iou(mine.ids == i, truth.ids == i) > 0.9 for i in (0, 1, 2) if (truth.ids == i).sum() > 100)
 
 
 def test_an_instance_without_gaussians_keeps_its_masks_where_the_scene_shows_background(built, whole):
     without = select(whole, whole.instance_id != 2)
-    found = render_masks(built.scene.cameras, without, built.scene.maps)
-    for mine, truth in zip(found, built.scene.maps, strict=True):
+    for mine, truth in zip(drawn(built, without, background="anywhere"), built.scene.maps, strict=True):
         np.testing.assert_array_equal(mine.ids == 2, (truth.ids == 2) & (mine.ids != 1))
-    assert not any((m.ids == 9).any() for m in render_masks(built.scene.cameras, whole, built.scene.maps))
+    assert not any((m.ids == 9).any() for m in drawn(built, whole))
+
+
+def test_the_background_takes_no_more_of_a_mask_than_its_fringe_and_only_where_depth_is_known(built, whole):
+    few = whole.instance_id == 1
+    few[np.flatnonzero(few)[:5]] = False
+    thin = select(whole, ~few)
+    truth = built.scene.maps
+
+    def lost(**options):
+        pairs = zip(drawn(built, thin, **options), truth, strict=True)
+        return [(t.ids == 1) & (m.ids == 0) for m, t in pairs]
+
+    anywhere, fringe = lost(background="anywhere"), lost()
+    assert sum(m.sum() for m in anywhere) > 2 * sum(m.sum() for m in fringe) > 0
+    for taken, maps in zip(fringe, truth, strict=True):
+        # 5 pixels of 800 are one of this picture's 120.
+        assert not (taken & (cv2.erode(maps.ids, np.ones((3, 3))) == cv2.dilate(maps.ids, np.ones((3, 3))))).any()
+    blind = tuple(replace(d, depth=np.zeros_like(d.depth)) for d in built.scene.depths)
+    assert not any(m.any() for m in lost(depths=blind))
+
+
+def test_an_instance_takes_a_pixel_from_another_only_where_it_makes_up_most_of_it(built, whole):
+    nothing = [replace(m, ids=np.zeros_like(m.ids)) for m in built.scene.maps]
+    left = 0
+    for view, (sure, any_) in enumerate(
+        zip(drawn(built, whole, nothing), drawn(built, whole, nothing, share=0.0), strict=True)
+    ):
+        rendering = render(whole, camera_of(built.scene.cameras, view), label_ids=[1, 2])
+        strong = (rendering.label_masks >= 0.65 * rendering.alpha).any(axis=0)
+        np.testing.assert_array_equal(sure.ids, np.where(strong, any_.ids, 0))
+        left += (any_.ids != sure.ids).sum()
+    assert left
+
+
+def test_no_mask_covers_what_a_frame_excludes(built, whole):
+    valid = np.full(built.scene.maps[0].ids.shape, 255, np.uint8)
+    valid[:, 40:] = 0
+    frames = tuple(replace(f, valid=encode_png(valid)) for f in built.scene.frames)
+    for mine, free in zip(drawn(built, whole, frames=frames), drawn(built, whole), strict=True):
+        assert not mine.ids[:, 40:].any() and free.ids[:, 40:].any()
+        np.testing.assert_array_equal(mine.ids[:, :40], free.ids[:, :40])
+
+
+def test_a_loss_is_accepted_within_its_limit_or_when_the_other_gains_much_more():
+    ours, always = MergeParams(), MergeParams(guard_trade=0.0)
+    old = Quality(0.80, 12.0)
+    for iou_, psnr_, weighed, strict in (
+        (0.79, 11.5, True, True),
+        (0.74, 21.0, True, False),  # three limits lost, nine gained
+        (0.74, 17.9, False, False),
+        (0.74, 12.0, False, False),
+        (0.90, 10.0, True, False),  # two lost, five gained
+        (0.83, 10.0, False, False),
+        (0.70, 10.0, False, False),
+    ):
+        assert acceptable(old, Quality(iou_, psnr_), ours) == weighed
+        assert acceptable(old, Quality(iou_, psnr_), always) == strict
+    for limits in ({"guard_iou": 0.0}, {"guard_psnr": 0.0}, {"guard_iou": 0.0, "guard_psnr": 0.0}):
+        assert not acceptable(old, Quality(0.7, 10.0), MergeParams(**limits))
+        assert acceptable(old, old, MergeParams(**limits))
 
 
 def test_no_gaussian_outgrows_its_instance_unless_it_starts_larger(built):

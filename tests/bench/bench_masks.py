@@ -1,0 +1,86 @@
+"""Whether Splat makes the masks of a capture better or worse, object by object.
+
+    python tests/bench/bench_masks.py CAPTURE [--labels FOLDER] [--preset fast] [--set STEP.PARAM=VALUE] [--store DIR]
+
+Prints, for each object of the labels, the best IoU of any instance's mask with it, mean over the labelled views: after
+Split, after refinement, and in the end; and the most that a view loses. Labels are one-channel PNG files named like the
+frames, 0 where nothing is said; the capture's `instance` folder if not told otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+from ss_flow.flows import settings
+from ss_flow.flows.cli.context import file_digests
+from ss_flow.flows.cli.prepare import RunOptions, prepare
+from ss_flow.flows.params import Params
+from ss_flow.tasks.artifacts import LabelMap
+from ss_flow.tasks.capture.scene import open_scene
+
+STAGES = ("masks_split", "masks_refined", "masks")
+
+
+def masks_of(folder: Path, params: Params, store: Store) -> list[list[LabelMap]]:
+    """The label maps of all views, at each stage."""
+    prepared = prepare(open_scene(folder), params, RunOptions(), file_digests(store))
+
+    def build() -> dict[str, object]:
+        results = prepared.build()
+        return {stage: results[stage] for stage in STAGES}
+
+    values = run_flow(build, store, scene=prepared.name, header={}).values
+    return [[store.get(digest) for digest in values[stage]] for stage in STAGES]
+
+
+def best_iou(ids: np.ndarray, truth: np.ndarray) -> float:
+    """The highest IoU of an instance's mask with an object's: both [H, W]."""
+    found = [i for i in np.unique(ids[truth]) if i]
+    return max((float(((ids == i) & truth).sum() / ((ids == i) | truth).sum()) for i in found), default=0.0)
+
+
+def by_object(stages: list[list[LabelMap]], labels: Path) -> dict[int, np.ndarray]:
+    """[views, stages] the best IoU of each object."""
+    import cv2
+
+    table = defaultdict(list)
+    for maps in zip(*stages, strict=True):
+        file = labels / f"{maps[0].name}.png"
+        if not file.exists():
+            continue
+        height, width = maps[0].ids.shape
+        truth = cv2.resize(cv2.imread(str(file), -1), (width, height), interpolation=cv2.INTER_NEAREST)
+        for name in np.unique(truth[truth > 0]).tolist():
+            table[name].append([best_iou(m.ids, truth == name) for m in maps])
+    return {name: np.array(rows) for name, rows in sorted(table.items())}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--labels", type=Path)
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--set", nargs="*", default=[])
+    parser.add_argument("--store", type=Path, help="a store to keep")
+    args = parser.parse_args()
+    params = settings.apply(settings.preset(Params(), args.preset), args.set)
+    with tempfile.TemporaryDirectory() as temporary:
+        stages = masks_of(args.capture, params, Store(args.store or Path(temporary)))
+        table = by_object(stages, args.labels or args.capture / "instance")
+    print("| object | views | Split | refined | final | worst view |\n" + "|---" * 6 + "|")
+    for name, rows in table.items():
+        mean = " | ".join(f"{100 * value:.1f}" for value in rows.mean(axis=0))
+        print(f"| {name} | {len(rows)} | {mean} | {100 * (rows[:, -1] - rows[:, 0]).min():+.1f} |")
+    means = np.mean([rows.mean(axis=0) for rows in table.values()], axis=0)
+    print(f"| mean | | {' | '.join(f'{100 * value:.1f}' for value in means)} | |")
+
+
+if __name__ == "__main__":
+    main()
