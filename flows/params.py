@@ -76,7 +76,7 @@ class SplitParams:
     propagate: PropagateParams = field(default_factory=PropagateParams)
     parts: PartsParams = field(default_factory=PartsParams)
     hierarchy: HierarchyParams = field(default_factory=HierarchyParams)
-    granularity: Fraction = 0.5
+    granularity: Fraction = 0.45
     """How far pieces are put together: those that more than this share of the views show as one thing are one instance.
     1 leaves every part on its own, 0.3 gives groups of things."""
     reprompt: RepromptParams = field(default_factory=RepromptParams)

@@ -18,7 +18,7 @@ from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, Po
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 
-_IOU = (0.6, 0.85)
+_IOU = (0.5, 0.8)
 """IoU of a mask with the pieces from which on it begins to show them as one, and from which it does."""
 _REST = (0.3, 0.7)
 """The same for the share that it holds of all but the largest piece, which alone may make up most of the IoU."""
@@ -37,8 +37,8 @@ class HierarchyParams:
     doubt: Fraction = 0.2
     """By how much the segmenter may be surer of a piece than of the whole (predicted IoU times stability) before the
     whole no longer counts; from nothing to this, it counts less and less."""
-    prior: NonNegative = 0.5
-    """Views that are taken to speak against each union, so that one view alone does not decide."""
+    prior: NonNegative = 1.0
+    """So many views are taken to speak against each union, so that one view alone does not decide."""
     min_agreement: Fraction = 0.2
     """Agreement below which pieces are not united even to a group."""
     min_points: Count = 10

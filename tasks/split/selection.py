@@ -15,6 +15,9 @@ from ss_flow.tasks.split.mask_pool import canonical_order
 
 _CRUMB = 0.1
 """Pieces of a drawn mask below this share of its largest one are no part of it."""
+_BACKED = 0.3
+"""A mask joins another one of its label only with points of the label this dense in what it adds, as a share of how
+dense they are in the other: few points say nothing about a large area."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,8 @@ class SelectionParams:
     """The masks that together agree best with a label's points, or, as in the paper, all that overlap it most."""
     min_iou: Fraction = 0.3
     """IoU with a label's painted points below which no mask shows the label (only with "best")."""
+    unlabelled: Fraction = 0.5
+    """How much a point without a label counts against a mask that holds it (only with "best")."""
     erosion: ErosionParams = field(default_factory=ErosionParams)
     """How far a mask's border is taken off before its majority is counted (only with "all")."""
 
@@ -60,7 +65,7 @@ def select_masks(painted: PaintedView, pool: MaskSet, params: SelectionParams) -
         return {}
     if params.masks == "all":
         return _by_majority(painted, pool, dense, params)
-    return _by_agreement(painted, dense, params)
+    return _by_agreement(painted, pool, dense, params)
 
 
 def _by_majority(painted: PaintedView, pool: MaskSet, dense: Bool, params: SelectionParams) -> dict[int, Bool]:
@@ -77,37 +82,45 @@ def _by_majority(painted: PaintedView, pool: MaskSet, dense: Bool, params: Selec
     return shown
 
 
-def _by_agreement(painted: PaintedView, dense: Bool, params: SelectionParams) -> dict[int, Bool]:
+def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: SelectionParams) -> dict[int, Bool]:
     """Each label takes the mask that agrees best with its points, then those that make the agreement better still.
 
-    A mask shows one label at most; the pairs that agree best choose first, ties by label, then by mask.
+    A mask shows one label at most; the pairs that agree best choose first, where the segmenter's own estimate of a mask
+    counts too; ties by label, then by mask.
     """
-    dense = dense[canonical_order(dense)]
+    order = canonical_order(dense)
+    dense = dense[order]
+    quality = (np.minimum(pool.predicted_iou, 1) * pool.stability)[order]
     names, index = np.unique(painted.label, return_inverse=True)
     flat = dense.reshape(len(dense), -1)[:, painted.pixel]
     count = np.stack([np.bincount(index[mask], minlength=len(names)) for mask in flat])
     total = np.bincount(index, minlength=len(names))
-    iou = count / np.maximum(count.sum(axis=1, keepdims=True) + total - count, 1)
+    area = count @ np.where(names == 0, params.unlabelled, 1.0)
+    iou = count / np.maximum(area[:, None] + total - count, 1)
     iou[:, names == 0] = 0
+    fit = np.round(iou * quality[:, None], 9)
 
     chosen: dict[int, Bool] = {}
     shown: dict[int, Bool] = {}
-    order = sorted(zip(*np.nonzero((iou > 0) & (iou >= params.min_iou)), strict=True), key=lambda p: (-iou[p], p[::-1]))
+    pairs = sorted(zip(*np.nonzero((iou > 0) & (iou >= params.min_iou)), strict=True), key=lambda p: (-fit[p], p[::-1]))
     free = np.ones(len(dense), bool)
-    for row, column in order:
+    for row, column in pairs:
         if free[row] and column not in chosen:
             free[row] = False
             chosen[column], shown[int(names[column])] = flat[row], dense[row]
 
     # An occluder may cut an object in two: what is left joins where it fits.
     for column in sorted(chosen):
-        mine = index == column
+        mine, label = index == column, int(names[column])
         for row in np.flatnonzero(free & (count.argmax(axis=1) == column)):
             both = chosen[column] | flat[row]
-            if _iou(both, mine) > _iou(chosen[column], mine):
+            added = dense[row] & ~shown[label]
+            backed = (mine & both & ~chosen[column]).sum() / max(1, added.sum())
+            dense_enough = backed >= _BACKED * (mine & chosen[column]).sum() / shown[label].sum()
+            if dense_enough and _iou(both, mine) > _iou(chosen[column], mine):
                 free[row] = False
                 chosen[column] = both
-                shown[int(names[column])] = shown[int(names[column])] | dense[row]
+                shown[label] = shown[label] | dense[row]
     return shown
 
 
