@@ -20,7 +20,7 @@ from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.ranges import Count, Fraction
 
 _SIDE = 320
-"""Longer side of the images that are compared; all lengths below are pixels of these."""
+"""Longer side of the images that are compared, at most; all lengths below are pixels of these."""
 _SCALES = np.exp(np.arange(-0.2, 0.201, 0.01))
 _REACH = 12
 """Largest shift that is looked for."""
@@ -80,9 +80,10 @@ def registration(
     views = [view for view in looked if len(view.outline) >= _LEAST_OUTLINE]
     if len(views) < _LEAST_VIEWS:
         return Registration(1.0, np.zeros(2), 0.0)
-    found = _search(views)
+    coarse = [_coarse_fits(view) for view in views]
+    found = _search(views, coarse)
     halves = views[::2], views[1::2]
-    first, second = (_search(half) for half in halves)
+    first, second = _search(halves[0], coarse[::2]), _search(halves[1], coarse[1::2])
     gained = min(
         _fit(halves[1], first) - _fit(halves[1], _IDENTITY), _fit(halves[0], second) - _fit(halves[0], _IDENTITY)
     )
@@ -92,8 +93,7 @@ def registration(
     agree = abs(first[0] - second[0]) * _SIDE / 2 + shifts_apart <= _APART
     if gain < params.tau_found or not agree:
         return Registration(1.0, np.zeros(2), gain)
-    size = max(frames[0].width, frames[0].height) / _SIDE
-    result = Registration(found[0], np.array(found[1:]) * size, gain)
+    result = Registration(found[0], np.array(found[1:]) / _reduction(frames[0]), gain)
     if advise and gain >= params.tau_warn:
         warn(
             f"Depth edges fit the photos better when the depth images are {_said(result)}; use --calibrate depth, or "
@@ -134,10 +134,14 @@ def _said(found: Registration) -> str:
     return f"scaled by {found.scale:.3f} and shifted by ({x:+.1f}, {y:+.1f}) pixels"
 
 
+def _reduction(frame: Frame) -> float:
+    return min(1.0, _SIDE / max(frame.width, frame.height))
+
+
 def _view(frame: Frame, intrinsics: Float64, depth: DepthMap, jump: float) -> _View:
     import cv2
 
-    size = _SIDE / max(frame.width, frame.height)
+    size = _reduction(frame)
     width, height = max(1, round(frame.width * size)), max(1, round(frame.height * size))
     small = cv2.resize(decode_rgb(frame), (width, height), interpolation=cv2.INTER_AREA)
     lab = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32), (0, 0), 1)
@@ -189,27 +193,25 @@ def _fit(views: Sequence[_View], placing: Placing) -> float:
     return float(np.mean(fits))
 
 
-def _search(views: Sequence[_View]) -> Placing:
-    """The placing that fits best: all scales and whole shifts on blurred edges, then a descent from the best one."""
+def _search(views: Sequence[_View], coarse: Sequence[Float32]) -> Placing:
+    """The placing that fits best: a descent from the best of the coarse ones.
+
+    coarse: `_coarse_fits` of each view.
+    """
     from scipy.optimize import minimize
 
-    coarse = _blurred(views, 2)
-    tried = []
-    for scale in _SCALES.tolist():
-        fit = np.mean([_fit_of_shifts(view, scale) for view in coarse], axis=0)
-        y, x = np.unravel_index(int(fit.argmax()), fit.shape)
-        tried.append((float(fit[y, x]), scale, float(x - _REACH), float(y - _REACH)))
-    _, scale, x, y = max(tried)
+    fits = np.mean(coarse, axis=0)
+    s, y, x = np.unravel_index(int(fits.argmax()), fits.shape)
     fine = _blurred(views, 1)
     # In units of about one pixel at the photo's border.
-    start = np.array([np.log(scale) * _SIDE / 2, x, y])
+    start = np.array([np.log(_SCALES[s]) * _SIDE / 2, x - _REACH, y - _REACH])
     simplex = np.vstack([start, start + np.diag([1.5, 1.5, 1.5])])
 
-    def placing(x: Float64) -> Placing:
-        return float(np.exp(x[0] * 2 / _SIDE)), float(x[1]), float(x[2])
+    def placing(at: Float64) -> Placing:
+        return float(np.exp(at[0] * 2 / _SIDE)), float(at[1]), float(at[2])
 
     options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-6}
-    return placing(minimize(lambda x: -_fit(fine, placing(x)), start, method="Nelder-Mead", options=options).x)
+    return placing(minimize(lambda at: -_fit(fine, placing(at)), start, method="Nelder-Mead", options=options).x)
 
 
 def _blurred(views: Sequence[_View], sigma: float) -> list[_View]:
@@ -218,16 +220,19 @@ def _blurred(views: Sequence[_View], sigma: float) -> list[_View]:
     return [replace(view, edges=cv2.GaussianBlur(view.edges, (0, 0), sigma)) for view in views]
 
 
-def _fit_of_shifts(view: _View, scale: float) -> Float32:
-    """[2 R + 1, 2 R + 1] the fit of a view for every whole shift (y, x) of at most R pixels."""
+def _coarse_fits(view: _View) -> Float32:
+    """[S, 2 R + 1, 2 R + 1] the fit of a view, its edges blurred, at every scale and whole shift (y, x) up to R."""
     import cv2
 
+    (view,) = _blurred([view], 2)
     height, width = view.edges.shape
-    at = np.floor(view.outline * scale + view.center).astype(int)
-    at = at[((at >= 0) & (at < (width, height))).all(axis=1)]
-    drawn = np.zeros((height, width), np.float32)
-    np.add.at(drawn, (at[:, 1], at[:, 0]), 1)
     neutral = float(view.edges.mean())
     padded = cv2.copyMakeBorder(view.edges, *[_REACH] * 4, cv2.BORDER_CONSTANT, value=neutral)
-    total = cv2.matchTemplate(padded, drawn, cv2.TM_CCORR) + neutral * (len(view.outline) - len(at))
-    return np.asarray(total / len(view.outline), np.float32)
+    fits = []
+    for scale in _SCALES.tolist():
+        at = np.floor(view.outline * scale + view.center).astype(int)
+        at = at[((at >= 0) & (at < (width, height))).all(axis=1)]
+        drawn = np.zeros((height, width), np.float32)
+        np.add.at(drawn, (at[:, 1], at[:, 0]), 1)
+        fits.append(cv2.matchTemplate(padded, drawn, cv2.TM_CCORR) + neutral * (len(view.outline) - len(at)))
+    return np.asarray(np.stack(fits) / len(view.outline), np.float32)
