@@ -17,6 +17,7 @@ from ss_flow.tasks.capture.coco_masks import coco_masks
 from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.mono import mono
+from ss_flow.tasks.capture.registration import calibrated, registration
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.sfm import registered, sfm
 from ss_flow.tasks.models.catalogue import Model
@@ -43,6 +44,8 @@ class Capture:
     """tuple[Clicks, ...] where its user pointed at objects."""
     objects: tuple[str, ...] = ()
     """What the user calls these objects."""
+    registration: Any | None = None
+    """Registration of a sensor's depth."""
 
 
 def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, monodepth: Model | None) -> Capture:
@@ -75,9 +78,22 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         pointed = clicks(frames, cameras, hints=scene.hints, **views)
     if scene.ground_truth is not None:
         truth = ground_truth(frames, cameras, files=_all(reference, scene.ground_truth), **views)
-    depths = _depths(scene, reference, params, monodepth, frames, cameras, names)
+    source = params.depth
+    if source == "auto":
+        source = "sensor" if scene.depths is not None or scene.kind == "sens" else "mvs"
+    depths, placing = _depths(source, scene, reference, params, monodepth, frames, cameras, names), None
+    if source == "sensor":
+        calibrates = params.calibrate == "depth"
+        placing = registration(frames, cameras, depths, advise=not calibrates, params=params.registration)
+        if calibrates:
+            depths = calibrated(frames, cameras, depths, placing)
+    elif params.calibrate == "depth":
+        raise InputError(
+            f"{scene.root} is to be run with depth that no sensor measured (capture.depth={source}), and only a "
+            "sensor's can be calibrated; leave --calibrate depth out."
+        )
     objects = scene.hints.objects if scene.hints is not None else ()
-    return Capture(frames, cameras, depths, masks, truth, names, pointed, objects)
+    return Capture(frames, cameras, depths, masks, truth, names, pointed, objects, placing)
 
 
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> Any:
@@ -99,6 +115,7 @@ def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> A
 
 
 def _depths(
+    source: str,
     scene: SceneFiles,
     reference: Reference,
     params: CaptureParams,
@@ -107,11 +124,7 @@ def _depths(
     cameras: Any,
     names: tuple[str, ...] | None,
 ) -> Any:
-    """Sensor depth where there is some; otherwise a plane sweep over several views; or a network, when asked for."""
-    sensor = scene.depths is not None or scene.kind == "sens"
-    source = params.depth
-    if source == "auto":
-        source = "sensor" if sensor else "mvs"
+    """The sensor's depth, a plane sweep over several views ("mvs"), or a network's ("mono")."""
     if source == "sensor":
         if scene.kind == "sens" and scene.recording is not None:
             return recordings.sens_depth(

@@ -9,6 +9,7 @@ from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
 from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.recordings import VideoParams
+from ss_flow.tasks.capture.registration import RegistrationParams
 from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive
 from ss_flow.tasks.semantics.describe import DescribeParams
@@ -39,6 +40,8 @@ class CaptureParams:
     """Take every n-th view of a posed capture (ScanNet is evaluated at 20)."""
     depth: Literal["auto", "sensor", "mvs", "mono"] = "auto"
     """Where depth comes from; "auto" is the sensor where there is one, else several views (mvs)."""
+    calibrate: Literal["none", "depth"] = "none"
+    """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
     monodepth: str = "auto"
     """The network for depth=mono: a name of the catalogue, or "auto"."""
     ingest: IngestParams = field(default_factory=IngestParams)
@@ -46,6 +49,7 @@ class CaptureParams:
     sfm: SfmParams = field(default_factory=SfmParams)
     sweep: SweepParams = field(default_factory=SweepParams)
     agreement: AgreementParams = field(default_factory=AgreementParams)
+    registration: RegistrationParams = field(default_factory=RegistrationParams)
     mono: MonoParams = field(default_factory=MonoParams)
 
 

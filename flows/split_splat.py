@@ -77,6 +77,7 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
     results: dict[str, Any] = {
         "ingest": capture.frames,
         "cameras": capture.cameras,
+        **({"registration": capture.registration} if capture.registration is not None else {}),
         "depth": capture.depths,
         "dense": halved.points,
         "segment": halved.masks,

@@ -49,7 +49,9 @@ class Terminal(Reporter):
             self._display.update(self._all, completed=self._done, total=max(self._done, details.get("known", 0)))
         if kind == "finished" and details["seconds"] >= WORTH_SECONDS:
             self._console.print(f"[green]done[/]  {label:<34} {details['seconds']:8.1f} s", highlight=False)
-        elif kind == "failed" and not details["bad_input"]:  # whoever asked for the run tells of bad input, once
+        for warning in details.get("warnings", ()):
+            self._console.print(f"[yellow]warning[/] {label}: {escape(warning)}", highlight=False, soft_wrap=True)
+        if kind == "failed" and not details["bad_input"]:  # whoever asked for the run tells of bad input, once
             self._console.print(f"[red]failed[/] {label}: {escape(details['error'])}", highlight=False)
         elif kind in ("retried", "restarted"):
             self._console.print(f"[yellow]again[/]  {label}: {escape(details['because'])}", highlight=False)

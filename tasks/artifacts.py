@@ -78,6 +78,18 @@ class DepthMap:
 
 
 @dataclass(frozen=True)
+class Registration:
+    """How the depth maps must be moved for their edges to lie on those of the photos: frame point x goes to
+    scale * (x - principal point) + principal point + shift."""
+
+    scale: float
+    shift: Float64
+    """[2] x, y in pixels of the frames."""
+    gain: float
+    """0..1 share of the agreement between edges of depth and of photo that is lost where the maps stay as they are."""
+
+
+@dataclass(frozen=True)
 class MaskSet:
     """The 2D instance masks that a segmenter found in one view (Split&Splat, M_k); they may overlap."""
 

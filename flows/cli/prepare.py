@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -133,7 +133,8 @@ def prepare(
         held_out = scene.root / "held_out"
         extra: Capture | None = None
         if held_out.is_dir():
-            extra = capture(open_scene(held_out), reference, params.capture, networks.monodepth)
+            uncalibrated = replace(params.capture, calibrate="none")  # of these views only the photos count
+            extra = capture(open_scene(held_out), reference, uncalibrated, networks.monodepth)
         results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
         if text is not None:
             results["query"] = query(

@@ -39,11 +39,15 @@ class Run:
     COCO file (.json)."""
     hints: Path | None = None
     """A file (.json) of a few points clicked on objects in a few views; the segmenter looks for these objects only."""
+    calibrate: Literal["none", "depth"] = "none"
+    """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
     """How to run."""
 
     def run(self) -> int:
         params = settings.preset(Params(), self.execution.preset)
+        if self.calibrate != "none":
+            params = settings.apply(params, [f"capture.calibrate={self.calibrate}"])
         out = self.out or Path("ss-flow-out") / self.scene.resolve().stem
         return run_scene(open_scene(self.scene, self.masks, self.hints), out, params, self.execution)
 

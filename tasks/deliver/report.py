@@ -71,6 +71,7 @@ def report_html(
         metrics=_metrics(run.get("metrics") or {}),
         params=_flat(run.get("params") or {}),
         failures=[_failure(failure) for failure in run.get("failures") or ()],
+        warnings=list(dict.fromkeys(text for node in nodes for text in node.get("warnings") or ())),
         steps=_steps(nodes),
         hits=sum(bool(node.get("hit")) for node in nodes),
         misses=sum(not node.get("hit") for node in nodes),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Int32, MaskSet
 from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size, pack_masks
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, NonNegative, Positive
 from ss_flow.tasks.split.graph_segmentation import (
@@ -81,7 +82,10 @@ def segment_rgbd(frame: Frame, depth: DepthMap, cameras: Cameras, *, params: Seg
     columns = ((np.arange(width) + 0.5) * frame.width / width).astype(np.intp)
     pick = np.ix_(rows, columns)
     valid_small = valid[pick]
-    surface = surface_of(np.where(valid_small, depth_at_frame_size(depth, frame)[pick], 0).astype(np.float32), camera)
+    # Thin holes would cut every surface into pieces. They are closed for the masks alone: no step that compares depths
+    # may take what is guessed for what was measured.
+    closed = replace(depth, depth=close_holes(depth.depth))
+    surface = surface_of(np.where(valid_small, depth_at_frame_size(closed, frame)[pick], 0).astype(np.float32), camera)
     boundary = boundaries(surface, valid_small, params.depth_jump, params.crease)
     regions = superpixels(small, surface, boundary, valid_small, params.superpixel)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)

@@ -66,6 +66,14 @@ RUNS: dict[str, tuple[Make, str]] = {
         lambda base, scene: [scene, "--set", "capture.depth=lidar"],
         "'sensor' or 'mvs' or 'mono'",
     ),
+    "a calibration of what there is not": (
+        lambda base, scene: [missing(scene / "depth", scene), "--calibrate", "depth"],
+        r"capture.depth=mvs\), and only a sensor's can be calibrated",
+    ),
+    "a calibration of depth that is not used": (
+        lambda base, scene: [scene, "--calibrate", "depth", "--set", "capture.depth=mvs"],
+        r"capture.depth=mvs\), and only a sensor's can be calibrated",
+    ),
     "an assignment without =": (lambda base, scene: [scene, "--set", "tau_label"], "not of the form step.param=value"),
     "an unknown step": (
         lambda base, scene: [scene, "--until", "train"],
@@ -191,6 +199,7 @@ def test_a_bad_input_leaves_an_earlier_result_as_it_was(broken, warm, tmp_path):
         (["run"], "required"),
         (["run", "x", "--colour"], "Unrecognized"),
         (["run", "x", "--jobs", "many"], "jobs"),
+        (["run", "x", "--calibrate", "poses"], "calibrate"),
         (["query", "x"], "required"),
         (["demo", "--masks", "none"], "masks"),
     ],

@@ -84,6 +84,7 @@ def test_cache_show_describes_the_items_of_a_list(tiny):
         "ingest",
         "cameras",
         "sensor_depth",
+        "registration",
         "ready_masks",
         "dense",
         "visibility[0001]",

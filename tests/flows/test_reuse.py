@@ -22,6 +22,7 @@ BEFORE_PROPAGATE = {
     "capture.ingest",
     "capture.cameras",
     "capture.sensor_depth",
+    "capture.registration",
     "capture.ready_masks",
     "capture.ground_truth",
     "split.dense",

@@ -100,6 +100,12 @@ def test_of_a_scenes_place_only_its_name_is_shown():
     assert "<h1>kitchen</h1>" in html and "someone" not in html
 
 
+def test_warnings_are_told_once():
+    nodes = [{"step": "capture.registration", "warnings": ["Depth <does> not fit."]}] * 2
+    assert report_html({"nodes": nodes}, pictures={}).count("Depth &lt;does&gt; not fit.") == 1
+    assert "Warnings" not in report_html({"nodes": [{"step": "capture.registration", "warnings": []}]}, pictures={})
+
+
 def test_failures_by_label_are_told():
     page = Page(report_html({"failures": [{"label": "reconstruct[3]", "error": "out of memory"}]}, pictures={}))
     assert "reconstruct[3]: out of memory" in page.text

@@ -1,0 +1,238 @@
+"""Whether depth lies where its photos show it: edges of depth against edges of the photo, over several views.
+
+A depth camera of another focal length whose images pass for registered ones shows everything at a wrong place, by tens
+of pixels in the corners. Where depth jumps, the nearer side is the outline of something, and the photo mostly has an
+edge there; that tells the scale about the principal point and the shift that bring the two together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ss_flow.running import warn
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame, Registration
+from ss_flow.tasks.geometry.holes import close_holes
+from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.ranges import Count, Fraction
+
+_SIDE = 320
+"""Longer side of the images that are compared, at most; all lengths below are pixels of these."""
+_SCALES = np.exp(np.arange(-0.2, 0.201, 0.01))
+_REACH = 12
+"""Largest shift that is looked for."""
+_LEAST_EDGE, _LEAST_OUTLINE = 10, 50
+"""Connected pixels of an outline below which it is noise, and points of all outlines that a view needs to count."""
+_LEAST_VIEWS = 4
+_APART = 3.0
+"""How far apart, at the photo's border, two halves of the views may place the depth and still mean the same."""
+_IDENTITY = (1.0, 0.0, 0.0)
+
+Placing = tuple[float, float, float]
+"""Scale about the principal point, then shift along x and y."""
+
+
+@dataclass(frozen=True)
+class RegistrationParams:
+    """How depth is compared with the photos."""
+
+    views: Count = 16
+    """The most views that are compared, spread evenly."""
+    jump: Fraction = 0.05
+    """Step in depth, as a share of the depth, that counts as an edge."""
+    tau_found: Fraction = 0.1
+    """Gain from which another scale and shift count as found; calibrate=depth then applies them. The gain is the share
+    of the agreement between edges of depth and of photo that is lost without them."""
+    tau_warn: Fraction = 0.4
+    """Gain from which a run warns of them."""
+
+
+@dataclass(frozen=True)
+class _View:
+    edges: Float32
+    """[h, w] 0..1 how strong the photo's edges are."""
+    outline: Float64
+    """[N, 2] where depth has edges, from the principal point on."""
+    center: Float64
+    """[2] the principal point."""
+
+
+@task(name="capture.registration", uses=("opencv-contrib-python-headless", "scipy"))
+def registration(
+    frames: Sequence[Frame],
+    cameras: Cameras,
+    depths: Sequence[DepthMap],
+    *,
+    advise: bool = True,
+    params: RegistrationParams = RegistrationParams(),
+) -> Registration:
+    """The scale and shift under which the depth maps fit their photos best.
+
+    All views together find them. They are believed only when both halves of the views find the same, and what one half
+    finds holds for the other.
+    advise: whether to warn where the depth maps had better be scaled and shifted.
+    """
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(params.views, len(frames))).round().astype(int))
+    looked = (_view(frames[k], cameras.intrinsics[k], depths[k], params.jump) for k in chosen.tolist())
+    views = [view for view in looked if len(view.outline) >= _LEAST_OUTLINE]
+    if len(views) < _LEAST_VIEWS:
+        return Registration(1.0, np.zeros(2), 0.0)
+    coarse = [_coarse_fits(view) for view in views]
+    found = _search(views, coarse)
+    halves = views[::2], views[1::2]
+    first, second = _search(halves[0], coarse[::2]), _search(halves[1], coarse[1::2])
+    gained = min(
+        _fit(halves[1], first) - _fit(halves[1], _IDENTITY), _fit(halves[0], second) - _fit(halves[0], _IDENTITY)
+    )
+    by_chance = float(np.mean([view.edges.mean() for view in views]))
+    gain = max(0.0, gained / max(_fit(views, found) - by_chance, 1e-9))
+    shifts_apart = np.abs(np.subtract(first[1:], second[1:])).max()
+    agree = abs(first[0] - second[0]) * _SIDE / 2 + shifts_apart <= _APART
+    if gain < params.tau_found or not agree:
+        return Registration(1.0, np.zeros(2), gain)
+    result = Registration(found[0], np.array(found[1:]) / _reduction(frames[0]), gain)
+    if advise and gain >= params.tau_warn:
+        warn(
+            f"Depth edges fit the photos better when the depth images are {_said(result)}; use --calibrate depth, or "
+            "correct the capture's intrinsics."
+        )
+    return result
+
+
+@task(name="capture.calibrated", uses=("opencv-contrib-python-headless",))
+def calibrated(
+    frames: Sequence[Frame], cameras: Cameras, depths: Sequence[DepthMap], registration: Registration
+) -> tuple[DepthMap, ...]:
+    """The depth maps, moved to where the photos show them: nearest pixels, 0 where the sensor saw nothing.
+
+    z-depth is kept, as both cameras are taken to share their centre and axes.
+    """
+    import cv2
+
+    if registration.scale == 1 and not registration.shift.any():
+        warn("The depth images stay as they are: no other scale and shift fits the photos clearly better.")
+        return tuple(depths)
+    warn(f"The depth images were {_said(registration)}, so that its edges fit the photos.")
+    result = []
+    for frame, intrinsics, depth in zip(frames, cameras.intrinsics, depths, strict=True):
+        height, width = depth.depth.shape
+        per_pixel = np.array([width / frame.width, height / frame.height])
+        center, shift = intrinsics[2:] * per_pixel, registration.shift * per_pixel
+        # Pixel centres are integers here.
+        offset = center + shift - registration.scale * center + 0.5 * registration.scale - 0.5
+        matrix = np.column_stack([registration.scale * np.eye(2), offset])
+        moved = cv2.warpAffine(depth.depth, matrix, (width, height), flags=cv2.INTER_NEAREST)
+        result.append(replace(depth, depth=moved))
+    return tuple(result)
+
+
+def _said(found: Registration) -> str:
+    x, y = found.shift
+    return f"scaled by {found.scale:.3f} and shifted by ({x:+.1f}, {y:+.1f}) pixels"
+
+
+def _reduction(frame: Frame) -> float:
+    return min(1.0, _SIDE / max(frame.width, frame.height))
+
+
+def _view(frame: Frame, intrinsics: Float64, depth: DepthMap, jump: float) -> _View:
+    import cv2
+
+    size = _reduction(frame)
+    width, height = max(1, round(frame.width * size)), max(1, round(frame.height * size))
+    small = cv2.resize(decode_rgb(frame), (width, height), interpolation=cv2.INTER_AREA)
+    lab = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32), (0, 0), 1)
+    slopes = cv2.Sobel(lab, -1, 1, 0), cv2.Sobel(lab, -1, 0, 1)
+    strength = np.sqrt(sum((slope**2).sum(axis=2) for slope in slopes))
+    # A strong edge counts little more than a clear one.
+    edges = strength / (strength + 3 * np.median(strength) + 1e-6)
+    values = close_holes(depth.depth)
+    if values.shape[0] > height:
+        values = cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST)
+    center = intrinsics[2:] * (width / frame.width, height / frame.height)
+    scale = width / values.shape[1], height / values.shape[0]
+    return _View(edges.astype(np.float32), _outline(values, jump) * scale - center, center)
+
+
+def _outline(depth: Float32, jump: float, reach: int = 4) -> Float64:
+    """[N, 2] x, y where surfaces end before something farther: the borders of known pixels to pixels that are farther
+    or unknown, with something farther known within `reach` pixels, since sensors see nothing right beside an edge."""
+    import cv2
+
+    known = depth > 0
+    farther = cv2.dilate(depth, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > (1 + jump) * depth
+    around = np.pad(np.where(known, depth, np.float32(np.inf)), 1, mode="edge")
+    height, width = depth.shape
+    steps = ((0, 1), (0, -1), (1, 0), (-1, 0))
+    beside = [around[1 + y : 1 + y + height, 1 + x : 1 + x + width] for y, x in steps]
+    ends = [known & farther & (other > (1 + jump) * depth) for other in beside]
+    _, part, stats, _ = cv2.connectedComponentsWithStats(np.any(ends, axis=0).astype(np.uint8), connectivity=8)
+    large = (stats[:, cv2.CC_STAT_AREA] >= _LEAST_EDGE)[part]
+    # Half a pixel on from the pixel's centre lies its border.
+    at = [np.argwhere(end & large) + 0.5 + 0.5 * np.array(step) for end, step in zip(ends, steps, strict=True)]
+    return np.concatenate(at)[:, ::-1]
+
+
+def _fit(views: Sequence[_View], placing: Placing) -> float:
+    """0..1 how strong the photos' edges are along the outlines, placed so; a mean over views."""
+    import cv2
+
+    scale, *shift = placing
+    fits = []
+    for view in views:
+        at = (view.outline * scale + view.center + shift - 0.5).astype(np.float32)
+        # What leaves the photo neither speaks for the placing nor against it.
+        neutral = float(view.edges.mean())
+        here = cv2.remap(
+            view.edges, at[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=neutral
+        )
+        fits.append(float(here.mean()))
+    return float(np.mean(fits))
+
+
+def _search(views: Sequence[_View], coarse: Sequence[Float32]) -> Placing:
+    """The placing that fits best: a descent from the best of the coarse ones.
+
+    coarse: `_coarse_fits` of each view.
+    """
+    from scipy.optimize import minimize
+
+    fits = np.mean(coarse, axis=0)
+    s, y, x = np.unravel_index(int(fits.argmax()), fits.shape)
+    fine = _blurred(views, 1)
+    # In units of about one pixel at the photo's border.
+    start = np.array([np.log(_SCALES[s]) * _SIDE / 2, x - _REACH, y - _REACH])
+    simplex = np.vstack([start, start + np.diag([1.5, 1.5, 1.5])])
+
+    def placing(at: Float64) -> Placing:
+        return float(np.exp(at[0] * 2 / _SIDE)), float(at[1]), float(at[2])
+
+    options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-6}
+    return placing(minimize(lambda at: -_fit(fine, placing(at)), start, method="Nelder-Mead", options=options).x)
+
+
+def _blurred(views: Sequence[_View], sigma: float) -> list[_View]:
+    import cv2
+
+    return [replace(view, edges=cv2.GaussianBlur(view.edges, (0, 0), sigma)) for view in views]
+
+
+def _coarse_fits(view: _View) -> Float32:
+    """[S, 2 R + 1, 2 R + 1] the fit of a view, its edges blurred, at every scale and whole shift (y, x) up to R."""
+    import cv2
+
+    (view,) = _blurred([view], 2)
+    height, width = view.edges.shape
+    neutral = float(view.edges.mean())
+    padded = cv2.copyMakeBorder(view.edges, *[_REACH] * 4, cv2.BORDER_CONSTANT, value=neutral)
+    fits = []
+    for scale in _SCALES.tolist():
+        at = np.floor(view.outline * scale + view.center).astype(int)
+        at = at[((at >= 0) & (at < (width, height))).all(axis=1)]
+        drawn = np.zeros((height, width), np.float32)
+        np.add.at(drawn, (at[:, 1], at[:, 0]), 1)
+        fits.append(cv2.matchTemplate(padded, drawn, cv2.TM_CCORR) + neutral * (len(view.outline) - len(at)))
+    return np.asarray(np.stack(fits) / len(view.outline), np.float32)

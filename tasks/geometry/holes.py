@@ -1,0 +1,31 @@
+"""Holes of a depth map that are as thin as a warp leaves them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Float32
+
+
+def close_holes(depth: Float32, step: float = 0.05) -> Float32:
+    """A depth map without its unknown pixels and lines of at most two pixels across.
+
+    depth: [H, W] float32, 0 where unknown. A map that was moved pixel by pixel into another camera has them wherever
+    neighbours moved apart. A hole is closed by the mean inverse depth of the known pixels beside it, unless the largest
+    and the smallest known depth within two pixels differ by more than `step` of the smaller: an edge may run through
+    it. Wider holes stay as they are, and so does every known pixel.
+    """
+    import cv2
+
+    known = depth > 0
+    if known.all():
+        return depth
+    # Closing with 3 x 3 keeps unknown what holds a whole 3 x 3 block of unknown pixels.
+    thin = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+    near = np.ones((5, 5), np.uint8)  # reaches both sides of a line of two pixels
+    largest = cv2.dilate(depth, near)
+    smallest = cv2.erode(np.where(known, depth, np.float32(np.inf)), near)
+    hole = thin & ~known & (largest / smallest <= 1 + step)
+    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
+    count, total = (cv2.boxFilter(image, -1, (3, 3), normalize=False) for image in (known.astype(np.float32), inverse))
+    return np.where(hole, count / np.where(hole, total, 1), depth).astype(np.float32)
