@@ -91,14 +91,14 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
     if capture.truth is not None:
         with labelled("split"):
             results["metrics_split"] = evaluate_masks(
-                masks_split, capture.truth, zero_is_void=params.evaluate.zero_is_void
+                masks_split, capture.truth, halved.tree, zero_is_void=params.evaluate.zero_is_void
             )
     results |= splat(capture, halved, networks, params)
     if capture.truth is not None:
         for stage, masks in (("refined", "masks_refined"), ("splat", "masks")):
             with labelled(stage):
                 results[f"metrics_{stage}"] = evaluate_masks(
-                    results[masks], capture.truth, zero_is_void=params.evaluate.zero_is_void
+                    results[masks], capture.truth, halved.tree, zero_is_void=params.evaluate.zero_is_void
                 )
     if held_out is not None:
         results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])

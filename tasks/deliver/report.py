@@ -28,6 +28,7 @@ _METRIC_NAMES = {
     "macc25": "mAcc @ 0.25",
     "macc50": "mAcc @ 0.5",
     "pq": "PQ",
+    "pq_things": "PQ of things",
     "sq": "SQ",
     "rq": "RQ",
     "psnr": "PSNR",

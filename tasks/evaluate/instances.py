@@ -9,7 +9,17 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Float32, Float64, Gaussians, Int32, LabelMap, Metrics, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import (
+    Float32,
+    Float64,
+    Gaussians,
+    Hierarchy,
+    Int32,
+    LabelMap,
+    Metrics,
+    PointCloud,
+    PointLabels,
+)
 from ss_flow.tasks.evaluate.contingency import Labels, contingency
 from ss_flow.tasks.evaluate.panoptic import (
     hungarian_miou,
@@ -95,7 +105,11 @@ def evaluate_gaussians(
 
 @task(uses=("scipy",))
 def evaluate_masks(
-    predicted: tuple[LabelMap, ...], truth: tuple[LabelMap, ...], *, zero_is_void: bool = False
+    predicted: tuple[LabelMap, ...],
+    truth: tuple[LabelMap, ...],
+    tree: Hierarchy | None = None,
+    *,
+    zero_is_void: bool = False,
 ) -> Metrics:
     """Score instance masks over all annotated views at once: one predicted id stands for one instance in every view.
 
@@ -103,10 +117,12 @@ def evaluate_masks(
     truth: the views' true ids. Where every pixel is annotated (a generated room: 0 = walls and floor), predicted
         pixels on 0 are false. Where 0 means "not annotated", set `zero_is_void`: such pixels are dropped on both
         sides, and a prediction most of which lies on them is no false positive.
+    tree: tells which predicted ids are stuff.
     Returns, on the pixels of all views pooled: miou, the mean over the true instances of the best IoU with any
     predicted id; macc25, macc50; pq, sq, rq (class-agnostic video panoptic quality over the whole scene);
     hungarian_miou (one-to-one); whole, the share of the true instances that are exactly one predicted id (IoU at
-    least 0.5, and no second id on more than a tenth of it); over_segmentation, under_segmentation; and the counts
+    least 0.5, and no second id on more than a tenth of it); pq_things, with a tree, where predicted stuff is no false
+    positive as only things are annotated; over_segmentation, under_segmentation; and the counts
     num_truth, num_predicted.
     Raises InputError when a view lacks its prediction, sizes differ, or nothing is annotated.
     """
@@ -124,12 +140,17 @@ def evaluate_masks(
     if not len(table.truth_ids):
         raise InputError("The ground truth masks hold no instance; at least one view with one is needed to evaluate.")
     quality = panoptic_quality(table, ignored)
+    of_things = {}
+    if tree is not None:
+        stuff = np.isin(table.predicted_ids, tree.node[tree.stuff])
+        of_things["pq_things"] = panoptic_quality(table, stuff if ignored is None else stuff | ignored).pq
     return Metrics(
         {
             **_summary(table.best_iou()),
             "pq": quality.pq,
             "sq": quality.sq,
             "rq": quality.rq,
+            **of_things,
             "hungarian_miou": hungarian_miou(table),
             "whole": float(whole(table).mean()),
             "over_segmentation": over_segmentation(table),

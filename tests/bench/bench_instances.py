@@ -27,7 +27,20 @@ from ss_flow.flows import settings
 from ss_flow.flows.generated import RoomParams, generate
 from ss_flow.flows.generated_masks import DegradeParams, degrade
 from ss_flow.flows.params import Params, SplitParams
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Int32, LabelMap, MaskSet, PointCloud, PointParts
+from ss_flow.tasks.artifacts import (
+    Cameras,
+    DepthMap,
+    Frame,
+    Hierarchy,
+    Int32,
+    LabelMap,
+    MaskSet,
+    Observation,
+    PointCloud,
+    PointLabels,
+    PointParts,
+    Visibility,
+)
 from ss_flow.tasks.capture.id_images import masks_of
 from ss_flow.tasks.evaluate.contingency import contingency
 from ss_flow.tasks.evaluate.instances import evaluate_masks, pooled
@@ -35,17 +48,31 @@ from ss_flow.tasks.evaluate.panoptic import average_precision
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.models.catalogue import available, default_folders, find
 from ss_flow.tasks.splat.resolve import resolve
+from ss_flow.tasks.split.cut import cut
 from ss_flow.tasks.split.dense import dense
 from ss_flow.tasks.split.embed import embed
+from ss_flow.tasks.split.hierarchy import hierarchy
 from ss_flow.tasks.split.observe import observe
 from ss_flow.tasks.split.propagate import propagate
 from ss_flow.tasks.split.reproject import reproject
 from ss_flow.tasks.split.segment import segment
+from ss_flow.tasks.split.tally import tally
 from ss_flow.tasks.split.visibility import visibility
 
 SIZES = {10: (24, 320, 240), 50: (36, 480, 360), 200: (60, 640, 480)}
 """Views, width and height of a room with so many objects."""
-COLUMNS = ("miou", "macc25", "macc50", "pq", "ap50", "over_segmentation", "under_segmentation", "points", "moved")
+COLUMNS = (
+    "miou",
+    "macc25",
+    "macc50",
+    "pq",
+    "pq_things",
+    "ap50",
+    "over_segmentation",
+    "under_segmentation",
+    "points",
+    "moved",
+)
 WITHOUT = {
     "views at once": {"propagate.views": "in_turn"},
     "votes of borders": {"propagate.at_once.border_vote": 1e-9},
@@ -54,6 +81,7 @@ WITHOUT = {
     "DBSCAN of labels": {"propagate.label_clusters.eps": 0.0},
     "touching labels": {"propagate.touching_merge": False},
     "best masks": {"reproject.selection.masks": "all"},
+    "wholes": {"granularity": 1.0},
     "drawn masks": {"reproject.draw_missing": False},
     "exclusive masks": {"observe.nested": True},
     "erosion scaled and limited": {
@@ -158,14 +186,14 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
     observed = tuple(
         observe(room.cloud, view, pool, params=split.observe) for view, pool in zip(seen, masks, strict=True)
     )
-    labels = propagate(room.cloud, seen, observed, params=split.propagate)
+    labels, tree = labelled(room, seen, masks, observed, split)
     seconds = time.perf_counter() - begun
     order = np.random.default_rng(1).permutation(len(seen))
-    again = propagate(room.cloud, [seen[k] for k in order], [observed[k] for k in order], params=split.propagate)
+    again, _ = labelled(room, *([of[k] for k in order] for of in (seen, masks, observed)), split)
     whole = PointParts(np.zeros_like(labels.label))
     instances = reproject(room.cloud, seen, masks, labels, whole, (), params=split.reproject)
     maps = resolve(room.cameras, instances)
-    values = evaluate_masks(maps, room.truth).values
+    values = evaluate_masks(maps, room.truth, tree).values
     table = contingency(*pooled(maps, room.truth)).without(truth=0, predicted=0)
     confidence = {i.instance_id: i.confidence * np.sqrt(len(i.view)) for i in instances}
     known = room.true_label >= 0
@@ -177,6 +205,20 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
         "labels": float(len(table.predicted_ids)),
         "seconds": seconds,
     }
+
+
+def labelled(
+    room: Scene,
+    seen: Sequence[Visibility],
+    masks: Sequence[MaskSet],
+    observed: Sequence[Observation],
+    split: SplitParams,
+) -> tuple[PointLabels, Hierarchy]:
+    """The instances of the points, and the tree that they were cut from."""
+    pieces = propagate(room.cloud, seen, observed, params=split.propagate)
+    counted = [tally(view, pool, pieces) for view, pool in zip(seen, masks, strict=True)]
+    tree = hierarchy(room.cloud, room.cameras, pieces, counted, params=split.hierarchy)
+    return cut(pieces, tree, granularity=split.granularity), tree
 
 
 def moved(before: Int32, after: Int32) -> float:
