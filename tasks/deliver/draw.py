@@ -19,6 +19,7 @@ from ss_flow.tasks.artifacts import (
     Float32,
     Frame,
     Gaussians,
+    Hierarchy,
     InstanceMasks,
     Int32,
     LabelMap,
@@ -294,6 +295,24 @@ def _(value: QueryResult, context: Context) -> UInt8:
         figures = (f"{x[i]:.3f}" for x in (value.score, value.delta, value.relevancy))
         rows.append((str(instance), *figures, "yes" if value.matched[i] else "no"))
     return table_picture(f"“{value.text}” ({value.encoder})", rows)
+
+
+@_draw.register
+def _(value: Hierarchy, context: Context) -> UInt8:
+    row_of, rows = value.row_of(), [("node", "kind", "agreement")]
+
+    def down(node: int, depth: int) -> None:
+        row = row_of[node]
+        below = value.node[value.parent == node].tolist()
+        kind = "stuff" if value.stuff[row] else "thing"
+        rows.append(("    " * depth + str(node), kind, f"{value.agreement[row]:.2f}" if below else ""))
+        for child in below:
+            down(child, depth + 1)
+
+    for node in value.node[value.parent == 0].tolist():
+        if (value.parent == node).any():
+            down(node, 0)
+    return table_picture("What the labels make up", rows)
 
 
 @_draw.register

@@ -8,10 +8,11 @@ from typing import Literal
 
 import numpy as np
 
+from ss_flow.running import warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Float32, Int32, Observation, PointCloud, PointLabels, Visibility
+from ss_flow.tasks.artifacts import Bool, Float32, Int32, Observation, PointCloud, PointLabels, Visibility
 from ss_flow.tasks.geometry.clustering import main_clusters
-from ss_flow.tasks.ranges import Fraction, Natural
+from ss_flow.tasks.ranges import Count, Fraction, Natural
 from ss_flow.tasks.split.consensus import ConsensusParams, merge_labels
 from ss_flow.tasks.split.mask_clustering import (
     MaskClusteringParams,
@@ -51,6 +52,9 @@ class PropagateParams:
     """Which points of a label are kept in the end."""
     min_label_points: Natural = 10
     """Points below which a label is dropped in the end."""
+    min_label_views: Count = 2
+    """Views that must show a label by a mask, where more views see at least half of it; else it is dropped in the end.
+    1 keeps all."""
 
 
 @task(uses=("scipy", "opencv-contrib-python-headless"))
@@ -81,6 +85,9 @@ def propagate(
     settled = _settle(label, points, observations, params)
     num_labels = max(matched.label, default=0)
     renamed = _renaming(label, settled, num_labels)
+    if params.min_label_views > 1:
+        dropped = _unconfirmed(settled, observations, matched, renamed, params.min_label_views)
+        settled, renamed = np.where(dropped[settled], 0, settled), np.where(dropped[renamed], 0, renamed)
     return PointLabels(
         label=settled,
         confidence=share.astype(np.float32),
@@ -135,3 +142,26 @@ def _renaming(before: Int32, after: Int32, num_labels: int) -> Int32:
     kept = after > 0
     renamed[before[kept]] = after[kept]
     return renamed
+
+
+def _unconfirmed(
+    label: Int32, observations: Sequence[Observation], matched: Matches, renamed: Int32, min_views: int
+) -> Bool:
+    """Which labels masks of fewer views show, though more views see at least half of their points: [L + 1].
+
+    Where hardly any view looks, there is nothing that could have confirmed them.
+    """
+    size = np.bincount(label)
+    seen = np.zeros(len(size), np.int32)
+    for observation in observations:
+        seen += 2 * np.bincount(label[observation.point_index], minlength=len(size)) >= np.maximum(size, 1)
+    shown = np.unique(np.stack([renamed[matched.label], np.array(matched.view, np.int32)]).astype(np.int64), axis=1)[0]
+    support = np.bincount(shown, minlength=len(size))[: len(size)]
+    dropped = (support < min_views) & (seen > min_views) & (size > 0)
+    dropped[0] = False
+    if dropped.any():
+        warn(
+            f"{dropped.sum()} labels ({size[dropped].sum() / len(label):.1%} of the points) are left to the background, "
+            f"since masks of fewer than {min_views} views show them though more see them."
+        )
+    return dropped

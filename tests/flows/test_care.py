@@ -158,11 +158,11 @@ def test_a_bad_limit_is_told_in_a_sentence(options, sentence, tiny):
 
 
 def test_pins_are_named_by_step_by_digest_or_by_scene(warm):
-    digest = warm.called.results()["propagate"]
-    for what in ("propagate", "visibility[0003]", digest[:9], warm.scene):
+    digest = warm.called.results()["dense"]
+    for what in ("dense", "visibility[0003]", digest[:9], warm.scene):
         assert ss_flow("cache", "pin", what, "--cache", warm.store).code == 0
     pins = json.loads(ss_flow("cache", "pin", "--json", "--cache", warm.store).out)
-    assert [p["what"] for p in pins] == ["propagate", "visibility[0003]", digest, str(warm.scene)]
+    assert [p["what"] for p in pins] == ["dense", "visibility[0003]", digest, str(warm.scene)]
     assert pins[2]["keys"] == pins[0]["keys"] and len(pins[0]["keys"]) == len(pins[1]["keys"]) == 1
     assert set(pins[3]["keys"]) == keys_of(warm.called)
     assert pins[2]["objects"] == [digest]
@@ -171,9 +171,9 @@ def test_pins_are_named_by_step_by_digest_or_by_scene(warm):
     assert ss_flow("cache", "unpin", digest[:9], "--cache", warm.store).code == 0
     assert ss_flow("cache", "unpin", warm.scene, "--cache", warm.store).code == 0
     assert digest not in ss_flow("cache", "du", "--cache", warm.store).out
-    wrong = ss_flow("cache", "unpin", "propagate", "--scene", warm.out, "--cache", warm.store)
-    assert wrong.code == 2 and "pinned are: propagate, visibility[0003]." in wrong.err
-    assert ss_flow("cache", "unpin", "propagate", "--scene", warm.scene, "--cache", warm.store).code == 0
+    wrong = ss_flow("cache", "unpin", "dense", "--scene", warm.out, "--cache", warm.store)
+    assert wrong.code == 2 and "pinned are: dense, visibility[0003]." in wrong.err
+    assert ss_flow("cache", "unpin", "dense", "--scene", warm.scene, "--cache", warm.store).code == 0
 
 
 def test_a_pin_of_what_is_not_there_is_refused(warm):

@@ -56,7 +56,7 @@ def test_a_run_with_a_coco_file_is_the_run_with_the_same_masks_as_id_images(warm
     # The masks themselves come in another order; what follows from them does not depend on it.
     before, after = images.results(), coco.results()
     different = {step for step in before if before[step] != after[step]}
-    assert "segment" in different and different <= {"segment", "propagate"}
+    assert "segment" in different and different <= {"segment", "propagate", "cut"}
     for name in ("scene_labeled.ply", "cloud_labeled.ply", "instances.json"):
         assert (tmp_path / "coco" / name).read_bytes() == (tmp_path / "images" / name).read_bytes()
 

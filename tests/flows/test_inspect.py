@@ -40,7 +40,7 @@ def test_the_graph_is_mermaid_with_a_box_a_step_and_what_feeds_it(tiny):
     assert boxes["split.visibility"] == "split.visibility x 5"
     assert {a for a, _, _ in arrows} | {b for _, _, b in arrows} <= set(boxes)
     assert ("capture.ready_masks", "masks", "split.observe") in arrows
-    assert ("split.propagate", "labels", "split.reproject") in arrows
+    assert {("split.propagate", "labels", "split.cut"), ("split.cut", "labels", "split.reproject")} <= arrows
 
 
 def test_cache_ls_has_a_line_a_result_and_says_how_large_each_is(tiny):
@@ -89,6 +89,9 @@ def test_cache_show_describes_the_items_of_a_list(tiny):
         "dense",
         "visibility[0001]",
         "propagate",
+        "tally[0001]",
+        "hierarchy",
+        "cut",
         "parts",
         "reproject",
         "reconstruct[1]",

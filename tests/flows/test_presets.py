@@ -33,7 +33,14 @@ TABLE = {
     # 5
     "split.segment.mask_threshold": ((0.5, 0.5, 0.3, 0.3),) * 3,
     # 6
+    "split.segment.suppression": ("boxes", "boxes", "masks"),
     "split.segment.box_nms": ((0.3, 0.3, 0.5, 0.3),) * 3,
+    "split.segment.mask_nms": (0.8, 0.8, 0.8),
+    # Neither text nor code speaks of these.
+    "split.segment.max_area": (1.0, 1.0, 0.8),
+    "split.segment.speckle": (0.0, 0.0, 0.05),
+    "split.propagate.min_label_views": (1, 1, 2),
+    "split.granularity": (1.0, 1.0, 0.45),
     # 7
     "split.segment.min_area": (0.0025, 0.0025, 0.0025),
     "split.segment.min_pixels": (0, 0, 64),
