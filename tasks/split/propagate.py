@@ -161,7 +161,7 @@ def _unconfirmed(
     dropped[0] = False
     if dropped.any():
         warn(
-            f"{dropped.sum()} labels ({size[dropped].sum() / len(label):.1%} of the points) are left to the background, "
+            f"{dropped.sum()} labels ({size[dropped].sum() / len(label):.1%} of the points) go to the background, "
             f"since masks of fewer than {min_views} views show them though more see them."
         )
     return dropped
