@@ -108,14 +108,15 @@ class _Pieces:
     """Pieces that may be united, and what the views say about sets of them."""
 
     def __init__(self, names: Int32, tallies: Sequence[Tally], stuff: Bool, params: HierarchyParams) -> None:
-        seen, held = [], []
-        for tally in tallies:
+        seen, held, quality = [], [], []
+        for tally in {_content(tally): tally for tally in tallies}.values():  # a second copy of a view says nothing
             column = np.searchsorted(names, tally.label)
             seen.append(np.zeros(len(names)))
             seen[-1][column] = tally.seen
             held.append(np.zeros((len(tally.held), len(names))))
             held[-1][:, column] = tally.held
-        self._set(seen, held, [tally.quality.astype(np.float64) for tally in tallies], stuff, params)
+            quality.append(tally.quality.astype(np.float64))
+        self._set(seen, held, quality, stuff, params)
 
     def _set(
         self,
@@ -202,6 +203,10 @@ class _Pieces:
             fit = _ramp(iou, *_IOU) * _ramp(rest, *_REST) * np.clip(1 - doubt, 0, 1)
             agreed[rows] += weight[rows] * fit.max(axis=1)
         return agreed / np.maximum(asked + self._params.prior, 1e-9)
+
+
+def _content(tally: Tally) -> tuple[bytes, ...]:
+    return tuple(array.tobytes() for array in (tally.label, tally.seen, tally.held, tally.quality))
 
 
 def _ramp(value: Float64, low: float, high: float) -> Float64:

@@ -53,7 +53,7 @@ class PropagateParams:
     min_label_points: Natural = 10
     """Points below which a label is dropped in the end."""
     min_label_views: Count = 2
-    """Views that must show a label by a mask, where more views see at least half of it; else it is dropped in the end.
+    """Views that must show a label by a mask, where as many see at least a tenth of it; else it is dropped in the end.
     1 keeps all."""
 
 
@@ -147,21 +147,25 @@ def _renaming(before: Int32, after: Int32, num_labels: int) -> Int32:
 def _unconfirmed(
     label: Int32, observations: Sequence[Observation], matched: Matches, renamed: Int32, min_views: int
 ) -> Bool:
-    """Which labels masks of fewer views show, though more views see at least half of their points: [L + 1].
+    """Which labels masks of fewer views show, though as many see at least a tenth of their points: [L + 1].
 
-    Where hardly any view looks, there is nothing that could have confirmed them.
+    Where no other view looks, there is nothing that could have confirmed them.
     """
     size = np.bincount(label)
-    seen = np.zeros(len(size), np.int32)
-    for observation in observations:
-        seen += 2 * np.bincount(label[observation.point_index], minlength=len(size)) >= np.maximum(size, 1)
-    shown = np.unique(np.stack([renamed[matched.label], np.array(matched.view, np.int32)]).astype(np.int64), axis=1)[0]
-    support = np.bincount(shown, minlength=len(size))[: len(size)]
-    dropped = (support < min_views) & (seen > min_views) & (size > 0)
+    seen, support = np.zeros(len(size), np.int32), np.zeros(len(size), np.int32)
+    shown = np.unique(np.stack([np.array(matched.view, np.int32), renamed[matched.label]]), axis=1)
+    known: set[tuple[bytes, bytes]] = set()
+    for k, observation in enumerate(observations):
+        content = observation.point_index.tobytes(), observation.row.tobytes()
+        if content not in known:  # a second copy of a view confirms nothing
+            known.add(content)
+            seen += 10 * np.bincount(label[observation.point_index], minlength=len(size)) >= np.maximum(size, 1)
+            support[shown[1, shown[0] == k]] += 1
+    dropped = (support < min_views) & (seen >= min_views) & (size > 0)
     dropped[0] = False
     if dropped.any():
         warn(
             f"{dropped.sum()} labels ({size[dropped].sum() / len(label):.1%} of the points) go to the background, "
-            f"since masks of fewer than {min_views} views show them though more see them."
+            f"since masks of fewer than {min_views} views show them though others see them too."
         )
     return dropped

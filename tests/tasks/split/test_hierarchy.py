@@ -10,12 +10,12 @@ SEES = 100
 """Points that a view sees of each label."""
 
 
-def tally(masks: list[tuple[set[int], float]], sees: set[int], name: str = "a") -> Tally:
-    """A view that sees some labels, and masks that hold all points of theirs: (labels, quality)."""
+def tally(masks: list[tuple[set[int], float]], sees: set[int], points: int = SEES) -> Tally:
+    """A view that sees so many points of some labels, and masks that hold all those of theirs: (labels, quality)."""
     label = np.array(sorted(sees), np.int32)
-    held = np.array([[SEES * (i in of) for i in label] for of, _ in masks], np.int32).reshape(len(masks), len(label))
+    held = np.array([[points * (i in of) for i in label] for of, _ in masks], np.int32).reshape(len(masks), len(label))
     quality = np.array([q for _, q in masks], np.float32)
-    return Tally(name, label, np.full(len(label), SEES, np.int32), held, quality)
+    return Tally("a", label, np.full(len(label), points, np.int32), held, quality)
 
 
 def tree(tallies: list[Tally], labels: int, **changes) -> Hierarchy:
@@ -50,14 +50,14 @@ def unions(found: Hierarchy) -> dict[frozenset[int], float]:
 def test_what_most_views_show_under_one_mask_is_one():
     faces = [({1, 2}, 0.9), ({1}, 0.9), ({2}, 0.9)]
     apart = [({1}, 0.9), ({2}, 0.9)]
-    found = tree([tally(faces, {1, 2, 3}), tally(faces, {1, 2, 3}), tally(apart, {1, 2})], 3)
+    found = tree([tally(faces, {1, 2, 3}), tally(faces, {1, 2, 3}, 90), tally(apart, {1, 2})], 3)
     assert unions(found) == {frozenset({1, 2}): 2 / 3}
     assert found.node.tolist() == [1, 2, 3, 4] and found.parent.tolist() == [4, 4, 0, 0]
 
 
 def test_views_that_see_one_piece_alone_have_no_say():
-    views = [tally([({1, 2}, 0.9)], {1, 2})] + [tally([({1}, 0.9)], {1})] * 5
-    assert unions(tree(views, 2)) == {frozenset({1, 2}): 1.0}
+    alone = [tally([({1}, 0.9)], {1}, points) for points in range(90, 95)]
+    assert unions(tree([tally([({1, 2}, 0.9)], {1, 2}), *alone], 2)) == {frozenset({1, 2}): 1.0}
 
 
 def test_a_box_is_whole_though_no_view_sees_all_its_faces():
@@ -67,7 +67,7 @@ def test_a_box_is_whole_though_no_view_sees_all_its_faces():
 
 def test_a_mask_of_two_things_of_which_the_segmenter_is_less_sure_is_a_group_at_most():
     # Sure of each thing (0.95) and in doubt of both together (0.8): with a doubt of 0.2, a quarter remains.
-    views = [tally([({1, 2}, 0.8), ({1}, 0.95), ({2}, 0.95)], {1, 2})] * 3
+    views = [tally([({1, 2}, 0.8), ({1}, 0.95), ({2}, 0.95)], {1, 2}, points) for points in (80, 90, 100)]
     assert unions(tree(views, 2, doubt=0.2)) == {frozenset({1, 2}): 0.25}
     assert unions(tree(views, 2, doubt=0.2, min_agreement=0.3)) == {}
 
@@ -107,3 +107,11 @@ def test_neither_the_order_of_views_nor_that_of_masks_matters(views, random):
     after = of(mixed)
     assert before.node.tolist() == after.node.tolist() and before.parent.tolist() == after.parent.tolist()
     assert np.allclose(before.agreement, after.agreement)
+
+
+@given(st.lists(st.tuples(masks, subsets), min_size=1, max_size=4))
+@settings(deadline=None, max_examples=30)
+def test_a_second_copy_of_all_views_changes_nothing(views):
+    once = [tally([(m & sees, q) for m, q in of if m & sees], sees) for of, sees in views]
+    before, after = tree(once, 5), tree([*once, *once], 5)
+    assert before.parent.tolist() == after.parent.tolist() and np.array_equal(before.agreement, after.agreement)
