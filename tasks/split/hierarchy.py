@@ -205,8 +205,10 @@ class _Pieces:
         return agreed / np.maximum(asked + self._params.prior, 1e-9)
 
 
-def _content(tally: Tally) -> tuple[bytes, ...]:
-    return tuple(array.tobytes() for array in (tally.label, tally.seen, tally.held, tally.quality))
+def _content(tally: Tally) -> tuple[object, ...]:
+    """What a tally says, whatever the order of its masks."""
+    masks = sorted((float(quality), held.tobytes()) for quality, held in zip(tally.quality, tally.held, strict=True))
+    return tally.label.tobytes(), tally.seen.tobytes(), tuple(masks)
 
 
 def _ramp(value: Float64, low: float, high: float) -> Float64:
