@@ -205,6 +205,8 @@ class Tally:
     """[V] points of each that the view sees."""
     held: Int32
     """[M, V] those of them under each mask of the view's MaskSet."""
+    beside: Int32
+    """[V, V] pixels at which the area of each label meets that of each other one."""
     quality: Float32
     """[M] how sure the segmenter is of each mask: its own estimate of the IoU, times the mask's stability."""
 

@@ -16,6 +16,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.split.mounds import Mounds, find_mounds
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 
 _IOU = (0.5, 0.8)
@@ -26,6 +27,8 @@ _OWN = 0.75
 """IoU with a single piece from which a mask is the piece's own."""
 _BALANCED = 0.1
 """Share of the smaller pieces in what a view sees of all, from which on the view counts in full."""
+_ON_TOP = 0.5
+"""What is left of an agreement when one piece stands on the others: the views show a group."""
 _MOST_SETS = 2000
 """Sets of pieces that are weighed in a round: those that the most masks show."""
 
@@ -45,6 +48,10 @@ class HierarchyParams:
     """Points of a piece that a view must see to count."""
     min_visible: Fraction = 0.2
     """Share of the points that any view sees of a piece, which a view must see to count."""
+    around: Fraction = 0.8
+    """Share of its border with other labels along which a piece is surrounded by what it stands on."""
+    bulge: Fraction = 0.09
+    """How far it must rise from there, as a share of its extent: a bag on a sofa is no part of the sofa."""
     stuff: StuffParams = field(default_factory=StuffParams)
     """What is a wall or a floor rather than a thing."""
 
@@ -66,7 +73,8 @@ def hierarchy(
     """
     names = np.unique(labels.label[labels.label > 0]).astype(np.int32)
     is_stuff = find_stuff(points, cameras, labels, params.stuff)
-    pieces = _Pieces(names, tallies, is_stuff, params)
+    mounds = find_mounds(points, cameras, labels, tallies, around=params.around, height=params.bulge)
+    pieces = _Pieces(names, tallies, is_stuff, mounds, params)
     node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
     top = list(range(len(names)))  # the tree's row of each piece
     while True:
@@ -107,7 +115,9 @@ class _View:
 class _Pieces:
     """Pieces that may be united, and what the views say about sets of them."""
 
-    def __init__(self, names: Int32, tallies: Sequence[Tally], stuff: Bool, params: HierarchyParams) -> None:
+    def __init__(
+        self, names: Int32, tallies: Sequence[Tally], stuff: Bool, mounds: Mounds, params: HierarchyParams
+    ) -> None:
         seen, held, quality = [], [], []
         for tally in {_content(tally): tally for tally in tallies}.values():  # a second copy of a view says nothing
             column = np.searchsorted(names, tally.label)
@@ -116,6 +126,7 @@ class _Pieces:
             held.append(np.zeros((len(tally.held), len(names))))
             held[-1][:, column] = tally.held
             quality.append(tally.quality.astype(np.float64))
+        self._mounds, self._labels = mounds, [(row,) for row in range(len(names))]
         self._set(seen, held, quality, stuff, params)
 
     def _set(
@@ -145,6 +156,8 @@ class _Pieces:
         for column, members in enumerate(groups):
             joined[list(members), column] = 1
         after = _Pieces.__new__(_Pieces)
+        after._mounds = self._mounds
+        after._labels = [tuple(row for piece in members for row in self._labels[piece]) for members in groups]
         after._set(
             [seen @ joined for seen in self._seen],
             [held @ joined for held in self._held],
@@ -159,7 +172,8 @@ class _Pieces:
         sets = self._sets()
         if not sets:
             return []
-        agreement = np.round(self._agreement(sets), 6)
+        agreement = self._agreement(sets) * np.where([self._standing(members) for members in sets], _ON_TOP, 1.0)
+        agreement = np.round(agreement, 6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
@@ -171,14 +185,24 @@ class _Pieces:
         return chosen
 
     def _sets(self) -> list[tuple[int, ...]]:
-        """The sets of pieces that masks show: those of which a mask holds at least half."""
+        """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
+        on the others."""
         shown: Counter[tuple[int, ...]] = Counter()
         for view in self._views:
             for held in (view.held >= 0.5 * view.seen) & (view.seen > 0):
                 members = tuple(np.flatnonzero(held).tolist())
                 if len(members) > 1 and len(set(self._stuff[list(members)].tolist())) == 1:
                     shown[members] += 1
+                    on_top = self._standing(members)
+                    if on_top and len(members) - len(on_top) > 1:
+                        shown[tuple(piece for piece in members if piece not in on_top)] += 1
         return [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
+
+    def _standing(self, members: tuple[int, ...]) -> set[int]:
+        """Which of these pieces stand on the others."""
+        labels = [row for piece in members for row in self._labels[piece]]
+        on_top = dict(zip(labels, self._mounds.standing(labels).tolist(), strict=True))
+        return {piece for piece in members if all(on_top[row] for row in self._labels[piece])}
 
     def _agreement(self, sets: list[tuple[int, ...]]) -> Float64:
         """[S] share of the views that show each set of pieces as one, of those that see at least two of them."""

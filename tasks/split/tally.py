@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import MaskSet, PointLabels, Tally, Visibility
+from ss_flow.tasks.artifacts import Int32, MaskSet, PointLabels, Tally, Visibility
+from ss_flow.tasks.split.selection import nearest_labels, paint_labels
+
+_REACH = 5.0
+"""How far a label's area reaches round its points, in pixels of an image with a diagonal of 800."""
 
 
-@task(name="split.tally")
+@task(name="split.tally", uses=("opencv-contrib-python-headless",))
 def tally(visibility: Visibility, masks: MaskSet, labels: PointLabels) -> Tally:
     """How many of each label's points lie under each mask of a view.
 
@@ -25,5 +29,19 @@ def tally(visibility: Visibility, masks: MaskSet, labels: PointLabels) -> Tally:
         label=names.astype(np.int32),
         seen=np.bincount(column, minlength=len(names)).astype(np.int32),
         held=held.reshape(len(masks), len(names)),
+        beside=_borders(visibility, labels, names),
         quality=np.minimum(masks.predicted_iou, 1) * masks.stability,
     )
+
+
+def _borders(visibility: Visibility, labels: PointLabels, names: Int32) -> Int32:
+    """[V, V] how long the border is between the areas of labels in a view."""
+    height, width = visibility.height, visibility.width
+    reach = _REACH * float(np.hypot(height, width)) / 800
+    area = nearest_labels(paint_labels(visibility, labels.label), height, width, reach)
+    column = np.searchsorted(names, area)
+    beside = np.zeros((len(names), len(names)), np.int32)
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        meets = (area[a] != area[b]) & (area[a] > 0) & (area[b] > 0)
+        np.add.at(beside, (column[a][meets], column[b][meets]), 1)
+    return beside + beside.T

@@ -65,7 +65,7 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
     order = np.argsort(first)
     names = names[order]
     label = np.argsort(order).astype(np.int32)[inverse[1:]]
-    rows, beside, touches = _borders(label, cloud, params)
+    rows, beside, touches = borders(label, cloud, params)
     bins = _bins(cloud.colors)
     colors: dict[int, Float32] = {}
     united = np.arange(len(names), dtype=np.int32)
@@ -88,7 +88,7 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
             return lowest[united][label]
 
 
-def _borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> tuple[Int32, Int32, Int32]:
+def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> tuple[Int32, Int32, Int32]:
     """Where labels end, and where they go on into another.
 
     label: [N], 0 = none. Returns the labelled points that have some of another label, or of none, beside them [R]; the

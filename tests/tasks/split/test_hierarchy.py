@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels, Tally
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
 
+NO_BORDERS = np.zeros((9, 9), np.int32)
 SEES = 100
 """Points that a view sees of each label."""
 
@@ -15,7 +16,9 @@ def tally(masks: list[tuple[set[int], float]], sees: set[int], points: int = SEE
     label = np.array(sorted(sees), np.int32)
     held = np.array([[points * (i in of) for i in label] for of, _ in masks], np.int32).reshape(len(masks), len(label))
     quality = np.array([q for _, q in masks], np.float32)
-    return Tally("a", label, np.full(len(label), points, np.int32), held, quality)
+    return Tally(
+        "a", label, np.full(len(label), points, np.int32), held, NO_BORDERS[: len(label), : len(label)], quality
+    )
 
 
 def tree(tallies: list[Tally], labels: int, **changes) -> Hierarchy:
@@ -82,7 +85,7 @@ def test_the_best_union_comes_first_and_becomes_a_piece_of_the_next():
 
 def test_a_crumb_that_a_view_hardly_sees_neither_speaks_for_nor_against():
     tiny = Tally("a", np.array([1, 2], np.int32), np.array([SEES, 3], np.int32), np.array([[SEES, 0]], np.int32),
-                 np.array([0.9], np.float32))  # fmt: skip
+                 NO_BORDERS[:2, :2], np.array([0.9], np.float32))  # fmt: skip
     assert unions(tree([tally([({1, 2}, 0.9)], {1, 2}), tiny, tiny], 2)) == {frozenset({1, 2}): 1.0}
 
 

@@ -29,3 +29,11 @@ def test_a_view_without_masks_still_says_what_it_sees():
     view = Visibility("a", np.array([0], np.int32), np.array([0], np.int32), np.ones(1, np.float32), 1, 2)
     counted = tally(view, mask_set("a", np.zeros((0, 1, 2), bool), np.zeros(0, np.float32), "test"), labelled([1]))
     assert counted.seen.tolist() == [1] and counted.held.shape == (0, 1)
+
+
+def test_borders_are_counted_where_areas_meet():
+    # Points one a pixel: labels 1 1 2 / 1 2 2; three pairs of neighbours differ.
+    pixels = np.arange(6, dtype=np.int32)
+    view = Visibility("a", pixels, pixels, np.ones(6, np.float32), 2, 3)
+    masks = mask_set("a", np.zeros((0, 2, 3), bool), np.zeros(0, np.float32), "test")
+    assert tally(view, masks, labelled([1, 1, 2, 1, 2, 2])).beside.tolist() == [[0, 3], [3, 0]]

@@ -1,0 +1,48 @@
+import numpy as np
+import pytest
+
+from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
+from ss_flow.tasks.split.mounds import Mounds, find_mounds
+
+STEP = 0.02
+
+
+def grid(width: float, depth: float) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(-width / 2, width / 2, STEP), np.arange(-depth / 2, depth / 2, STEP))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+
+SEAT = grid(1.2, 0.8)
+HOLE = (np.abs(SEAT[:, :2]) < 0.15).all(axis=1)
+
+
+def on_seat(height: float) -> Mounds:
+    """A seat (label 1), seen from above, with something of this height in the middle of it (label 2)."""
+    top = grid(0.3, 0.3) + np.array([0, 0, height])
+    steps = np.arange(STEP, height, STEP)
+    rim = top[(np.abs(top[:, :2]) > 0.13).any(axis=1)]
+    sides = np.concatenate([np.zeros((0, 3)), *(rim * (1, 1, 0) + (0, 0, z) for z in steps)])
+    places = np.concatenate([SEAT[~HOLE], top, sides]).astype(np.float32)
+    label = np.repeat(np.array([1, 2], np.int32), [(~HOLE).sum(), len(top) + len(sides)])
+    nothing = np.zeros(0, np.int32)
+    labels = PointLabels(label, np.ones(len(label)), 2, nothing, nothing, nothing, np.zeros(0))
+    pose = np.diag([1.0, -1, -1, 1])
+    pose[:3, 3] = (0, 0, 2)
+    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
+    both = np.array([1, 2], np.int32)
+    beside = np.array([[0, 40], [40, 0]], np.int32)
+    seen = Tally("a", both, np.bincount(label)[1:].astype(np.int32), np.zeros((0, 2), np.int32), beside, np.zeros(0))
+    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, STEP)
+    return find_mounds(cloud, cameras, labels, [seen], around=0.8, height=0.09)
+
+
+@pytest.mark.parametrize(("height", "stands"), [(0.0, False), (0.12, True), (0.2, True)])
+def test_a_bag_on_a_seat_stands_on_it_and_a_patch_sewn_on_does_not(height, stands):
+    assert on_seat(height).standing([0, 1]).tolist() == [False, stands]
+
+
+def test_nothing_stands_on_something_smaller_or_on_what_does_not_surround_it():
+    share, bulges = np.array([[0, 1], [1, 0]], float), np.array([True, True])
+    assert Mounds(share, np.array([100, 40], np.int32), bulges, 0.8).standing([0, 1]).tolist() == [False, True]
+    assert Mounds(share, np.array([100, 60], np.int32), bulges, 0.8).standing([0, 1]).tolist() == [False, False]
+    assert Mounds(0.7 * share, np.array([100, 40], np.int32), bulges, 0.8).standing([0, 1]).tolist() == [False, False]
