@@ -8,7 +8,7 @@ from typing import Any
 from ss_flow.cache.store import Store
 from ss_flow.flows.deliver import METRICS
 
-_MASKS = ("miou", "macc25", "macc50", "pq", "sq", "rq", "hungarian_miou", "whole")
+_MASKS = ("miou", "macc25", "macc50", "pq", "sq", "rq", "hungarian_miou", "whole", "pq_things")
 _COUNTS = ("over_segmentation", "under_segmentation", "num_truth", "num_predicted")
 
 NAMES: dict[str, tuple[str, ...]] = {
