@@ -9,14 +9,18 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Hierarchy, Int32, PointLabels, PointParts
 
+_WEAKEST = 2 / 3
+"""Share of the granularity that each union below an instance must exceed: views that see all of an instance make up for
+those that doubt some of its unions, but not for those that deny them."""
+
 
 @task(name="split.cut")
 def cut(labels: PointLabels, tree: Hierarchy, *, granularity: float) -> PointLabels:
     """The labels of points and masks at one level of the hierarchy.
 
-    labels: those that are the leaves of the tree. granularity: pieces on which the views agree more than this
-    are one instance (0..1); the highest such node counts, so that 1 leaves the labels as they are, and lower values
-    give things, then groups of things. Ids are those of the nodes.
+    labels: those that are the leaves of the tree. granularity: pieces on which the views agree more than this are one
+    instance (0..1); the highest such node counts, as long as no union in it has less than two thirds of that. So 1
+    leaves the labels as they are, and lower values give things, then groups of things. Ids are those of the nodes.
     """
     instance = instances_of(tree, labels.num_labels, granularity)
     highest = max(labels.num_labels, int(tree.node.max(initial=0)))
@@ -43,11 +47,15 @@ def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) ->
 def instances_of(tree: Hierarchy, num_labels: int, granularity: float) -> Int32:
     """[num_labels + 1] the instance that each label belongs to; labels that no point carries stay as they are."""
     row = tree.row_of()
+    sound = tree.agreement > _WEAKEST * granularity
+    for child, parent in enumerate(tree.parent):  # children come first
+        if parent and not sound[child]:
+            sound[row[int(parent)]] = False
     instance = np.arange(num_labels + 1, dtype=np.int32)
     for leaf in np.flatnonzero(~np.isin(tree.node, tree.parent)):
         above = int(leaf)
         while parent := int(tree.parent[above]):
             above = row[parent]
-            if tree.agreement[above] > granularity:
+            if sound[above] and tree.agreement[above] > granularity:
                 instance[tree.node[leaf]] = parent
     return instance

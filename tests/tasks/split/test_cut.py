@@ -35,9 +35,10 @@ def test_masks_follow_their_labels_and_ids_are_those_of_the_tree():
     assert things.confidence.tolist() == LABELS.confidence.tolist()
 
 
-def test_a_group_on_which_the_views_agree_more_than_on_its_things_is_taken_whole():
-    odd = Hierarchy(TREE.node, TREE.parent, np.array([1, 1, 1, 1, 0.3, 0.8], np.float32), TREE.stuff)
-    assert cut(LABELS, odd, granularity=0.5).label.tolist() == [7, 7, 7, 7, 7, 7, 4, 0]
+def test_a_whole_makes_up_for_a_doubtful_union_in_it_but_not_for_one_that_the_views_deny():
+    for weakest, taken in ((0.4, [7, 7, 7, 7, 7, 7, 4, 0]), (0.3, LABELS.label.tolist())):
+        odd = Hierarchy(TREE.node, TREE.parent, np.array([1, 1, 1, 1, weakest, 0.8], np.float32), TREE.stuff)
+        assert cut(LABELS, odd, granularity=0.5).label.tolist() == taken
 
 
 def test_parts_are_what_an_instance_is_made_of_the_largest_first():
