@@ -66,7 +66,7 @@ def resolve_refined(
         if by_points:
             nearest = _nearest(scene, view, points, labels)
             for instance in instances:
-                for row in np.flatnonzero((instance.view == view) & (instance.instance_id > 0)):
+                for row in np.flatnonzero((instance.view == view) & (instance.instance_id > 0)).tolist():
                     label_map.ids[mask_of(instance, row) & (nearest == instance.instance_id)] = instance.instance_id
         label_map.ids[~decode_valid(frame)] = 0
     return maps

@@ -7,9 +7,10 @@ these pieces, and the segmenter is as sure of that mask as of those of the piece
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -74,7 +75,7 @@ def hierarchy(
     names = np.unique(labels.label[labels.label > 0]).astype(np.int32)
     is_stuff = find_stuff(points, cameras, labels, params.stuff)
     mounds = find_mounds(points, cameras, labels, tallies, around=params.around, height=params.bulge)
-    pieces = _Pieces(names, tallies, is_stuff, mounds, params)
+    pieces = _Pieces.of(names, tallies, is_stuff, mounds, params)
     node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
     top = list(range(len(names)))  # the tree's row of each piece
     while True:
@@ -112,12 +113,26 @@ class _View:
     """[G] quality of the best mask that is a piece's own, 0 where there is none."""
 
 
+@dataclass(frozen=True)
 class _Pieces:
-    """Pieces that may be united, and what the views say about sets of them."""
+    """G pieces that may be united, and what the K views say about sets of them."""
 
-    def __init__(
-        self, names: Int32, tallies: Sequence[Tally], stuff: Bool, mounds: Mounds, params: HierarchyParams
-    ) -> None:
+    seen: list[Float64]
+    """K x [G] points of each piece that a view sees."""
+    held: list[Float64]
+    """K x [M, G] those under each of its masks."""
+    quality: list[Float64]
+    """K x [M] how sure the segmenter is of each mask."""
+    stuff: Bool
+    """[G]."""
+    labels: list[tuple[int, ...]]
+    """G x the labels (rows) that each is made of."""
+    mounds: Mounds
+    params: HierarchyParams
+
+    @staticmethod
+    def of(names: Int32, tallies: Sequence[Tally], stuff: Bool, mounds: Mounds, params: HierarchyParams) -> _Pieces:
+        """Each label on its own."""
         seen, held, quality = [], [], []
         for tally in {_content(tally): tally for tally in tallies}.values():  # a second copy of a view says nothing
             column = np.searchsorted(names, tally.label)
@@ -126,58 +141,48 @@ class _Pieces:
             held.append(np.zeros((len(tally.held), len(names))))
             held[-1][:, column] = tally.held
             quality.append(tally.quality.astype(np.float64))
-        self._mounds, self._labels = mounds, [(row,) for row in range(len(names))]
-        self._set(seen, held, quality, stuff, params)
+        return _Pieces(seen, held, quality, stuff, [(row,) for row in range(len(names))], mounds, params)
 
-    def _set(
-        self,
-        seen: list[Float64],
-        held: list[Float64],
-        quality: list[Float64],
-        stuff: Bool,
-        params: HierarchyParams,
-    ) -> None:
-        self._seen, self._held, self._quality, self._stuff, self._params = seen, held, quality, stuff, params
-        most = np.max(seen, axis=0, initial=0)
-        self._views = []
-        for of_view, under, sure in zip(seen, held, quality, strict=True):
-            enough = (of_view >= params.min_points) & (of_view >= params.min_visible * most)
+    @functools.cached_property
+    def views(self) -> list[_View]:
+        """What counts of each view."""
+        most = np.max(self.seen, axis=0, initial=0)
+        views = []
+        for of_view, under, sure in zip(self.seen, self.held, self.quality, strict=True):
+            enough = (of_view >= self.params.min_points) & (of_view >= self.params.min_visible * most)
             count, inside = of_view * enough, under * enough
             iou = inside / np.maximum(inside.sum(axis=1, keepdims=True) + count - inside, 1)
             own = np.where(iou >= _OWN, sure[:, None], 0).max(axis=0, initial=0)
-            self._views.append(_View(count, inside, sure, own))
+            views.append(_View(count, inside, sure, own))
+        return views
 
     def united(self, unions: list[tuple[int, ...]]) -> _Pieces:
         """What is left when each of these sets has become one piece: the others first, then the unions."""
-        count = len(self._stuff)
+        count = len(self.stuff)
         gone = {piece for members in unions for piece in members}
-        groups = [(piece,) for piece in range(count) if piece not in gone] + unions
+        groups: list[tuple[int, ...]] = [*((piece,) for piece in range(count) if piece not in gone), *unions]
         joined = np.zeros((count, len(groups)))
         for column, members in enumerate(groups):
             joined[list(members), column] = 1
-        after = _Pieces.__new__(_Pieces)
-        after._mounds = self._mounds
-        after._labels = [tuple(row for piece in members for row in self._labels[piece]) for members in groups]
-        after._set(
-            [seen @ joined for seen in self._seen],
-            [held @ joined for held in self._held],
-            self._quality,
-            self._stuff[[members[0] for members in groups]],
-            self._params,
+        return replace(
+            self,
+            seen=[seen @ joined for seen in self.seen],
+            held=[held @ joined for held in self.held],
+            stuff=self.stuff[[members[0] for members in groups]],
+            labels=[tuple(row for piece in members for row in self.labels[piece]) for members in groups],
         )
-        return after
 
     def best_unions(self) -> list[tuple[tuple[int, ...], float]]:
         """The sets of pieces to unite now, each with its agreement: of sets that share a piece, the best alone."""
         sets = self._sets()
         if not sets:
             return []
-        agreement = self._agreement(sets) * np.where([self._standing(members) for members in sets], _ON_TOP, 1.0)
+        agreement = self._agreement(sets) * np.where([bool(self._standing(members)) for members in sets], _ON_TOP, 1.0)
         agreement = np.round(agreement, 6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
-            if agreement[row] < max(self._params.min_agreement, 1e-6):
+            if agreement[row] < max(self.params.min_agreement, 1e-6):
                 break
             if not taken & set(sets[row]):
                 chosen.append((sets[row], float(agreement[row])))
@@ -188,10 +193,10 @@ class _Pieces:
         """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
         on the others."""
         shown: Counter[tuple[int, ...]] = Counter()
-        for view in self._views:
+        for view in self.views:
             for held in (view.held >= 0.5 * view.seen) & (view.seen > 0):
                 members = tuple(np.flatnonzero(held).tolist())
-                if len(members) > 1 and len(set(self._stuff[list(members)].tolist())) == 1:
+                if len(members) > 1 and len(set(self.stuff[list(members)].tolist())) == 1:
                     shown[members] += 1
                     on_top = self._standing(members)
                     if on_top and len(members) - len(on_top) > 1:
@@ -200,17 +205,17 @@ class _Pieces:
 
     def _standing(self, members: tuple[int, ...]) -> set[int]:
         """Which of these pieces stand on the others."""
-        labels = [row for piece in members for row in self._labels[piece]]
-        on_top = dict(zip(labels, self._mounds.standing(labels).tolist(), strict=True))
-        return {piece for piece in members if all(on_top[row] for row in self._labels[piece])}
+        labels = [row for piece in members for row in self.labels[piece]]
+        on_top = dict(zip(labels, self.mounds.standing(labels).tolist(), strict=True))
+        return {piece for piece in members if all(on_top[row] for row in self.labels[piece])}
 
     def _agreement(self, sets: list[tuple[int, ...]]) -> Float64:
         """[S] share of the views that show each set of pieces as one, of those that see at least two of them."""
-        member = np.zeros((len(sets), len(self._stuff)))
+        member = np.zeros((len(sets), len(self.stuff)))
         for row, members in enumerate(sets):
             member[row, list(members)] = 1
         agreed, asked = np.zeros(len(sets)), np.zeros(len(sets))
-        for view in self._views:
+        for view in self.views:
             seen = member * view.seen
             total, largest = seen.sum(axis=1), seen.max(axis=1)
             weight = np.minimum((1 - largest / np.maximum(total, 1)) / _BALANCED, 1)
@@ -223,10 +228,10 @@ class _Pieces:
             iou = inside / np.maximum(view.held.sum(axis=1) + total - inside, 1)
             rest = (inside - view.held[:, seen.argmax(axis=1)].T) / (total - largest)
             surest_piece = np.where(seen > 0, view.own, 0).max(axis=1)
-            doubt = (surest_piece[:, None] - view.quality) / max(self._params.doubt, 1e-9)
+            doubt = (surest_piece[:, None] - view.quality) / max(self.params.doubt, 1e-9)
             fit = _ramp(iou, *_IOU) * _ramp(rest, *_REST) * np.clip(1 - doubt, 0, 1)
             agreed[rows] += weight[rows] * fit.max(axis=1)
-        return agreed / np.maximum(asked + self._params.prior, 1e-9)
+        return agreed / np.maximum(asked + self.params.prior, 1e-9)
 
 
 def _content(tally: Tally) -> tuple[object, ...]:

@@ -2,8 +2,9 @@
 
     python tests/bench/bench_masks.py CAPTURE [--labels FOLDER] [--preset fast] [--set STEP.PARAM=VALUE] [--store DIR]
 
-Prints, for each object of the labels, the best IoU of any instance's mask with it, mean over the labelled views: after
-Split, after refinement, and in the end; and the most that a view loses. Labels are one-channel PNG files named like the
+Prints, for each object of the labels, the best IoU of any mask with it, mean over the labelled views: of the view's own
+masks (raw), then of the instances' after Split, after refinement, and in the end; and the most that a view loses from
+Split to the end. Labels are one-channel PNG files named like the
 frames, 0 where nothing is said; the capture's `instance` folder if not told otherwise.
 """
 
@@ -22,14 +23,14 @@ from ss_flow.flows import settings
 from ss_flow.flows.cli.context import file_digests
 from ss_flow.flows.cli.prepare import RunOptions, prepare
 from ss_flow.flows.params import Params
-from ss_flow.tasks.artifacts import LabelMap
+from ss_flow.tasks.artifacts import LabelMap, MaskSet
 from ss_flow.tasks.capture.scene import open_scene
 
-STAGES = ("masks_split", "masks_refined", "masks")
+STAGES = ("segment", "masks_split", "masks_refined", "masks")
 
 
-def masks_of(folder: Path, params: Params, store: Store) -> list[list[LabelMap]]:
-    """The label maps of all views, at each stage."""
+def masks_of(folder: Path, params: Params, store: Store) -> list[list[MaskSet | LabelMap]]:
+    """The masks of all views, at each stage."""
     prepared = prepare(open_scene(folder), params, RunOptions(), file_digests(store))
 
     def build() -> dict[str, object]:
@@ -40,13 +41,16 @@ def masks_of(folder: Path, params: Params, store: Store) -> list[list[LabelMap]]
     return [[store.get(digest) for digest in values[stage]] for stage in STAGES]
 
 
-def best_iou(ids: np.ndarray, truth: np.ndarray) -> float:
-    """The highest IoU of an instance's mask with an object's: both [H, W]."""
-    found = [i for i in np.unique(ids[truth]) if i]
-    return max((float(((ids == i) & truth).sum() / ((ids == i) | truth).sum()) for i in found), default=0.0)
+def best_iou(masks: MaskSet | LabelMap, truth: np.ndarray) -> float:
+    """The highest IoU of a mask with an object's: [H, W]."""
+    if isinstance(masks, MaskSet):
+        dense = masks.dense()
+    else:
+        dense = np.array([masks.ids == i for i in np.unique(masks.ids[truth]) if i]).reshape(-1, *truth.shape)
+    return max((float((mask & truth).sum() / (mask | truth).sum()) for mask in dense), default=0.0)
 
 
-def by_object(stages: list[list[LabelMap]], labels: Path) -> dict[int, np.ndarray]:
+def by_object(stages: list[list[MaskSet | LabelMap]], labels: Path) -> dict[int, np.ndarray]:
     """[views, stages] the best IoU of each object."""
     import cv2
 
@@ -55,10 +59,10 @@ def by_object(stages: list[list[LabelMap]], labels: Path) -> dict[int, np.ndarra
         file = labels / f"{maps[0].name}.png"
         if not file.exists():
             continue
-        height, width = maps[0].ids.shape
+        height, width = maps[-1].ids.shape
         truth = cv2.resize(cv2.imread(str(file), -1), (width, height), interpolation=cv2.INTER_NEAREST)
         for name in np.unique(truth[truth > 0]).tolist():
-            table[name].append([best_iou(m.ids, truth == name) for m in maps])
+            table[name].append([best_iou(m, truth == name) for m in maps])
     return {name: np.array(rows) for name, rows in sorted(table.items())}
 
 
@@ -74,10 +78,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         stages = masks_of(args.capture, params, Store(args.store or Path(temporary)))
         table = by_object(stages, args.labels or args.capture / "instance")
-    print("| object | views | Split | refined | final | worst view |\n" + "|---" * 6 + "|")
+    print("| object | views | raw | Split | refined | final | worst view |\n" + "|---" * 7 + "|")
     for name, rows in table.items():
         mean = " | ".join(f"{100 * value:.1f}" for value in rows.mean(axis=0))
-        print(f"| {name} | {len(rows)} | {mean} | {100 * (rows[:, -1] - rows[:, 0]).min():+.1f} |")
+        print(f"| {name} | {len(rows)} | {mean} | {100 * (rows[:, -1] - rows[:, 1]).min():+.1f} |")
     means = np.mean([rows.mean(axis=0) for rows in table.values()], axis=0)
     print(f"| mean | | {' | '.join(f'{100 * value:.1f}' for value in means)} | |")
 

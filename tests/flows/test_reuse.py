@@ -53,6 +53,12 @@ def test_a_run_of_hits_loads_no_heavy_library(warm):
     assert done.stderr.strip().splitlines()[-1] == "0 []"
 
 
+def test_another_granularity_computes_the_cut_and_nothing_before_it(warm):
+    again = run_tiny(warm.scene, warm.store, "--set", "split.granularity=0.9")
+    # Ready-made masks hold no wholes: the cut comes to the same, and nothing after it is computed either.
+    assert again.code == 0 and again.computed() == {"split.cut": 1}
+
+
 def test_an_output_folder_that_was_deleted_is_written_again_from_the_store(warm):
     before = bytes_of(warm.out)
     shutil.rmtree(warm.out)
