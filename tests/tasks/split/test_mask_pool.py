@@ -9,9 +9,12 @@ from ss_flow.tasks.split.mask_pool import (
     drop_duplicates,
     exclusive,
     intersections,
+    mask_iou,
     mask_tree,
     merge_union,
     suppress,
+    whole_pictures,
+    without_speckles,
 )
 
 
@@ -95,3 +98,47 @@ def test_intersections_count_shared_pixels(seed):
     dense = rng.random((4, 700, 500)) < 0.5
     expected = [[(a & b).sum() for b in dense] for a in dense]
     np.testing.assert_array_equal(intersections(dense), expected)
+
+
+def test_two_things_of_one_bounding_box_are_not_one():
+    wall = np.ones((10, 10), bool)
+    wall[1:9, 1:9] = False
+    thing = np.zeros((10, 10), bool)
+    thing[1:9, 1:9] = thing[0, 4] = thing[9, 4] = thing[4, 0] = thing[4, 9] = True
+    overlap = mask_iou(np.stack([wall, thing]))
+    assert overlap[0, 1] == 4 / 100 and overlap[0, 0] == overlap[1, 1] == 1
+
+
+def test_most_of_the_picture_and_the_rest_of_it_round_a_thing_are_no_masks():
+    thing = np.zeros((10, 10), bool)
+    thing[2:8, 2:7] = True  # 30 pixels
+    half = np.zeros((10, 10), bool)
+    half[:, :6] = True
+    nearly_all = np.ones((10, 10), bool)
+    nearly_all[0] = False  # 90 pixels
+    masks = np.stack([thing, ~thing, half, nearly_all])
+    everything = np.ones((10, 10), bool)
+    assert whole_pictures(masks, everything, 0.8).tolist() == [False, True, False, True]
+    # Of the pixels that count, the half is all.
+    assert whole_pictures(half[None], half, 0.8).tolist() == [True]
+
+
+def test_speckles_go_and_small_holes_are_filled_but_not_bays_nor_large_holes():
+    clean = np.zeros((40, 40), bool)
+    clean[5:35, 5:35] = True
+    clean[10:20, 10:20] = False  # a hole of 100 of 800 pixels
+    clean[30:35, 18:20] = False  # a bay, open to the outside
+    spoilt = clean.copy()
+    spoilt[1, 1] = spoilt[38, 30:33] = True
+    spoilt[25, 25] = spoilt[28, 10:12] = False
+    np.testing.assert_array_equal(without_speckles(spoilt, 0.05), clean)
+    np.testing.assert_array_equal(without_speckles(spoilt, 0.0), spoilt)
+    assert without_speckles(clean, 0.2)[15, 15]
+    assert not without_speckles(np.zeros((4, 4), bool), 0.05).any()
+
+
+@given(st.integers(0, 2**16 - 1))
+def test_taking_speckles_off_twice_is_taking_them_off_once_where_nothing_large_is_left_over(bits):
+    mask = np.array([bits >> i & 1 for i in range(16)], bool).reshape(4, 4)
+    once = without_speckles(mask, 1.0)
+    assert not once.any() or np.array_equal(without_speckles(once, 1.0), once)
