@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels, Tally
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Hierarchy, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.mounds import Mounds, find_mounds
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
@@ -103,9 +103,9 @@ def hierarchy(
 class _View:
     """One view's counts, a column for each piece; 0 where it sees too little of a piece."""
 
-    seen: Float64
+    seen: Float32
     """[G]."""
-    held: Float64
+    held: Float32
     """[M, G]."""
     quality: Float64
     """[M] how sure the segmenter is of each mask."""
@@ -117,9 +117,9 @@ class _View:
 class _Pieces:
     """G pieces that may be united, and what the K views say about sets of them."""
 
-    seen: list[Float64]
+    seen: list[Float32]
     """K x [G] points of each piece that a view sees."""
-    held: list[Float64]
+    held: list[Float32]
     """K x [M, G] those under each of its masks."""
     quality: list[Float64]
     """K x [M] how sure the segmenter is of each mask."""
@@ -136,9 +136,9 @@ class _Pieces:
         seen, held, quality = [], [], []
         for tally in {_content(tally): tally for tally in tallies}.values():  # a second copy of a view says nothing
             column = np.searchsorted(names, tally.label)
-            seen.append(np.zeros(len(names)))
+            seen.append(np.zeros(len(names), np.float32))  # counts are exact in it, and take half the memory
             seen[-1][column] = tally.seen
-            held.append(np.zeros((len(tally.held), len(names))))
+            held.append(np.zeros((len(tally.held), len(names)), np.float32))
             held[-1][:, column] = tally.held
             quality.append(tally.quality.astype(np.float64))
         return _Pieces(seen, held, quality, stuff, [(row,) for row in range(len(names))], mounds, params)
@@ -161,7 +161,7 @@ class _Pieces:
         count = len(self.stuff)
         gone = {piece for members in unions for piece in members}
         groups: list[tuple[int, ...]] = [*((piece,) for piece in range(count) if piece not in gone), *unions]
-        joined = np.zeros((count, len(groups)))
+        joined = np.zeros((count, len(groups)), np.float32)
         for column, members in enumerate(groups):
             joined[list(members), column] = 1
         return replace(
@@ -211,7 +211,7 @@ class _Pieces:
 
     def _agreement(self, sets: list[tuple[int, ...]]) -> Float64:
         """[S] share of the views that show each set of pieces as one, of those that see at least two of them."""
-        member = np.zeros((len(sets), len(self.stuff)))
+        member = np.zeros((len(sets), len(self.stuff)), np.float32)
         for row, members in enumerate(sets):
             member[row, list(members)] = 1
         agreed, asked = np.zeros(len(sets)), np.zeros(len(sets))
