@@ -112,6 +112,11 @@ class MaskSet:
     def __len__(self) -> int:
         return len(self.packed)
 
+    @property
+    def quality(self) -> Float32:
+        """[N] how sure the segmenter is of each mask: its own estimate of the IoU, times the mask's stability."""
+        return np.minimum(self.predicted_iou, 1) * self.stability
+
     def dense(self) -> Bool:
         """The masks as [N, H, W] booleans."""
         bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
@@ -208,7 +213,7 @@ class Tally:
     beside: Int32
     """[V, V] pixels at which the area of each label meets that of each other one."""
     quality: Float32
-    """[M] how sure the segmenter is of each mask: its own estimate of the IoU, times the mask's stability."""
+    """[M] `MaskSet.quality`."""
 
 
 @dataclass(frozen=True)

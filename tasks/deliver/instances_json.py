@@ -9,6 +9,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Frame, Gaussians, Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.palette import instance_color
+from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.semantics.name import InstanceNames
 
 _CRUMB = 0.001
@@ -39,7 +40,7 @@ def instances_document(
     """
     known = sorted((i for i in instances if i.instance_id != 0), key=lambda i: i.instance_id)
     called = _unique_names([i.instance_id for i in known], names)
-    rows_of = _rows_by_instance(gaussians)
+    rows_of = rows_by_label(gaussians.instance_id) if gaussians is not None else {}
     stuff, parents = _kinds_and_parents(tree)
     entries = []
     for instance in known:
@@ -142,14 +143,6 @@ def _unique_names(ids: Sequence[int], names: InstanceNames | None) -> dict[int, 
         taken.add(name)
         called[instance_id] = name
     return called
-
-
-def _rows_by_instance(gaussians: Gaussians | None) -> dict[int, np.ndarray]:
-    if gaussians is None or not len(gaussians):
-        return {}
-    order = np.argsort(gaussians.instance_id, kind="stable")
-    ids, starts = np.unique(gaussians.instance_id[order], return_index=True)
-    return dict(zip(ids.tolist(), np.split(order, starts[1:]), strict=True))
 
 
 def _place(points: Float32) -> dict[str, Any]:

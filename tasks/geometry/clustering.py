@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
 
@@ -62,3 +63,10 @@ def nearest_spacing(points: Float32 | Float64) -> float:
         return 0.0
     distance = np.asarray(cKDTree(points).query(points, k=2)[0])
     return float(np.median(distance[:, 1]))
+
+
+def rows_by_label(labels: Int32) -> dict[int, NDArray[np.intp]]:
+    """The rows that carry each label that occurs in [N], ascending."""
+    order = np.argsort(labels, kind="stable")
+    names, starts = np.unique(labels[order], return_index=True)
+    return dict(zip(names.tolist(), np.split(order, starts[1:]), strict=True)) if len(labels) else {}

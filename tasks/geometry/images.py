@@ -46,3 +46,8 @@ def depth_at_frame_size(depth: DepthMap, frame: Frame) -> Float32:
     rows = (np.arange(frame.height) + 0.5) * h / frame.height
     columns = (np.arange(frame.width) + 0.5) * w / frame.width
     return depth.depth[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
+
+
+def at_diagonal(pixels: float, height: int, width: int) -> float:
+    """A length that is meant for an image 800 pixels across, in pixels of an image of this size."""
+    return pixels * float(np.hypot(height, width)) / 800

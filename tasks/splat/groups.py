@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame, Gaussians
+from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.splat.views import SceneViews
 from ss_flow.tasks.split.dense import scene_unit
 
@@ -38,12 +39,6 @@ def scene_views(
 ) -> SceneViews:
     """The views of a scene, with the depth tolerance in world units (tau_depth is in scene units, spec 3.0)."""
     return SceneViews(frames, cameras, depths, tau_depth * scene_unit(cameras, depths), tau_relative)
-
-
-def box_diagonal(points: Float32) -> float:
-    """The diagonal of the box around points, less the outermost 0.5 % on each axis: [N, 3] world -> world units."""
-    low, high = np.quantile(points, (0.005, 0.995), axis=0)
-    return float(np.linalg.norm(high - low))
 
 
 def extents(gaussians: Gaussians) -> Float32:

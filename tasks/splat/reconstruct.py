@@ -14,8 +14,9 @@ from ss_flow.tasks.gaussians.densification import Schedule
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
 from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
-from ss_flow.tasks.splat.groups import NO_GAUSSIANS, box_diagonal, rasterizer, scene_views
+from ss_flow.tasks.splat.groups import NO_GAUSSIANS, rasterizer, scene_views
 from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, dilated, mask_of, training_view
 
 

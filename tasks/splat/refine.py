@@ -16,10 +16,11 @@ from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
+from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Positive
-from ss_flow.tasks.splat.groups import box_diagonal, rasterizer, scene_views
+from ss_flow.tasks.splat.groups import rasterizer, scene_views
 from ss_flow.tasks.splat.views import CropParams, SceneViews, crop_camera, grown, mask_of, sample_depth
 
 Prompt = Callable[[Float32], tuple[Bool, float]]
@@ -196,7 +197,7 @@ def _replacement(
     """
     if prompt is None and old is not None:
         return None
-    rows, column, row = scene.surface_rows(view, gaussians.means)
+    rows, column, row, _ = scene.surface_rows(view, gaussians.means)
     if len(rows) < params.min_visible:
         return None
     valid = decode_valid(scene.frames[view])

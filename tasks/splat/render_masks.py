@@ -14,7 +14,7 @@ from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, Gaussians, L
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
-from ss_flow.tasks.geometry.images import decode_valid, depth_at_frame_size
+from ss_flow.tasks.geometry.images import at_diagonal, decode_valid, depth_at_frame_size
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.splat.groups import rasterizer
 
@@ -81,7 +81,7 @@ def _at_border(ids: np.ndarray) -> Bool:
     """[H, W] which pixels have another id within `_FRINGE` of them."""
     import cv2
 
-    reach = round(_FRINGE * float(np.hypot(*ids.shape)) / 800)
+    reach = round(at_diagonal(_FRINGE, *ids.shape))
     window = np.ones((2 * reach + 1,) * 2, np.uint8)
     return cv2.erode(ids, window) != cv2.dilate(ids, window)
 

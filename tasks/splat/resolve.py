@@ -9,13 +9,21 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import REFINED, Cameras, DepthMap, Float32, Frame, InstanceMasks, Int32, LabelMap
-from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
-from ss_flow.tasks.geometry.images import decode_valid, pack_masks
-from ss_flow.tasks.geometry.zbuffer import paint
+from ss_flow.tasks.artifacts import (
+    REFINED,
+    Cameras,
+    DepthMap,
+    Float32,
+    Frame,
+    InstanceMasks,
+    Int32,
+    LabelMap,
+    Visibility,
+)
+from ss_flow.tasks.geometry.images import at_diagonal, decode_valid, pack_masks
 from ss_flow.tasks.splat.groups import scene_views
 from ss_flow.tasks.splat.views import SceneViews, mask_of
-from ss_flow.tasks.split.selection import PaintedView, nearest_labels
+from ss_flow.tasks.split.selection import nearest_labels, paint_labels
 
 _REACH = 8.0
 """How far from a pixel a point may lie that decides it, in pixels of an image with a diagonal of 800."""
@@ -77,15 +85,10 @@ def _nearest(scene: SceneViews, view: int, points: Float32, labels: Int32) -> In
 
     points: [N, 3] world; labels: [N].
     """
-    camera = camera_of(scene.cameras, view)
-    seen, _, _ = scene.surface_rows(view, points)
-    rows, column, row, z = pixels_in_view(points[seen], camera)
-    image = paint(labels[seen[rows]] + 1, row * camera.width + column, z, camera.height * camera.width)
-    pixel = np.flatnonzero(image).astype(np.int32)
-    if not len(pixel):
-        return image.reshape(camera.height, camera.width)
-    reach = _REACH * float(np.hypot(camera.height, camera.width)) / 800
-    return nearest_labels(PaintedView(pixel, image[pixel] - 1), camera.height, camera.width, reach)
+    width, height = (int(n) for n in scene.cameras.sizes[view])
+    rows, column, row, z = scene.surface_rows(view, points)
+    seen = Visibility(scene.cameras.names[view], rows, row * width + column, z, height, width)
+    return nearest_labels(paint_labels(seen, labels), height, width, at_diagonal(_REACH, height, width))
 
 
 def _painted(cameras: Cameras, instances: tuple[InstanceMasks, ...], *, kept_on_top: bool) -> tuple[LabelMap, ...]:

@@ -35,13 +35,14 @@ class SceneViews:
     tau_relative: float
     """The same as a fraction of the depth; the larger of the two counts."""
 
-    def surface_rows(self, view: int, points: Float32) -> tuple[Int32, Int32, Int32]:
-        """The points that a view really sees (Split&Splat, Eq. 1-2): rows of `points`, pixel columns, pixel rows."""
+    def surface_rows(self, view: int, points: Float32) -> tuple[Int32, Int32, Int32, Float32]:
+        """The points that a view really sees (Split&Splat, Eq. 1-2): rows of `points`, pixel columns, pixel rows, and
+        z-depths."""
         camera = camera_of(self.cameras, view)
         rows, column, row, z = pixels_in_view(points, camera)
         measured = depth_at(self.depths[view], column, row, camera.width, camera.height)
         seen = (measured > 0) & (np.abs(measured - z) < np.maximum(self.tau, self.tau_relative * z))
-        return rows[seen], column[seen], row[seen]
+        return rows[seen], column[seen], row[seen], z[seen].astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, TrainView, train
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.fusion import VoxelSums, sum_by_voxel
+from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
-from ss_flow.tasks.splat.groups import box_diagonal, rasterizer
+from ss_flow.tasks.splat.groups import rasterizer
 from ss_flow.tasks.splat.views import CropParams, SceneViews, training_view
 from ss_flow.tasks.split.dense import DenseParams, consistent_cloud, depth_samples, scene_unit, voxel_side
 

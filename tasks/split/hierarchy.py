@@ -174,11 +174,10 @@ class _Pieces:
 
     def best_unions(self) -> list[tuple[tuple[int, ...], float]]:
         """The sets of pieces to unite now, each with its agreement: of sets that share a piece, the best alone."""
-        sets = self._sets()
+        sets, group = self._sets()
         if not sets:
             return []
-        agreement = self._agreement(sets) * np.where([bool(self._standing(members)) for members in sets], _ON_TOP, 1.0)
-        agreement = np.round(agreement, 6)
+        agreement = np.round(self._agreement(sets) * np.where(group, _ON_TOP, 1.0), 6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
@@ -189,19 +188,23 @@ class _Pieces:
             taken |= set(sets[row])
         return chosen
 
-    def _sets(self) -> list[tuple[int, ...]]:
+    def _sets(self) -> tuple[list[tuple[int, ...]], list[bool]]:
         """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
-        on the others."""
+        on the others. With each, whether something still does."""
         shown: Counter[tuple[int, ...]] = Counter()
         for view in self.views:
             for held in (view.held >= 0.5 * view.seen) & (view.seen > 0):
                 members = tuple(np.flatnonzero(held).tolist())
                 if len(members) > 1 and len(set(self.stuff[list(members)].tolist())) == 1:
                     shown[members] += 1
-                    on_top = self._standing(members)
-                    if on_top and len(members) - len(on_top) > 1:
-                        shown[tuple(piece for piece in members if piece not in on_top)] += 1
-        return [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
+        on_top = {members: self._standing(members) for members in shown}
+        for members, times in list(shown.items()):
+            below = tuple(piece for piece in members if piece not in on_top[members])
+            if 1 < len(below) < len(members):
+                shown[below] += times
+                on_top.setdefault(below, self._standing(below))
+        sets = [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
+        return sets, [bool(on_top[members]) for members in sets]
 
     def _standing(self, members: tuple[int, ...]) -> set[int]:
         """Which of these pieces stand on the others."""

@@ -80,6 +80,17 @@ def whole_pictures(masks: Bool, valid: Bool, max_area: float) -> Bool:
     return (areas > max_area * total) | complement.any(axis=1)
 
 
+def large_pieces(mask: Bool, share: float) -> tuple[Bool, float]:
+    """A mask [H, W] without its pieces below this share of the largest, and the area of which these fall short."""
+    import cv2
+
+    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    least = share * float(area.max())
+    return ((area > 0) & (area >= least))[piece], least
+
+
 def without_speckles(mask: Bool, share: float) -> Bool:
     """A mask [H, W] without its small islands and holes: pieces below this share of its largest piece are taken off,
     and holes as small are filled. What lies open to the image's border is no hole."""
@@ -87,16 +98,13 @@ def without_speckles(mask: Bool, share: float) -> Bool:
 
     if not share or not mask.any():
         return mask
-    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA].copy()
-    area[0] = 0
-    least = share * area.max()
+    large, least = large_pieces(mask, share)
     _, gap, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
     x, y, w, h, size = stats[:, :5].T
     inside = (x > 0) & (y > 0) & (x + w < mask.shape[1]) & (y + h < mask.shape[0])
     hole = inside & (size < least)
     hole[0] = False  # the mask itself
-    return (area >= least)[piece] & mask | hole[gap]
+    return large | hole[gap]
 
 
 def suppress(overlap: Float32 | Float64, scores: Float32, threshold: float) -> Int32:

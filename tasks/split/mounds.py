@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Int32, PointCloud, PointLabels, Tally
+from ss_flow.tasks.geometry.clustering import rows_by_label
+from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
 from ss_flow.tasks.split.touching import TouchingParams, borders
 
 _FOOT = 0.3
@@ -18,6 +20,8 @@ _FEW = 20
 """Points below which a label has no shape."""
 _SMALL = 0.5
 """What stands on something is smaller than this share of it, in points: the body of a mug does not stand on its rim."""
+_TRIM = 0.02
+"""Share of the points, on every side, that an extent leaves out."""
 _MOST = 2000
 """So many points of a label tell."""
 
@@ -59,26 +63,26 @@ def find_mounds(
         column = np.searchsorted(names, tally.label)
         meets[np.ix_(column, column)] += tally.beside
     share = meets / np.maximum(meets.sum(axis=1, keepdims=True), 1)
-    eye = np.mean([-pose[:3, :3].T @ pose[:3, 3] for pose in cameras.world_to_camera], axis=0)
     bulges = np.zeros(len(names), bool)
     if not len(names):
         return Mounds(share, size.astype(np.int32), bulges, around)
-    at_border, _, touches = borders(labels.label, points, TouchingParams())
+    ends = _ends(labels.label, names, points)
+    rows_of, eye = rows_by_label(labels.label), middle_of(cameras)
+    for row in np.flatnonzero((size >= _FEW) & ends & (share > _BESIDE).any(axis=1)):
+        own = thinned(points.points[rows_of[int(names[row])]], _MOST)
+        rest = np.sort(np.concatenate([rows_of[name] for name in names[share[row] > _BESIDE].tolist()]))
+        distance, _ = cKDTree(points.points[rest]).query(own)
+        centre, normal = plane_through(own[distance <= np.quantile(distance, _FOOT)])
+        rises = np.quantile((own - centre) @ towards(normal, centre, eye), 0.9)
+        bulges[row] = rises >= max(height * box_diagonal(own, _TRIM), 2 * points.spacing)
+    return Mounds(share, size.astype(np.int32), bulges, around)
+
+
+def _ends(label: Int32, names: Int32, points: PointCloud) -> Bool:
+    """[L] which labels do not go on smoothly into others along half of their border."""
+    at_border, _, touches = borders(label, points, TouchingParams())
     smooth = np.zeros(len(at_border), bool)
     smooth[touches[0][touches[1] > 0]] = True
-    for row, name in enumerate(names):
-        beside = names[share[row] > _BESIDE]
-        own, rest = points.points[labels.label == name], points.points[np.isin(labels.label, beside)]
-        own = own[:: max(1, len(own) // _MOST)].astype(np.float64)
-        contact = smooth[labels.label[at_border] == name]
-        if len(own) < _FEW or not len(rest) or (contact.size and contact.mean() >= 0.5):
-            continue
-        distance, _ = cKDTree(rest).query(own)
-        foot = own[distance <= np.quantile(distance, _FOOT)]
-        centre = foot.mean(axis=0)
-        normal = np.linalg.svd(foot - centre, full_matrices=False)[2][2]
-        towards = normal if (eye - centre) @ normal > 0 else -normal
-        rises = np.quantile((own - centre) @ towards, 0.9)
-        low, high = np.quantile(own, (0.02, 0.98), axis=0)
-        bulges[row] = rises >= max(height * float(np.linalg.norm(high - low)), 2 * points.spacing)
-    return Mounds(share, size.astype(np.int32), bulges, around)
+    of = np.searchsorted(names, label[at_border])
+    length = np.bincount(of, minlength=len(names))
+    return 2 * np.bincount(of, smooth, len(names)) < np.maximum(length, 1)

@@ -11,7 +11,7 @@ import numpy as np
 from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, Observation, PointCloud, PointLabels, Visibility
-from ss_flow.tasks.geometry.clustering import main_clusters
+from ss_flow.tasks.geometry.clustering import main_clusters, rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, Natural
 from ss_flow.tasks.split.consensus import ConsensusParams, merge_labels
 from ss_flow.tasks.split.mask_clustering import (
@@ -125,8 +125,9 @@ def _settle(label: Int32, points: PointCloud, observations: Sequence[Observation
     label = label.copy()
     clusters = params.label_clusters
     if clusters.eps:
-        for name in np.unique(label[label > 0]):
-            rows = np.flatnonzero(label == name)
+        for name, rows in rows_by_label(label).items():
+            if not name:
+                continue
             kept = main_clusters(
                 points.points[rows], clusters.eps * points.spacing, clusters.min_samples, clusters.keep_share
             )

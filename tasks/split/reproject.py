@@ -24,7 +24,7 @@ from ss_flow.tasks.artifacts import (
     PromptedMasks,
     Visibility,
 )
-from ss_flow.tasks.geometry.images import pack_masks
+from ss_flow.tasks.geometry.images import at_diagonal, pack_masks
 from ss_flow.tasks.ranges import Count, NonNegative
 from ss_flow.tasks.split.selection import (
     PaintedView,
@@ -122,7 +122,7 @@ def _drawn(painted: PaintedView, view: Visibility, shown: set[int], params: Repr
     missing = [label for label in labels_in_front(painted, params.min_points) if label not in shown]
     if not missing:
         return {}
-    reach = params.reach * float(np.hypot(view.height, view.width)) / 800
+    reach = at_diagonal(params.reach, view.height, view.width)
     nearest = nearest_labels(painted, view.height, view.width, reach)
     masks = {label: smoothed(nearest == label, round(reach)) for label in missing}
     return {label: mask for label, mask in masks.items() if agreement(painted, mask, label) >= params.selection.min_iou}

@@ -11,7 +11,7 @@ from ss_flow.tasks.artifacts import Bool, Float64, Int32, MaskSet, Visibility
 from ss_flow.tasks.geometry.zbuffer import paint
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.split.erosion import ErosionParams, interiors
-from ss_flow.tasks.split.mask_pool import canonical_order
+from ss_flow.tasks.split.mask_pool import canonical_order, large_pieces
 
 _CRUMB = 0.1
 """Pieces of a drawn mask below this share of its largest one are no part of it."""
@@ -90,7 +90,6 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     """
     order = canonical_order(dense)
     dense = dense[order]
-    quality = (np.minimum(pool.predicted_iou, 1) * pool.stability)[order]
     names, index = np.unique(painted.label, return_inverse=True)
     flat = dense.reshape(len(dense), -1)[:, painted.pixel]
     count = np.stack([np.bincount(index[mask], minlength=len(names)) for mask in flat])
@@ -98,7 +97,7 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     area = count @ np.where(names == 0, params.unlabelled, 1.0)
     iou = count / np.maximum(area[:, None] + total - count, 1)
     iou[:, names == 0] = 0
-    fit = np.round(iou * quality[:, None], 9)
+    fit = np.round(iou * pool.quality[order, None], 9)
 
     chosen: dict[int, Bool] = {}
     shown: dict[int, Bool] = {}
@@ -153,11 +152,7 @@ def smoothed(mask: Bool, radius: int) -> Bool:
 
     side = 2 * radius + 1
     most = cv2.boxFilter(mask.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE) > 0.5
-    _, piece, stats, _ = cv2.connectedComponentsWithStats(most.astype(np.uint8), connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA].copy()
-    area[0] = 0
-    large = (area > 0) & (area >= _CRUMB * area.max())
-    return large[piece]
+    return large_pieces(most, _CRUMB)[0]
 
 
 def agreement(painted: PaintedView, mask: Bool, label: int) -> float:

@@ -7,9 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, PointCloud, PointLabels
+from ss_flow.tasks.geometry.clustering import rows_by_label
+from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
 from ss_flow.tasks.ranges import Fraction
 
 _ROUNDS = 4
+_TRIM = 0.02
+"""Share of the points, on every side, that an extent leaves out."""
 _FEW = 10
 """Points below which a label has no plane."""
 _MOST = 4000
@@ -37,35 +41,27 @@ def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params
     table that the capture never looks beyond. A poster on a wall is a thing.
     """
     names = np.unique(labels.label[labels.label > 0])
-    scene = points.points[:: max(1, len(points.points) // (10 * _MOST))].astype(np.float64)
-    least = params.extent * _extent(scene) if len(scene) else 0.0
-    eye = np.mean([-pose[:3, :3].T @ pose[:3, 3] for pose in cameras.world_to_camera], axis=0)
+    scene, eye = thinned(points.points, 10 * _MOST), middle_of(cameras)
+    least = params.extent * box_diagonal(scene, _TRIM) if len(scene) else 0.0
+    rows_of = rows_by_label(labels.label)
     stuff = np.zeros(len(names), bool)
-    for row, name in enumerate(names):
-        own = points.points[labels.label == name]
-        own = own[:: max(1, len(own) // _MOST)].astype(np.float64)
-        if (extent := _extent(own)) < least or len(own) < _FEW:
+    for row, name in enumerate(names.tolist()):
+        own = thinned(points.points[rows_of[name]], _MOST)
+        if (extent := box_diagonal(own, _TRIM)) < least or len(own) < _FEW:
             continue
         thickness = params.thickness * extent
         centre, normal = _plane(own, thickness)
-        towards = normal if (eye - centre) @ normal > 0 else -normal
         flat = (np.abs((own - centre) @ normal) <= thickness).mean() >= params.flat
-        stuff[row] = flat and ((scene - centre) @ towards < -2 * thickness).mean() <= params.behind
+        in_front = (scene - centre) @ towards(normal, centre, eye)
+        stuff[row] = flat and (in_front < -2 * thickness).mean() <= params.behind
     return stuff
-
-
-def _extent(places: Float64) -> float:
-    """Diagonal of the box of points [N, 3], without the outermost 2 % on every side."""
-    low, high = np.quantile(places, (0.02, 0.98), axis=0)
-    return float(np.linalg.norm(high - low))
 
 
 def _plane(places: Float64, thickness: float) -> tuple[Float64, Float64]:
     """The plane that most of some points [N, 3] lie on: a point on it, and its unit normal."""
     near = np.ones(len(places), bool)
     for _ in range(_ROUNDS):
-        centre = places[near].mean(axis=0)
-        normal = np.linalg.svd(places[near] - centre, full_matrices=False)[2][2]
+        centre, normal = plane_through(places[near])
         distance = np.abs((places - centre) @ normal)
         near = distance <= max(thickness, float(np.median(distance)))
     return centre, normal

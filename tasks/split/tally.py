@@ -6,6 +6,7 @@ import numpy as np
 
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Int32, MaskSet, PointLabels, Tally, Visibility
+from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.split.selection import nearest_labels, paint_labels
 
 _REACH = 5.0
@@ -30,15 +31,15 @@ def tally(visibility: Visibility, masks: MaskSet, labels: PointLabels) -> Tally:
         seen=np.bincount(column, minlength=len(names)).astype(np.int32),
         held=held.reshape(len(masks), len(names)),
         beside=_borders(visibility, labels, names),
-        quality=np.minimum(masks.predicted_iou, 1) * masks.stability,
+        quality=masks.quality,
     )
 
 
 def _borders(visibility: Visibility, labels: PointLabels, names: Int32) -> Int32:
     """[V, V] how long the border is between the areas of labels in a view."""
     height, width = visibility.height, visibility.width
-    reach = _REACH * float(np.hypot(height, width)) / 800
-    area = nearest_labels(paint_labels(visibility, labels.label), height, width, reach)
+    painted = paint_labels(visibility, labels.label)
+    area = nearest_labels(painted, height, width, at_diagonal(_REACH, height, width))
     column = np.searchsorted(names, area)
     beside = np.zeros((len(names), len(names)), np.int32)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):

@@ -26,8 +26,8 @@ from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, TrainView, train
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.models.catalogue import blake3_of
-from ss_flow.tasks.splat.groups import box_diagonal
 from ss_flow.tasks.splat.reconstruct import thin
 from ss_flow.tasks.split.dense import DenseParams, dense
 

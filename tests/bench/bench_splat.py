@@ -49,7 +49,7 @@ from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
-from ss_flow.tasks.splat.groups import box_diagonal
+from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.splat.reconstruct import thin
 from ss_flow.tasks.splat.views import CropParams, crop_camera, mask_of
 

@@ -15,8 +15,9 @@ from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.splat import merge as module
-from ss_flow.tasks.splat.groups import box_diagonal, extents
+from ss_flow.tasks.splat.groups import extents
 from ss_flow.tasks.splat.merge import MergeParams, Quality, acceptable, assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
 from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin

@@ -1,0 +1,38 @@
+"""How large a group of points is, and which way it faces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Cameras, Float32, Float64
+from ss_flow.tasks.geometry.cameras import camera_of
+
+
+def box_diagonal(points: Float32 | Float64, trim: float = 0.005) -> float:
+    """The diagonal of the box around points, less the outermost share `trim` on each side of each axis.
+
+    points: [N, 3] world. Returns world units.
+    """
+    low, high = np.quantile(points, (trim, 1 - trim), axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def thinned(points: Float32, most: int) -> Float64:
+    """Every n-th of the points [N, 3], so that less than twice `most` are left."""
+    return points[:: max(1, len(points) // most)].astype(np.float64)
+
+
+def plane_through(points: Float64) -> tuple[Float64, Float64]:
+    """The plane with the least squared distances from points [N, 3]: their mean, and its unit normal."""
+    centre = points.mean(axis=0)
+    return centre, np.linalg.svd(points - centre, full_matrices=False)[2][2]
+
+
+def middle_of(cameras: Cameras) -> Float64:
+    """[3] the mean place of the cameras."""
+    return np.mean([camera_of(cameras, view).center for view in range(len(cameras))], axis=0)
+
+
+def towards(normal: Float64, centre: Float64, eye: Float64) -> Float64:
+    """The normal of a plane through `centre`, on the side of `eye`."""
+    return normal if (eye - centre) @ normal > 0 else -normal
