@@ -89,8 +89,27 @@ class Registration:
     """0..1 share of the agreement between edges of depth and of photo that is lost where the maps stay as they are."""
 
 
+class PackedMasks:
+    """Masks of one size, a bit a pixel."""
+
+    height: int
+    width: int
+    packed: UInt8
+    """[N, ceil(H * W / 8)] row-major (`np.packbits`)."""
+
+    def dense(self) -> Bool:
+        """The masks as [N, H, W] booleans."""
+        bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
+        return bits.reshape(-1, self.height, self.width).astype(bool)
+
+    def mask(self, row: int) -> Bool:
+        """One of the masks: [H, W]."""
+        bits = np.unpackbits(self.packed[row], count=self.height * self.width)
+        return bits.reshape(self.height, self.width).astype(bool)
+
+
 @dataclass(frozen=True)
-class MaskSet:
+class MaskSet(PackedMasks):
     """The 2D instance masks that a segmenter found in one view (Split&Splat, M_k); they may overlap."""
 
     name: str
@@ -116,11 +135,6 @@ class MaskSet:
     def quality(self) -> Float32:
         """[N] how sure the segmenter is of each mask: its own estimate of the IoU, times the mask's stability."""
         return np.minimum(self.predicted_iou, 1) * self.stability
-
-    def dense(self) -> Bool:
-        """The masks as [N, H, W] booleans."""
-        bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
-        return bits.reshape(-1, self.height, self.width).astype(bool)
 
 
 @dataclass(frozen=True)
@@ -256,7 +270,7 @@ class Clicks:
 
 
 @dataclass(frozen=True)
-class PromptedMasks:
+class PromptedMasks(PackedMasks):
     """Masks that the segmenter gave in one view when asked for certain labels."""
 
     name: str
@@ -269,14 +283,9 @@ class PromptedMasks:
     predicted_iou: Float32
     """[N] the segmenter's own estimate of each mask's quality."""
 
-    def dense(self) -> Bool:
-        """The masks as [N, H, W] booleans."""
-        bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
-        return bits.reshape(-1, self.height, self.width).astype(bool)
-
 
 @dataclass(frozen=True)
-class InstanceMasks:
+class InstanceMasks(PackedMasks):
     """One instance after Split: its points and view-consistent masks (Split&Splat, M~_{k,l}). Id 0 is background."""
 
     instance_id: int
@@ -300,11 +309,6 @@ class InstanceMasks:
     """[V] where the mask came from: FOUND, PROMPTED, REFINED or DRAWN."""
     weak: bool
     """Seen in too few views to be reconstructed: kept as points only."""
-
-    def dense(self) -> Bool:
-        """The masks as [V, H, W] booleans."""
-        bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
-        return bits.reshape(-1, self.height, self.width).astype(bool)
 
 
 FOUND, PROMPTED, REFINED, DRAWN = 0, 1, 2, 3

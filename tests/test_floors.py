@@ -1,4 +1,4 @@
-"""The four floors: imports go only downwards."""
+"""The four floors, and the order of the rooms on the third: imports go only downwards."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = {"cache": "ss_flow.cache", "ss_flow": "ss_flow", "tasks": "ss_flow.tasks", "flows": "ss_flow.flows"}
 ORDER = list(FLOORS)
+ROOMS = (
+    {"artifacts", "ranges"},
+    {"geometry"},
+    {"models", "gaussians", "masks"},
+    {"capture"},
+    {"split"},
+    {"splat"},
+    {"semantics"},
+    {"evaluate", "deliver"},
+)
+"""The folders of `tasks`, in the order in which they may know of each other; those of one line know nothing of it."""
 LATE = {f"ss_flow.tasks.gaussians.{name}" for name in ("autograd", "cuda", "torch_backend")}
 """Modules that cannot be defined without torch, and so are imported inside functions only."""
 HEAVY = {"torch", "cv2", "scipy", "open3d", "onnxruntime", "onnx", "pycolmap", "zarr", "matplotlib", "jinja2"}
@@ -40,6 +51,24 @@ def test_a_module_imports_only_from_its_own_floor_and_those_below(folder, path):
     above = ORDER[ORDER.index(folder) + 1 :]
     found = [m for m in imported(ast.parse(path.read_text())) if floor_of(m) in above]
     assert not found, f"{path.name} on floor {folder} imports {found}"
+
+
+def room_of(module: str) -> int | None:
+    """The place of a module of `tasks` in the order of the rooms; None for other modules."""
+    if not module.startswith("ss_flow.tasks."):
+        return None
+    return next(i for i, rooms in enumerate(ROOMS) if module.split(".")[2] in rooms)
+
+
+def test_a_room_of_tasks_knows_only_those_before_it():
+    wrong = []
+    for path in sorted((ROOT / "tasks").rglob("*.py")):
+        own = ".".join(("ss_flow", *path.relative_to(ROOT).with_suffix("").parts))
+        if own == "ss_flow.tasks.__init__":
+            continue
+        others = {m for m in imported(ast.parse(path.read_text())) if own.split(".")[2] != (m.split(".") + [""] * 2)[2]}
+        wrong += [f"{own} imports {m}" for m in others if (room := room_of(m)) is not None and room >= room_of(own)]
+    assert not wrong
 
 
 @pytest.mark.parametrize(("folder", "path"), SOURCES, ids=[str(p.relative_to(ROOT)) for _, p in SOURCES])

@@ -16,7 +16,7 @@ from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Frame, MaskSet
 from ss_flow.tasks.capture.id_images import frame_pixels
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import is_number, read_json
-from ss_flow.tasks.split.mask_pool import mask_set
+from ss_flow.tasks.masks.pool import mask_set
 
 _SCORES = ("predicted_iou", "score")
 

@@ -11,7 +11,7 @@ from ss_flow.tasks.artifacts import Cameras, Frame, LabelMap, MaskSet
 from ss_flow.tasks.capture.lens import Lens, photo_lens, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
 from ss_flow.tasks.capture.sensor_depth import resampled
-from ss_flow.tasks.geometry.images import pack_masks
+from ss_flow.tasks.masks.pool import masks_by_id
 
 _USES = ("opencv-contrib-python-headless",)
 
@@ -29,25 +29,7 @@ def ready_masks(
 
     Raises InputError when an image is damaged, holds no ids, or has not its photo's size.
     """
-    return tuple(masks_of(ids, frame.name) for frame, ids in _id_images(frames, cameras, names, files, lenses))
-
-
-def masks_of(ids: NDArray[np.integer], name: str) -> MaskSet:
-    """The masks of an id image [H, W], one for each id above 0, by rising id."""
-    present = np.unique(ids)
-    present = present[present > 0]
-    count = len(present)
-    return MaskSet(
-        name=name,
-        height=ids.shape[0],
-        width=ids.shape[1],
-        packed=pack_masks(ids[None] == present[:, None, None]),
-        predicted_iou=np.ones(count, np.float32),
-        stability=np.ones(count, np.float32),
-        grid=np.zeros(count, np.int32),
-        parent=np.full(count, -1, np.int32),
-        source="ready-made",
-    )
+    return tuple(masks_by_id(ids, frame.name) for frame, ids in _id_images(frames, cameras, names, files, lenses))
 
 
 @task(name="capture.ground_truth", uses=_USES)

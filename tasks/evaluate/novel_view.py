@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, Gaussians, Metrics, UInt8
+from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 
@@ -20,16 +19,10 @@ _PSNR_OF_EQUALS = 100.0
 """dB given where two images agree exactly, so that a mean over views stays finite."""
 
 
-def _rasterizer() -> Mapping[str, str]:
-    from ss_flow.tasks.gaussians.rasterize import backend_identity
-
-    return backend_identity()
-
-
 @task(
     resources=Resources(cores=1),
     uses=("opencv-contrib-python-headless", "scipy", "torch"),
-    environment=_rasterizer,
+    environment=backend_identity,
 )
 def novel_view(
     frames_held_out: tuple[Frame, ...],

@@ -12,6 +12,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Bool, Float64, LabelMap
 from ss_flow.tasks.evaluate.contingency import Contingency, Labels, contingency
 from ss_flow.tasks.evaluate.instances import pooled
+from ss_flow.tasks.masks.overlap import iou
 
 
 @dataclass(frozen=True)
@@ -60,19 +61,13 @@ def strict_targets(frame: LabelledFrame) -> dict[str, Bool]:
     return targets
 
 
-def mask_iou(a: Bool, b: Bool) -> float:
-    """Intersection over union of two masks of one size; 0 when both are empty."""
-    union = int((a | b).sum())
-    return int((a & b).sum()) / union if union else 0.0
-
-
 def strict_ious(frame: LabelledFrame, predicted: Mapping[str, Bool]) -> dict[str, float]:
     """IoU of each (frame, category) pair; a category without a predicted mask scores 0 (spec 2.2, strict, step 5).
 
     predicted: binary silhouette [H, W] of what was selected for each category, by text alone.
     """
     return {
-        category: mask_iou(predicted[category], target) if category in predicted else 0.0
+        category: iou(predicted[category], target) if category in predicted else 0.0
         for category, target in strict_targets(frame).items()
     }
 
@@ -98,7 +93,7 @@ def oracle_ious(frame: LabelledFrame, ids: Labels, candidates: Mapping[str, froz
     scores = []
     for category, target in oracle_targets(frame):
         free = sorted(candidates.get(category, frozenset()) & present)
-        iou = {i: mask_iou(ids == i, target) for i in free}
+        iou = {i: iou(ids == i, target) for i in free}
         chosen = max(free, key=iou.__getitem__, default=None)
         scores.append(0.0 if chosen is None else iou[chosen])
         present.discard(-1 if chosen is None else chosen)

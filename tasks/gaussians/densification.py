@@ -43,9 +43,6 @@ class Seen:
 class Strategy(Protocol):
     """Something that decides how many Gaussians there are, and where."""
 
-    last_step: int
-    """After this one it does nothing."""
-
     def regularise(self, parameters: Parameters, gradients: Mapping[str, Float32]) -> None:
         """Add to the gradients, in place, before they are applied."""
 
@@ -61,8 +58,6 @@ class Strategy(Protocol):
 
 class Fixed:
     """No strategy: the Gaussians stay as many as they are."""
-
-    last_step = 0
 
     def regularise(self, parameters: Parameters, gradients: Mapping[str, Float32]) -> None:
         pass

@@ -1,4 +1,4 @@
-"""Gaussians from points, and rows of Gaussians joined and picked."""
+"""Sets of Gaussians: made from points, joined, picked, measured."""
 
 from __future__ import annotations
 
@@ -9,9 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Float32, Gaussians, Int32, UInt8
+from ss_flow.tasks.geometry.shape import box_diagonal
 
 SH_ZERO = 0.28209479177387814
 """The constant basis function, sqrt(1 / (4 pi))."""
+
+NO_GAUSSIANS = Gaussians(
+    means=np.zeros((0, 3), np.float32),
+    quaternions=np.zeros((0, 4), np.float32),
+    log_scales=np.zeros((0, 3), np.float32),
+    opacity_logits=np.zeros(0, np.float32),
+    sh=np.zeros((0, 1, 3), np.float32),
+    instance_id=np.zeros(0, np.int32),
+    instance_conf=np.zeros(0, np.float32),
+    part_id=np.zeros(0, np.int32),
+)
 
 
 def initialise(
@@ -75,3 +87,13 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
 def select(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.integer]) -> Gaussians:
     """Some rows, by mask or by index."""
     return Gaussians(**{f.name: getattr(gaussians, f.name)[rows] for f in fields(Gaussians)})
+
+
+def extents(gaussians: Gaussians) -> Float32:
+    """[N] the size of the instance that each Gaussian is part of, world units: the diagonal of its box."""
+    sizes = np.zeros(len(gaussians), np.float32)
+    for instance_id in np.unique(gaussians.instance_id):
+        own = gaussians.instance_id == instance_id
+        sizes[own] = box_diagonal(gaussians.means[own])
+    # An instance of a single Gaussian is as large as that.
+    return np.maximum(sizes, np.exp(gaussians.log_scales.max(axis=1)))

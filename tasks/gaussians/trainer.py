@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
-from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
+from ss_flow.tasks.artifacts import Float32, Gaussians
 from ss_flow.tasks.gaussians.backends import backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, Fixed, Schedule, Seen, Strategy
 from ss_flow.tasks.gaussians.mcmc import MarkovChain
@@ -21,7 +21,7 @@ from ss_flow.tasks.gaussians.objective import Target, Weights
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import NEAR_PLANE, training_device
 from ss_flow.tasks.gaussians.render import channels_of
-from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, NonNegative, Positive
 
 CHECKPOINT_SECONDS = 60.0
@@ -30,24 +30,6 @@ CHECKPOINT_SECONDS = 60.0
 
 class TrainingDiverged(RuntimeError):
     """The loss or a parameter is no longer finite."""
-
-
-@dataclass(frozen=True)
-class TrainView:
-    """One view to train on; every array has the camera's size."""
-
-    camera: Camera
-    """Already cropped to the view's box."""
-    image: Float32
-    """[h, w, 3] RGB, 0..1."""
-    inside: Bool
-    """[h, w] pixels of what is trained: colour loss, alpha towards 1."""
-    free: Bool
-    """[h, w] pixels where nothing is: alpha towards 0. Pixels of neither kind are ignored."""
-    depth: Float32
-    """[h, w] z-depth in world units, 0 = unknown; counts inside only."""
-    ids: Int32 | None = None
-    """[h, w] for the mask loss: index into `label_ids`, -1 = ignore, -2 = none of them. None = no mask loss."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +86,6 @@ class TrainParams:
     """When "classic" clones and splits."""
     max_gaussians: Count = 30_000
     """Densification ends at this number."""
-    plateau: Fraction = 0.0
-    """Training ends early when, once the number of Gaussians is settled, the mean loss over all views falls by less
-    than this share twice in a row; 0 = never."""
     prune_opacity: Fraction = 0.005
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
@@ -158,7 +137,7 @@ def train(
     training = _Training(initial, views, params, extents, seed, label_ids)
     training.resume()
     saved = time.monotonic()
-    while training.step < params.iterations and not training.settled():
+    while training.step < params.iterations and len(training.parameters):
         training.advance()
         if training.step % 50 and training.step < params.iterations:
             continue
@@ -244,18 +223,6 @@ class _Training:
         """Raises TrainingDiverged when a parameter is no longer finite."""
         if not self.parameters.finite():
             raise TrainingDiverged(f"training of {len(self.parameters)} Gaussians diverged at step {self.step}")
-
-    def settled(self) -> bool:
-        """Whether nothing is left to train, or training has come to a plateau."""
-        if len(self.parameters) == 0:
-            return True
-        stretch = -(-100 // len(self._targets)) * len(self._targets)  # whole rounds over the views
-        settled_for = self.step - self._strategy.last_step
-        if not self._params.plateau or self.step % stretch or settled_for < 3 * stretch:
-            return False
-        a, b, c = self.losses[self.step - 3 * stretch : self.step].reshape(3, stretch).mean(axis=1)
-        enough = 1 - self._params.plateau
-        return bool(b > enough * a and c > enough * b)
 
     def save(self) -> None:
         """Keep everything for a later try."""

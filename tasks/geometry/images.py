@@ -35,11 +35,6 @@ def encode_png(image: np.ndarray) -> UInt8:
     return data.ravel()
 
 
-def pack_masks(masks: Bool) -> UInt8:
-    """[N, H, W] booleans as [N, ceil(H * W / 8)] bits, the form of `MaskSet.packed`."""
-    return np.packbits(masks.reshape(len(masks), masks.shape[1] * masks.shape[2]), axis=1)
-
-
 def depth_at_frame_size(depth: DepthMap, frame: Frame) -> Float32:
     """The depth map at its frame's resolution, nearest neighbour (depth must not be blended across edges): [H, W]."""
     h, w = depth.depth.shape

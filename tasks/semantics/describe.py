@@ -12,10 +12,10 @@ from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, UInt8
 from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.masks.erosion import ErosionParams, erode
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.ranges import Count, Fraction, Natural, Positive
 from ss_flow.tasks.semantics.encoders import encoder_of
-from ss_flow.tasks.split.erosion import ErosionParams, erode
 
 
 @dataclass(frozen=True)

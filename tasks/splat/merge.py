@@ -11,15 +11,23 @@ import numpy as np
 from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, Gaussians, Int32, LabelMap
-from ss_flow.tasks.gaussians.initialise import concatenate, select
+from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, extents, select
+from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, TrainView, train
+from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
+from ss_flow.tasks.gaussians.views import (
+    IGNORED,
+    NONE_OF_MINE,
+    CropParams,
+    SceneViews,
+    TrainView,
+    scene_views,
+    training_view,
+)
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import group_box
-from ss_flow.tasks.splat.groups import NO_GAUSSIANS, extents, rasterizer, scene_views
-from ss_flow.tasks.splat.views import IGNORED, NONE_OF_MINE, CropParams, SceneViews, training_view
 
 
 @dataclass(frozen=True)
@@ -88,7 +96,7 @@ class Quality:
     name="splat.merge_pair",
     resources=Resources(cores=1, most_cores=8, memory_mb=2000, gpus=0.25),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
-    environment=rasterizer,
+    environment=backend_identity,
 )
 def merge_pair(
     frames: tuple[Frame, ...],
@@ -195,7 +203,7 @@ def assemble(groups: tuple[Gaussians, ...]) -> Gaussians:
     name="splat.global_pass",
     resources=Resources(cores=1, most_cores=8, memory_mb=4000, gpus=0.5),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
-    environment=rasterizer,
+    environment=backend_identity,
 )
 def global_pass(
     frames: tuple[Frame, ...],

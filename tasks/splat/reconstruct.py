@@ -11,13 +11,14 @@ from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import REFINED, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks, Int32
 from ss_flow.tasks.gaussians.densification import Schedule
-from ss_flow.tasks.gaussians.initialise import initialise
+from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, initialise
+from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
+from ss_flow.tasks.gaussians.views import NONE_OF_MINE, CropParams, SceneViews, scene_views, training_view
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.shape import box_diagonal
-from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
-from ss_flow.tasks.splat.groups import NO_GAUSSIANS, rasterizer, scene_views
-from ss_flow.tasks.splat.views import NONE_OF_MINE, CropParams, SceneViews, dilated, mask_of, training_view
+from ss_flow.tasks.masks.packing import dilated
+from ss_flow.tasks.ranges import Count, HarmonicsDegree, Natural, NonNegative, Positive
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,6 @@ class ReconstructParams:
     Gaussians to where opaque ones are and grows by 5 % at a time (for many views), "none" leaves it."""
     schedule: Schedule = Schedule()
     """When "classic" clones and splits."""
-    plateau: Fraction = 0.0
-    """Training ends early when the loss falls by less than this share from one stretch of at least 100 steps to the
-    next, twice in a row; 0 = never."""
     depth_weight_start: NonNegative = 1.0
     """Weight of the depth loss at the first step."""
     depth_weight_final: NonNegative = 0.01
@@ -82,7 +80,7 @@ class ReconstructParams:
     name="splat.reconstruct",
     resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.25),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
-    environment=rasterizer,
+    environment=backend_identity,
 )
 def reconstruct(
     frames: tuple[Frame, ...],
@@ -115,7 +113,7 @@ def reconstruct(
     name="splat.retrain",
     resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.25),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
-    environment=rasterizer,
+    environment=backend_identity,
 )
 def retrain(
     frames: tuple[Frame, ...],
@@ -177,7 +175,7 @@ def _trained(
         training_view(
             scene,
             int(view),
-            np.where(mask_of(instance, row), 0, NONE_OF_MINE).astype(np.int32),
+            np.where(instance.mask(row), 0, NONE_OF_MINE).astype(np.int32),
             surface,
             spacing,
             crop=params.crop,
@@ -209,7 +207,6 @@ def _settings(params: ReconstructParams, iterations: int, scale: float) -> Train
         background=params.background,
         densify=params.densify,
         schedule=params.schedule,
-        plateau=params.plateau,
         max_gaussians=round(params.max_gaussians * scale),
         depth_weight_start=params.depth_weight_start,
         depth_weight_final=params.depth_weight_final,

@@ -12,16 +12,18 @@ from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import DRAWN, REFINED, Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import select
+from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.views import CropParams, SceneViews, crop_camera, sample_depth, scene_views
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.geometry.shape import box_diagonal
+from ss_flow.tasks.masks.overlap import iou
+from ss_flow.tasks.masks.packing import grown
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Positive
-from ss_flow.tasks.splat.groups import rasterizer, scene_views
-from ss_flow.tasks.splat.views import CropParams, SceneViews, crop_camera, grown, mask_of, sample_depth
 
 Prompt = Callable[[Float32], tuple[Bool, float]]
 """Points [n, 2] in pixels of a photo -> the segmenter's mask and its score."""
@@ -77,7 +79,7 @@ class RenderedMask:
     name="splat.refine",
     resources=Resources(cores=1, memory_mb=1800),
     uses=("onnxruntime", "opencv-contrib-python-headless", "scipy"),
-    environment=rasterizer,
+    environment=backend_identity,
 )
 def refine(
     frames: tuple[Frame, ...],
@@ -113,7 +115,7 @@ def refine(
     held = {int(view): row for row, view in enumerate(instance.view)}
     views, masks, prompted = [], [], []
     for view, frame in enumerate(frames):
-        old = mask_of(instance, held[view]) if view in held else None
+        old = instance.mask(held[view]) if view in held else None
         drawn = old is not None and instance.prompted[held[view]] == DRAWN
         prompt = functools.partial(segmenter.predict_prompt, embeddings[view]) if segmenter else None
         new = _replacement(scene, view, solid, old, drawn, params, prompt)
@@ -160,11 +162,6 @@ def render_mask(
     visible = solid & ((measured == 0) | (measured + tolerance >= depth))
     agrees = visible & (measured > 0) & (np.abs(measured - depth) <= tolerance)
     return RenderedMask(_pasted(visible, camera, full), float(agrees.sum() / max(1, visible.sum())))
-
-
-def iou(a: Bool, b: Bool) -> float:
-    """Intersection over union of two masks of one shape; 0 when both are empty."""
-    return float((a & b).sum() / max(1, (a | b).sum()))
 
 
 def _pasted(mask: Bool, camera: Camera, full: Camera) -> Bool:

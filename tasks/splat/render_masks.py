@@ -12,11 +12,11 @@ from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import select
+from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.images import at_diagonal, decode_valid, depth_at_frame_size
 from ss_flow.tasks.ranges import Fraction
-from ss_flow.tasks.splat.groups import rasterizer
 
 _LABELS_AT_ONCE = 16
 """So many mask images are held at once."""
@@ -44,7 +44,7 @@ class RenderMasksParams:
     name="splat.render_masks",
     resources=Resources(cores=1, memory_mb=1000),
     uses=("opencv-contrib-python-headless",),
-    environment=rasterizer,
+    environment=backend_identity,
 )
 def render_masks(
     frames: Sequence[Frame],

@@ -20,10 +20,10 @@ from ss_flow.tasks.artifacts import (
     LabelMap,
     Visibility,
 )
-from ss_flow.tasks.geometry.images import at_diagonal, decode_valid, pack_masks
-from ss_flow.tasks.splat.groups import scene_views
-from ss_flow.tasks.splat.views import SceneViews, mask_of
-from ss_flow.tasks.split.selection import nearest_labels, paint_labels
+from ss_flow.tasks.gaussians.views import SceneViews, scene_views
+from ss_flow.tasks.geometry.images import at_diagonal, decode_valid
+from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.painting import nearest_labels, paint_labels
 
 _REACH = 8.0
 """How far from a pixel a point may lie that decides it, in pixels of an image with a diagonal of 800."""
@@ -75,7 +75,7 @@ def resolve_refined(
             nearest = _nearest(scene, view, points, labels)
             for instance in instances:
                 for row in np.flatnonzero((instance.view == view) & (instance.instance_id > 0)).tolist():
-                    label_map.ids[mask_of(instance, row) & (nearest == instance.instance_id)] = instance.instance_id
+                    label_map.ids[instance.mask(row) & (nearest == instance.instance_id)] = instance.instance_id
         label_map.ids[~decode_valid(frame)] = 0
     return maps
 
@@ -105,12 +105,12 @@ def _painted(cameras: Cameras, instances: tuple[InstanceMasks, ...], *, kept_on_
                     f"masks of instance {instance.instance_id} are {instance.width} x {instance.height}; "
                     "both must have one size."
                 )
-            area = int(mask_of(instance, row).sum())
+            area = int(instance.mask(row).sum())
             on_top = kept_on_top and instance.prompted[row] != REFINED
             seen[view].append((on_top, -area, -instance.instance_id, instance, row))
     for ids, layers in zip(maps, seen, strict=True):
         for *_, instance, row in sorted(layers, key=lambda layer: layer[:3]):
-            ids[mask_of(instance, row)] = instance.instance_id
+            ids[instance.mask(row)] = instance.instance_id
     return tuple(LabelMap(name, ids) for name, ids in zip(cameras.names, maps, strict=True))
 
 
@@ -128,7 +128,7 @@ def exclusive(instance: InstanceMasks, maps: tuple[LabelMap, ...]) -> InstanceMa
         if not mask.any():
             continue
         row = old.get(view)
-        same = row is not None and np.array_equal(mask, mask_of(instance, row))
+        same = row is not None and np.array_equal(mask, instance.mask(row))
         views.append(view)
         masks.append(mask)
         prompted.append(instance.prompted[row] if same else REFINED)

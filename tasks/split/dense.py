@@ -14,6 +14,7 @@ from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, sum_by_voxel
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.units import scene_unit
 from ss_flow.tasks.ranges import Count, NonNegative, Positive
 
 
@@ -96,17 +97,6 @@ def consistent_cloud(
 def voxel_side(cameras: Cameras, depths: tuple[DepthMap, ...], unit: float, params: DenseParams) -> float:
     """Side of the sampling cube, in world units."""
     return min(params.voxel * unit, params.voxel_pixels * _pixel_footprint(cameras, depths))
-
-
-def scene_unit(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
-    """The length, in world units, that plays the part of one metre: 1.0 when the scale is known (spec 3.0).
-
-    Otherwise half the median, over the views, of the median known depth. Raises InputError when no depth is known.
-    """
-    medians = [float(np.median(d.depth[d.depth > 0])) for d in depths if (d.depth > 0).any()]
-    if not medians:
-        raise InputError("None of the depth maps of this scene has a known depth; at least one view should.")
-    return 1.0 if cameras.metric else float(np.median(medians)) / 2
 
 
 def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:

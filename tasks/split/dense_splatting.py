@@ -10,16 +10,17 @@ from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud
 from ss_flow.tasks.gaussians.initialise import SH_ZERO, initialise
+from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, TrainView, train
+from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, train
+from ss_flow.tasks.gaussians.views import CropParams, SceneViews, TrainView, training_view
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.fusion import VoxelSums, sum_by_voxel
 from ss_flow.tasks.geometry.shape import box_diagonal
+from ss_flow.tasks.geometry.units import scene_unit
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
-from ss_flow.tasks.splat.groups import rasterizer
-from ss_flow.tasks.splat.views import CropParams, SceneViews, training_view
-from ss_flow.tasks.split.dense import DenseParams, consistent_cloud, depth_samples, scene_unit, voxel_side
+from ss_flow.tasks.split.dense import DenseParams, consistent_cloud, depth_samples, voxel_side
 
 _WIDTH = 0.25
 """Of the first Gaussians, in distances to their neighbours. Wider ones reach out in front of a surface that is seen at
@@ -57,7 +58,7 @@ class DenseSplattingParams:
 @task(
     resources=Resources(cores=1, most_cores=8, memory_mb=4000, gpus=0.5),
     uses=("torch", "opencv-contrib-python-headless", "scipy"),
-    environment=rasterizer,
+    environment=backend_identity,
 )
 def dense_splatting(
     frames: tuple[Frame, ...],

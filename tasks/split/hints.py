@@ -21,14 +21,14 @@ from ss_flow.tasks.artifacts import (
     PromptedMasks,
     Visibility,
 )
+from ss_flow.tasks.masks.erosion import ErosionParams
+from ss_flow.tasks.masks.painting import PaintedView, paint_labels
+from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding
-from ss_flow.tasks.split.erosion import ErosionParams
-from ss_flow.tasks.split.mask_pool import mask_set
 from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.reprompt import Prompt, RepromptParams, prompt, spread_prompts
-from ss_flow.tasks.split.selection import PaintedView, paint_labels
-from ss_flow.tasks.split.voting import Votes
+from ss_flow.tasks.split.votes.votes import Votes
 
 _MOST = 0.5
 """Share of the labelled pixels that counts as most of them."""

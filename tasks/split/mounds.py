@@ -10,7 +10,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
-from ss_flow.tasks.split.touching import TouchingParams, borders
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 _FOOT = 0.3
 """Share of a label's points, those nearest to what surrounds it, that are its foot."""

@@ -20,8 +20,8 @@ from ss_flow.tasks.artifacts import (
     Visibility,
 )
 from ss_flow.tasks.geometry.clustering import main_clusters
+from ss_flow.tasks.masks.erosion import ErosionParams, interiors
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
-from ss_flow.tasks.split.erosion import ErosionParams, interiors
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -13,17 +13,16 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, Observation, PointCloud, PointLabels, Visibility
 from ss_flow.tasks.geometry.clustering import main_clusters, rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, Natural
-from ss_flow.tasks.split.consensus import ConsensusParams, merge_labels
-from ss_flow.tasks.split.mask_clustering import (
+from ss_flow.tasks.split.observe import ClusterParams
+from ss_flow.tasks.split.votes.at_once import (
     MaskClusteringParams,
     cluster_masks,
     vote_at_once,
 )
-from ss_flow.tasks.split.observe import ClusterParams
-from ss_flow.tasks.split.sequential import Matches, SequentialParams, vote_in_turn
-from ss_flow.tasks.split.smoothing import smooth
-from ss_flow.tasks.split.touching import TouchingParams, merge_touching
-from ss_flow.tasks.split.voting import Votes
+from ss_flow.tasks.split.votes.in_turn import Matches, SequentialParams, vote_in_turn
+from ss_flow.tasks.split.votes.smoothing import smooth
+from ss_flow.tasks.split.votes.touching import TouchingParams, merge_touching
+from ss_flow.tasks.split.votes.votes import Votes
 
 
 @dataclass(frozen=True)
@@ -40,10 +39,6 @@ class PropagateParams:
     """Share of its votes that a point's label needs."""
     smoothing: Natural = 3
     """How often a point without a sure label takes the one that most of its neighbours carry; 0 = never."""
-    global_merge: bool = False
-    """Whether labels that the views hold together in one mask are united in the end."""
-    consensus: ConsensusParams = field(default_factory=ConsensusParams)
-    """When they are (only with global_merge)."""
     touching_merge: bool = True
     """Whether labels that go on into each other, alike in colour, are united in the end."""
     touching: TouchingParams = field(default_factory=TouchingParams)
@@ -82,7 +77,7 @@ def propagate(
     label = np.where(sure, leader, 0).astype(np.int32)
     if params.smoothing:
         label = smooth(label, covered & ~sure, points.points, points.spacing, params.smoothing)
-    settled = _settle(label, points, observations, params)
+    settled = _settle(label, points, params)
     num_labels = max(matched.label, default=0)
     renamed = _renaming(label, settled, num_labels)
     if params.min_label_views > 1:
@@ -116,10 +111,8 @@ def _at_once(
     return votes, against, matched
 
 
-def _settle(label: Int32, points: PointCloud, observations: Sequence[Observation], params: PropagateParams) -> Int32:
-    """The final labels: united where views or surfaces say so, without stray points, without tiny labels."""
-    if params.global_merge:
-        label = merge_labels(label, observations, params.consensus)
+def _settle(label: Int32, points: PointCloud, params: PropagateParams) -> Int32:
+    """The final labels: united where surfaces say so, without stray points, without tiny labels."""
     if params.touching_merge:
         label = merge_touching(label, points, params.touching)
     label = label.copy()

@@ -24,20 +24,20 @@ from ss_flow.tasks.artifacts import (
     PromptedMasks,
     Visibility,
 )
-from ss_flow.tasks.geometry.images import at_diagonal, pack_masks
-from ss_flow.tasks.ranges import Count, NonNegative
-from ss_flow.tasks.split.selection import (
+from ss_flow.tasks.geometry.images import at_diagonal
+from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.painting import (
     PaintedView,
-    SelectionParams,
     agreement,
     contradicted,
     labels_in_front,
     nearest_labels,
     paint_labels,
-    select_masks,
-    smoothed,
     stack_exclusive,
 )
+from ss_flow.tasks.masks.pool import smoothed
+from ss_flow.tasks.masks.selection import SelectionParams, select_masks
+from ss_flow.tasks.ranges import Count, NonNegative
 
 
 @dataclass(frozen=True)

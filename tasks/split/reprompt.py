@@ -8,19 +8,14 @@ import numpy as np
 
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Float64, Frame, Int32, MaskSet, PointLabels, PromptedMasks, Visibility
-from ss_flow.tasks.geometry.images import decode_valid, pack_masks
+from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
+from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.painting import PaintedView, agreement, labels_in_front, paint_labels
+from ss_flow.tasks.masks.selection import SelectionParams, select_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
-from ss_flow.tasks.split.selection import (
-    PaintedView,
-    SelectionParams,
-    agreement,
-    labels_in_front,
-    paint_labels,
-    select_masks,
-)
 
 
 @dataclass(frozen=True)

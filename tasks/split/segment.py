@@ -13,20 +13,13 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, MaskSet
-from ss_flow.tasks.geometry.images import decode_valid, pack_masks
+from ss_flow.tasks.geometry.images import decode_valid
+from ss_flow.tasks.masks.overlap import drop_duplicates, mask_iou, suppress
+from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.pool import canonical_order, mask_tree, merge_union, whole_pictures, without_speckles
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
-from ss_flow.tasks.split.mask_pool import (
-    canonical_order,
-    drop_duplicates,
-    mask_iou,
-    mask_tree,
-    merge_union,
-    suppress,
-    whole_pictures,
-    without_speckles,
-)
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,18 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Int32, MaskSet
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.holes import close_holes
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size, pack_masks
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size
+from ss_flow.tasks.masks.overlap import drop_duplicates
+from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.pool import canonical_order, mask_tree
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, NonNegative, Positive
-from ss_flow.tasks.split.graph_segmentation import (
+from ss_flow.tasks.split.regions.graph_segmentation import (
     RegionGraph,
     boundaries,
     find_planes,
     superpixels,
     surface_of,
 )
-from ss_flow.tasks.split.mask_pool import canonical_order, drop_duplicates, mask_tree
 
 
 @dataclass(frozen=True)

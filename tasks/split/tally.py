@@ -7,7 +7,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Int32, MaskSet, PointLabels, Tally, Visibility
 from ss_flow.tasks.geometry.images import at_diagonal
-from ss_flow.tasks.split.selection import nearest_labels, paint_labels
+from ss_flow.tasks.masks.painting import nearest_labels, paint_labels
 
 _REACH = 5.0
 """How far a label's area reaches round its points, in pixels of an image with a diagonal of 800."""

@@ -23,8 +23,8 @@ import numpy as np
 
 from ss_flow.flows.cli.main import main as ss_flow
 from ss_flow.flows.generated import Room, RoomParams, generate, write_scene
-from ss_flow.flows.generated_layout import furnish
-from ss_flow.flows.generated_render import Renderer
+from ss_flow.flows.generated.layout import furnish
+from ss_flow.flows.generated.render import Renderer
 from ss_flow.tasks.artifacts import Float32
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.split import segment_rgbd

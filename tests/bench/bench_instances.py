@@ -25,7 +25,7 @@ import numpy as np
 
 from ss_flow.flows import settings
 from ss_flow.flows.generated import RoomParams, generate
-from ss_flow.flows.generated_masks import DegradeParams, degrade
+from ss_flow.flows.generated.masks import DegradeParams, degrade
 from ss_flow.flows.params import Params, SplitParams
 from ss_flow.tasks.artifacts import (
     Cameras,
@@ -41,11 +41,11 @@ from ss_flow.tasks.artifacts import (
     PointParts,
     Visibility,
 )
-from ss_flow.tasks.capture.id_images import masks_of
 from ss_flow.tasks.evaluate.contingency import contingency
 from ss_flow.tasks.evaluate.instances import evaluate_masks, pooled
 from ss_flow.tasks.evaluate.panoptic import average_precision
 from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.masks.pool import masks_by_id
 from ss_flow.tasks.models.catalogue import available, default_folders, find
 from ss_flow.tasks.splat.resolve import resolve
 from ss_flow.tasks.split.cut import cut
@@ -92,7 +92,6 @@ WITHOUT = {
 }
 """The additions of `default` to the paper, and how to do without each."""
 WITH = {
-    "global merge": {"propagate.global_merge": True},
     "DBSCAN of masks": {"observe.clusters.eps": 5.0},
 }
 """What `default` leaves out, and how to have it."""
@@ -140,7 +139,7 @@ def masks_for(objects: int, seed: int, kind: str, preset: str, folder: str | Non
         return segmented(objects, seed, preset, folder)
     if kind != "perfect":
         ids = degrade(ids, DegradeParams(merged=0.1 if kind == "merged" else 0.0), seed=seed)
-    return tuple(masks_of(image, frame.name) for image, frame in zip(ids, room.frames, strict=True))
+    return tuple(masks_by_id(image, frame.name) for image, frame in zip(ids, room.frames, strict=True))
 
 
 @functools.lru_cache(maxsize=2)

@@ -23,7 +23,8 @@ from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.evaluate.novel_view import psnr, ssim, to_8bit
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, TrainView, train
+from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, train
+from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.geometry.shape import box_diagonal
@@ -77,7 +78,6 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=50_000)
     parser.add_argument("--most", type=int, default=150_000)
     parser.add_argument("--sh-degree", type=int, default=3)
-    parser.add_argument("--plateau", type=float, default=0.0)
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--store", type=Path, default=Path(tempfile.gettempdir()) / "ss-flow-bench")
     args = parser.parse_args()
@@ -95,7 +95,6 @@ def main() -> None:
                 sh_degree=args.sh_degree,
                 densify=strategy,
                 max_gaussians=args.most,
-                plateau=args.plateau,
                 rates=SLOW_RATES,
             )
             start = time.perf_counter()

@@ -29,7 +29,8 @@ from ss_flow.tasks.gaussians import native_pass
 from ss_flow.tasks.gaussians.library import Workspace
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import TrainParams, TrainView, train
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
+from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
 
 CASES = ((2_000, 160, 120, 0), (10_000, 320, 240, 0), (10_000, 320, 240, 3), (50_000, 640, 480, 0))

@@ -47,11 +47,11 @@ from ss_flow.tasks.evaluate.objects import change_elsewhere, floaters, fringe_sh
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
+from ss_flow.tasks.gaussians.views import CropParams, crop_camera
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.splat.reconstruct import thin
-from ss_flow.tasks.splat.views import CropParams, crop_camera, mask_of
 
 Masks = Literal["degraded", "truth", "none"]
 SPLIT_STEP = "masks_split"
@@ -193,7 +193,7 @@ def total_steps(found: Outcome, params: Params) -> tuple[int, int]:
 def crop_share(cameras: Cameras, instance: InstanceMasks, row: int, crop: CropParams) -> float:
     """How much of a photo's pixels are rendered to train on one view of an instance."""
     full = camera_of(cameras, int(instance.view[row]))
-    camera = crop_camera(full, mask_of(instance, row), instance.points, crop)
+    camera = crop_camera(full, instance.mask(row), instance.points, crop)
     return camera.width * camera.height / (full.width * full.height)
 
 

@@ -26,12 +26,12 @@ from ss_flow.cache.store import Store
 from ss_flow.execute import Stream
 from ss_flow.flows import settings
 from ss_flow.flows.generated import Room, RoomParams, generate
-from ss_flow.flows.generated_masks import DegradeParams, degrade
+from ss_flow.flows.generated.masks import DegradeParams, degrade
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import DepthMap, PointCloud
-from ss_flow.tasks.capture.id_images import masks_of
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.masks.pool import masks_by_id
 from ss_flow.tasks.split.observe import observe
 from ss_flow.tasks.split.propagate import propagate
 from ss_flow.tasks.split.visibility import visibility
@@ -88,7 +88,7 @@ def main() -> None:
             began = time.perf_counter()
             seen = visibility(cloud, cameras, depths[k % taken], view=k % taken, tau_depth=0.02)
             middle = time.perf_counter()
-            observed = observe(cloud, seen, masks_of(ids[k % taken], names[k % taken]), params=split.observe)
+            observed = observe(cloud, seen, masks_by_id(ids[k % taken], names[k % taken]), params=split.observe)
             ended = time.perf_counter()
             stored = store.put(replace(seen, name=str(k))), store.put(replace(observed, name=str(k)))
             return *stored, middle - began, ended - middle, len(seen.point_index)

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.errors import InputError
-from ss_flow.flows.generated import DegradeParams, Room, RoomParams, degrade, generate, write_scene
-from ss_flow.flows.generated_layout import MAX_OBJECTS, furnish
-from ss_flow.flows.generated_masks import _touching
-from ss_flow.flows.generated_shapes import SHAPES, ball, box, can, turned_profile
+from ss_flow.flows.generated import Room, RoomParams, generate, write_scene
+from ss_flow.flows.generated.layout import MAX_OBJECTS, furnish
+from ss_flow.flows.generated.masks import DegradeParams, _touching, degrade
+from ss_flow.flows.generated.shapes import SHAPES, ball, box, can, turned_profile
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, pixels_in_view
 
 SMALL = RoomParams(objects=10, views=12, width=120, height=90, seed=0, held_out=3)

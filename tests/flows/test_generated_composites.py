@@ -15,11 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.flows.generated import Room, RoomParams, generate, write_scene
-from ss_flow.flows.generated_composite_room import _in_a_row, furnish_composites
-from ss_flow.flows.generated_composites import Composite, Piece, book, brick, cup, paint, printed_box, stood_up, tube
-from ss_flow.flows.generated_layout import COLORS
-from ss_flow.flows.generated_prints import FACES, PRINTS, ellipse, face_size, on_face, rectangle, sheet
-from ss_flow.flows.generated_shapes import Mesh, box
+from ss_flow.flows.generated.composite_room import _in_a_row, furnish_composites
+from ss_flow.flows.generated.composites import Composite, Piece, book, brick, cup, paint, printed_box, stood_up, tube
+from ss_flow.flows.generated.layout import COLORS
+from ss_flow.flows.generated.prints import FACES, PRINTS, ellipse, face_size, on_face, rectangle, sheet
+from ss_flow.flows.generated.shapes import Mesh, box
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, pixels_in_view
 

@@ -93,7 +93,6 @@ TABLE = {
     # A12, and the global merge of S4
     "split.propagate.views": ("in_turn", "in_turn", "at_once"),
     "split.propagate.smoothing": (0, 0, 3),
-    "split.propagate.global_merge": (False, False, False),
     "split.propagate.touching_merge": (False, False, True),
     # 20
     "split.reprompt.min_points": (10, 10, 10),

@@ -6,7 +6,8 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, InstanceMasks, LabelMap
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
-from ss_flow.tasks.geometry.images import encode_png, pack_masks
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.masks.packing import pack_masks
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 8
 BALL, RADIUS = np.array([0.42, 0.0, 0.22]), 0.22

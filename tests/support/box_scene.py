@@ -8,7 +8,8 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, MaskSet, Visibility
 from ss_flow.tasks.geometry.cameras import camera_of
-from ss_flow.tasks.geometry.images import encode_png, pack_masks
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.masks.packing import pack_masks
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 6
 BOXES = np.array(

@@ -19,7 +19,8 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.deliver.draw import draw
 from ss_flow.tasks.deliver.palette import instance_color
-from ss_flow.tasks.geometry.images import encode_png, pack_masks
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.models.colour_words import TERMS
 from ss_flow.tasks.semantics.query import query
 

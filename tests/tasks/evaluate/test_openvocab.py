@@ -13,7 +13,6 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import LabelMap
 from ss_flow.tasks.evaluate.openvocab import (
     labelled_frame,
-    mask_iou,
     object_ious,
     oracle_ious,
     oracle_scores,
@@ -22,6 +21,7 @@ from ss_flow.tasks.evaluate.openvocab import (
     strict_scores,
     strict_targets,
 )
+from ss_flow.tasks.masks.overlap import iou
 
 SHELF = Path(__file__).parents[3] / ".." / "shared" / "data" / "apc_shelf"
 
@@ -113,7 +113,7 @@ def test_no_labels_cannot_be_scored() -> None:
     for scores in (strict_scores, oracle_scores):
         with pytest.raises(InputError, match="no polygon"):
             scores([])
-    assert mask_iou(np.zeros((2, 2), bool), np.zeros((2, 2), bool)) == 0
+    assert iou(np.zeros((2, 2), bool), np.zeros((2, 2), bool)) == 0
 
 
 def _maps(*views: list[int]) -> tuple[LabelMap, ...]:
@@ -149,4 +149,4 @@ def test_polygons_of_a_real_capture_fill_to_its_instance_masks() -> None:
         frame = labelled_frame(json.loads((SHELF / "label" / f"{view}.json").read_text()), view)
         ids = cv2.imread(str(SHELF / "instance" / f"{view}.png"), cv2.IMREAD_UNCHANGED)
         for category, mask in strict_targets(frame).items():
-            assert mask_iou(mask, ids == names[category]) > 0.9
+            assert iou(mask, ids == names[category]) > 0.9

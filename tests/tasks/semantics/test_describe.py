@@ -4,7 +4,8 @@ import pytest
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, InstanceMasks
-from ss_flow.tasks.geometry.images import encode_png, pack_masks
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.models.colour_words import TERMS
 from ss_flow.tasks.semantics.describe import DescribeParams, crop, describe
 

@@ -10,11 +10,12 @@ from ball_and_box import VIEWS, SmallScene
 
 from ss_flow.tasks.artifacts import DRAWN, REFINED, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import initialise, select
-from ss_flow.tasks.geometry.images import encode_png, pack_masks
+from ss_flow.tasks.gaussians.views import SceneViews
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.splat import refine as module
 from ss_flow.tasks.splat.refine import RefineParams, refine, render_mask
-from ss_flow.tasks.splat.views import SceneViews
 
 PARAMS = RefineParams()
 SEGMENTER = Model("stand-in", "segmenter", (), (), ())

@@ -8,7 +8,8 @@ from ball_and_box import VIEWS, SmallScene
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import REFINED, Cameras, Frame, InstanceMasks, LabelMap
-from ss_flow.tasks.geometry.images import encode_png, pack_masks
+from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.splat.resolve import ResolveParams, exclusive, resolve, resolve_refined
 
 CAMERAS = Cameras(

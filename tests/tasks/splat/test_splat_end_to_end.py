@@ -11,17 +11,16 @@ import pytest
 from ball_and_box import VIEWS, SmallScene
 
 from ss_flow.tasks.artifacts import REFINED, Gaussians
-from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
+from ss_flow.tasks.gaussians.initialise import concatenate, extents, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.shape import box_diagonal
+from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.splat import merge as module
-from ss_flow.tasks.splat.groups import extents
 from ss_flow.tasks.splat.merge import MergeParams, Quality, acceptable, assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
 from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
-from ss_flow.tasks.splat.refine import iou
 from ss_flow.tasks.splat.render_masks import RenderMasksParams, render_masks
 
 TRAIN = ReconstructParams(min_iterations=300, max_iterations=300, max_points=900)

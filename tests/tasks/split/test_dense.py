@@ -7,7 +7,8 @@ import pytest
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import DepthMap
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.split.dense import DenseParams, dense, scene_unit
+from ss_flow.tasks.geometry.units import scene_unit
+from ss_flow.tasks.split.dense import DenseParams, dense
 
 
 def fuse(**changes):

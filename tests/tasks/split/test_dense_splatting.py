@@ -8,7 +8,8 @@ from tiny_runs import run_tiny, write_room
 from ss_flow.errors import InputError
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.split.dense import DenseParams, scene_unit
+from ss_flow.tasks.geometry.units import scene_unit
+from ss_flow.tasks.split.dense import DenseParams
 from ss_flow.tasks.split.dense_splatting import DenseSplattingParams, _with_sparse_points, dense_splatting
 
 STEPS = 150

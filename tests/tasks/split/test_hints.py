@@ -10,15 +10,15 @@ import pytest
 from box_scene import HEIGHT, VIEWS, WIDTH, row_of_points
 
 from ss_flow.tasks.artifacts import Clicks, PointCloud, PointLabels, PromptedMasks, Visibility
-from ss_flow.tasks.geometry.images import pack_masks
+from ss_flow.tasks.masks.erosion import ErosionParams
+from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.painting import PaintedView
 from ss_flow.tasks.models.catalogue import Model, find
 from ss_flow.tasks.models.sam import Embedding
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.embed import embed
-from ss_flow.tasks.split.erosion import ErosionParams
 from ss_flow.tasks.split.reprompt import RepromptParams
-from ss_flow.tasks.split.selection import PaintedView
 from ss_flow.tasks.split.visibility import visibility
 
 WEIGHTS = Path(__file__).parents[4] / "shared" / "models"

@@ -10,11 +10,11 @@ from scipy.optimize import linear_sum_assignment
 
 from ss_flow.tasks.artifacts import PointCloud
 from ss_flow.tasks.split.dense import DenseParams, dense
-from ss_flow.tasks.split.mask_clustering import MaskClusteringParams
 from ss_flow.tasks.split.observe import ClusterParams, ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
-from ss_flow.tasks.split.sequential import SequentialParams
 from ss_flow.tasks.split.visibility import visibility
+from ss_flow.tasks.split.votes.at_once import MaskClusteringParams
+from ss_flow.tasks.split.votes.in_turn import SequentialParams
 
 BARE = PropagateParams(
     views="in_turn",

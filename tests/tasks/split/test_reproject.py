@@ -16,20 +16,14 @@ from ss_flow.tasks.artifacts import (
     PromptedMasks,
     Visibility,
 )
-from ss_flow.tasks.geometry.images import pack_masks
+from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.painting import PaintedView, nearest_labels, paint_labels, stack_exclusive
+from ss_flow.tasks.masks.pool import smoothed
+from ss_flow.tasks.masks.selection import SelectionParams, select_masks
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
 from ss_flow.tasks.split.reproject import ReprojectParams, reproject
-from ss_flow.tasks.split.selection import (
-    PaintedView,
-    SelectionParams,
-    nearest_labels,
-    paint_labels,
-    select_masks,
-    smoothed,
-    stack_exclusive,
-)
 from ss_flow.tasks.split.visibility import visibility
 
 ALL = ReprojectParams(SelectionParams(masks="all"), draw_missing=False)

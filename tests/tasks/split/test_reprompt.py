@@ -6,11 +6,11 @@ import pytest
 from box_scene import mask_set
 
 from ss_flow.tasks.artifacts import PointLabels, Visibility
+from ss_flow.tasks.masks.selection import SelectionParams
 from ss_flow.tasks.models.catalogue import Model, find
 from ss_flow.tasks.models.sam import Embedding
 from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.reprompt import RepromptParams, reprompt
-from ss_flow.tasks.split.selection import SelectionParams
 
 WEIGHTS = Path(__file__).parents[4] / "shared" / "models"
 

@@ -1,7 +1,7 @@
 import numpy as np
 
 from ss_flow.tasks.artifacts import PointLabels, Visibility
-from ss_flow.tasks.split.mask_pool import mask_set
+from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.split.tally import tally
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
-from ss_flow.flows.generated_composite_room import GAZE, close_up, furnish_composites, gripper
-from ss_flow.flows.generated_layout import Thing, furnish
-from ss_flow.flows.generated_masks import DegradeParams, degrade
-from ss_flow.flows.generated_render import Renderer
+from ss_flow.flows.generated.composite_room import GAZE, close_up, furnish_composites, gripper
+from ss_flow.flows.generated.layout import Thing, furnish
+from ss_flow.flows.generated.masks import DegradeParams, degrade
+from ss_flow.flows.generated.render import Renderer
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, UInt8
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of
 from ss_flow.tasks.geometry.images import encode_png

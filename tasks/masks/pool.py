@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, MaskSet
-from ss_flow.tasks.geometry.images import pack_masks
+from ss_flow.tasks.artifacts import Bool, Float32, Int32, MaskSet
+from ss_flow.tasks.masks.overlap import intersections, suppress
+from ss_flow.tasks.masks.packing import pack_masks
 
-_AT_ONCE = 1 << 18
-"""Pixels that are multiplied at once: floats of whole masks would take many times their memory."""
+_CRUMB = 0.1
+"""Pieces of a drawn mask below this share of its largest one are no part of it."""
 
 
 def canonical_order(masks: Bool) -> Int32:
@@ -38,31 +40,6 @@ def exclusive(masks: Bool, order: Int32) -> Int32:
     for index in order:
         owner[masks[index]] = index
     return owner
-
-
-def intersections(masks: Bool) -> Float32:
-    """Pixels that masks [N, H, W] share, two by two: [N, N], exact below 2^24."""
-    flat = masks.reshape(len(masks), masks.shape[1] * masks.shape[2])
-    shared = np.zeros((len(flat), len(flat)), np.float32)
-    for start in range(0, flat.shape[1], _AT_ONCE):
-        part = flat[:, start : start + _AT_ONCE].astype(np.float32)
-        shared += part @ part.T
-    return shared
-
-
-def drop_duplicates(masks: Bool, scores: Float32, max_iou: float) -> Int32:
-    """Non-maximum suppression over masks: of two with an IoU above `max_iou` the one with the better score stays.
-
-    masks: [N, H, W], none empty. scores: [N]. Returns the rows that stay, ascending.
-    """
-    return suppress(mask_iou(masks), scores, max_iou)
-
-
-def mask_iou(masks: Bool) -> Float32:
-    """IoU of masks [N, H, W], none empty, two by two: [N, N]."""
-    shared = intersections(masks)
-    areas = np.diag(shared)
-    return shared / (areas[:, None] + areas[None] - shared)
 
 
 def whole_pictures(masks: Bool, valid: Bool, max_area: float) -> Bool:
@@ -107,18 +84,17 @@ def without_speckles(mask: Bool, share: float) -> Bool:
     return large | hole[gap]
 
 
-def suppress(overlap: Float32 | Float64, scores: Float32, threshold: float) -> Int32:
-    """Greedy non-maximum suppression on a matrix of overlaps.
+def smoothed(mask: Bool, radius: int) -> Bool:
+    """A mask [H, W] with smooth borders and without crumbs.
 
-    overlap: [N, N]. scores: [N]; of equal scores the first row is taken first. Returns the rows that stay, ascending.
+    A pixel belongs to it when most of the square of this radius round it does; pieces of less than a tenth of the
+    largest one are dropped.
     """
-    alive = np.ones(len(scores), bool)
-    kept: list[int] = []
-    for index in np.argsort(-scores, kind="stable"):
-        if alive[index]:
-            kept.append(int(index))
-            alive &= overlap[index] <= threshold
-    return np.array(sorted(kept), np.int32)
+    import cv2
+
+    side = 2 * radius + 1
+    most = cv2.boxFilter(mask.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE) > 0.5
+    return large_pieces(most, _CRUMB)[0]
 
 
 def mask_tree(masks: Bool, contained: float) -> Int32:
@@ -191,3 +167,21 @@ def merge_union(masks: Bool, grid: Int32, duplicate: float, overlap: float) -> t
 
 def _pixels(mask: Bool) -> int:
     return int(np.count_nonzero(mask))
+
+
+def masks_by_id(ids: NDArray[np.integer], name: str) -> MaskSet:
+    """The masks of an id image [H, W], one for each id above 0, by rising id."""
+    present = np.unique(ids)
+    present = present[present > 0]
+    count = len(present)
+    return MaskSet(
+        name=name,
+        height=ids.shape[0],
+        width=ids.shape[1],
+        packed=pack_masks(ids[None] == present[:, None, None]),
+        predicted_iou=np.ones(count, np.float32),
+        stability=np.ones(count, np.float32),
+        grid=np.zeros(count, np.int32),
+        parent=np.full(count, -1, np.int32),
+        source="ready-made",
+    )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.flows.generated_layout import Thing
+from ss_flow.flows.generated.layout import Thing
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, UInt8
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.open3d import load_open3d

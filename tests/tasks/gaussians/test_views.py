@@ -8,9 +8,7 @@ import pytest
 from ball_and_box import HEIGHT, WIDTH, SmallScene
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.geometry.cameras import camera_of, project
-from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.splat.views import (
+from ss_flow.tasks.gaussians.views import (
     IGNORED,
     NONE_OF_MINE,
     CropParams,
@@ -20,6 +18,8 @@ from ss_flow.tasks.splat.views import (
     sample_depth,
     training_view,
 )
+from ss_flow.tasks.geometry.cameras import camera_of, project
+from ss_flow.tasks.geometry.images import encode_png
 
 
 @pytest.fixture(scope="module")

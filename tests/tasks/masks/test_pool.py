@@ -4,15 +4,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ss_flow.tasks.split.mask_pool import (
+from ss_flow.tasks.masks.overlap import drop_duplicates, intersections, mask_iou, suppress
+from ss_flow.tasks.masks.pool import (
     canonical_order,
-    drop_duplicates,
     exclusive,
-    intersections,
-    mask_iou,
     mask_tree,
     merge_union,
-    suppress,
     whole_pictures,
     without_speckles,
 )

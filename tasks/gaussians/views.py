@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, InstanceMasks, Int32
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, Int32
 from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view
 from ss_flow.tasks.geometry.fusion import depth_at
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, pack_masks
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.units import scene_unit
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 from ss_flow.tasks.ranges import Count, Natural
-
-if TYPE_CHECKING:
-    from ss_flow.tasks.gaussians.trainer import TrainView
 
 NONE_OF_MINE, IGNORED = -2, -1
 """Pixels without an instance of the group, and pixels that say nothing about it (see `TrainView.ids`)."""
 _MAX_REACH_PX = 8
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One view to train on; every array has the camera's size."""
+
+    camera: Camera
+    """Already cropped to the view's box."""
+    image: Float32
+    """[h, w, 3] RGB, 0..1."""
+    inside: Bool
+    """[h, w] pixels of what is trained: colour loss, alpha towards 1."""
+    free: Bool
+    """[h, w] pixels where nothing is: alpha towards 0. Pixels of neither kind are ignored."""
+    depth: Float32
+    """[h, w] z-depth in world units, 0 = unknown; counts inside only."""
+    ids: Int32 | None = None
+    """[h, w] for the mask loss: index into `label_ids`, -1 = ignore, -2 = none of them. None = no mask loss."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +60,17 @@ class SceneViews:
         return rows[seen], column[seen], row[seen], z[seen].astype(np.float32)
 
 
+def scene_views(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    tau_depth: float,
+    tau_relative: float,
+) -> SceneViews:
+    """The views of a scene, with the depth tolerance in world units (tau_depth is in scene units, spec 3.0)."""
+    return SceneViews(frames, cameras, depths, tau_depth * scene_unit(cameras, depths), tau_relative)
+
+
 @dataclass(frozen=True)
 class CropParams:
     """Which part of a view is used, and how large."""
@@ -53,27 +79,6 @@ class CropParams:
     """Pixels of the photo added on every side of the box around the instance."""
     max_side: Count = 480
     """Longest side of the crop, pixels; larger crops are scaled down."""
-
-
-def mask_of(instance: InstanceMasks, row: int) -> Bool:
-    """The mask of `instance.view[row]`: [H, W]."""
-    bits = np.unpackbits(instance.packed[row], count=instance.height * instance.width)
-    return bits.reshape(instance.height, instance.width).astype(bool)
-
-
-def dilated(instance: InstanceMasks, pixels: int) -> InstanceMasks:
-    """The same with masks that reach so many pixels farther on all sides."""
-    if not pixels:
-        return instance
-    masks = [grown(mask, pixels) for mask in instance.dense()]
-    return replace(instance, packed=pack_masks(np.array(masks, bool).reshape(-1, instance.height, instance.width)))
-
-
-def grown(mask: Bool, pixels: int) -> Bool:
-    """A mask [H, W] with all within so many pixels of it, diagonals included."""
-    import cv2
-
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0
 
 
 def sample_depth(depth: DepthMap, full: Camera, crop: Camera) -> Float32:
@@ -163,8 +168,6 @@ def training_view(
     Raises InputError when the frame's size is not that of the masks.
     """
     import cv2
-
-    from ss_flow.tasks.gaussians.trainer import TrainView
 
     frame, full = scene.frames[view], camera_of(scene.cameras, view)
     if channels.shape != (frame.height, frame.width):

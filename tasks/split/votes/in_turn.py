@@ -12,7 +12,7 @@ from ss_flow.running import progress
 from ss_flow.tasks.artifacts import BORDER, Float64, Int32, Observation, Visibility
 from ss_flow.tasks.geometry.zbuffer import paint
 from ss_flow.tasks.ranges import Count, Fraction, Natural, Range
-from ss_flow.tasks.split.voting import Votes
+from ss_flow.tasks.split.votes.votes import Votes
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.flows.generated_shapes import SHAPES, Mesh, box, shelf, sofa, table
+from ss_flow.flows.generated.shapes import SHAPES, Mesh, box, shelf, sofa, table
 
 HALF_WIDTH = 2.0
 """The room reaches from -HALF_WIDTH to HALF_WIDTH in x and y, metres; the floor is z = 0."""

@@ -7,7 +7,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.split.graph_segmentation import Boundary, RegionGraph, boundaries, find_planes, surface_of
+from ss_flow.tasks.split.regions.graph_segmentation import Boundary, RegionGraph, boundaries, find_planes, surface_of
 from ss_flow.tasks.split.segment_rgbd import SegmentRgbdParams, segment_rgbd
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 290.0

@@ -19,7 +19,7 @@ from ss_flow.running import progress
 from ss_flow.tasks.artifacts import INSIDE, STRAY, Float32, Float64, Int32, Observation
 from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.split.observe import membership
-from ss_flow.tasks.split.voting import Votes
+from ss_flow.tasks.split.votes.votes import Votes
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ss_flow.flows.generated_layout import COLORS, Material, Thing
-from ss_flow.flows.generated_prints import (
+from ss_flow.flows.generated.layout import COLORS, Material, Thing
+from ss_flow.flows.generated.prints import (
     FACES,
     LIFT,
     PRINTS,
@@ -22,7 +22,7 @@ from ss_flow.flows.generated_prints import (
     rectangle,
     sheet,
 )
-from ss_flow.flows.generated_shapes import Mesh, ball, box, joined, turned_profile
+from ss_flow.flows.generated.shapes import Mesh, ball, box, joined, turned_profile
 from ss_flow.tasks.artifacts import Float64
 
 PAINTS = {

@@ -4,7 +4,7 @@ from box_scene import mask_set
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ss_flow.tasks.split.erosion import ErosionParams, erode, interiors
+from ss_flow.tasks.masks.erosion import ErosionParams, erode, interiors
 
 
 def square(size, low, high):

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import PointCloud
-from ss_flow.tasks.split.touching import TouchingParams, merge_touching
+from ss_flow.tasks.split.votes.touching import TouchingParams, merge_touching
 
 BEIGE, BLUE = (200, 180, 150), (40, 60, 160)
 X, Y, Z = np.eye(3)

@@ -5,14 +5,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import BORDER, INSIDE, STRAY, Observation
-from ss_flow.tasks.split.mask_clustering import (
+from ss_flow.tasks.split.observe import membership
+from ss_flow.tasks.split.votes.at_once import (
     MaskClusteringParams,
     cluster_masks,
     correlation_clusters,
     evidence,
     vote_at_once,
 )
-from ss_flow.tasks.split.observe import membership
 
 SMALL = MaskClusteringParams(min_points=1)
 LEFT, RIGHT, WHOLE = range(10), range(10, 20), range(20)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from ss_flow.tasks.split.smoothing import smooth
+from ss_flow.tasks.split.votes.smoothing import smooth
 
 
 def row(count):

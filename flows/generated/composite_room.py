@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ss_flow.flows.generated_composites import (
+from ss_flow.flows.generated.composites import (
     Composite,
     Piece,
     book,
@@ -20,9 +20,9 @@ from ss_flow.flows.generated_composites import (
     slatted_chair,
     stood_up,
 )
-from ss_flow.flows.generated_layout import CEILING, COLORS, HALF_WIDTH, Thing
-from ss_flow.flows.generated_prints import ellipse, rectangle, sheet
-from ss_flow.flows.generated_shapes import ball, box, joined, vase
+from ss_flow.flows.generated.layout import CEILING, COLORS, HALF_WIDTH, Thing
+from ss_flow.flows.generated.prints import ellipse, rectangle, sheet
+from ss_flow.flows.generated.shapes import ball, box, joined, vase
 from ss_flow.tasks.artifacts import Float64
 
 GAZE = 0.8

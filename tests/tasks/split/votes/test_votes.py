@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ss_flow.tasks.split.voting import Votes
+from ss_flow.tasks.split.votes.votes import Votes
 
 
 @settings(deadline=None)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ss_flow.flows.generated_shapes import Mesh
+from ss_flow.flows.generated.shapes import Mesh
 from ss_flow.tasks.artifacts import Float64
 
 LIFT = 0.0008

@@ -1,0 +1,29 @@
+"""Masks as bits, and grown by some pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, InstanceMasks, UInt8
+
+
+def pack_masks(masks: Bool) -> UInt8:
+    """[N, H, W] booleans as [N, ceil(H * W / 8)] bits, the form of `MaskSet.packed`."""
+    return np.packbits(masks.reshape(len(masks), masks.shape[1] * masks.shape[2]), axis=1)
+
+
+def dilated(instance: InstanceMasks, pixels: int) -> InstanceMasks:
+    """The same with masks that reach so many pixels farther on all sides."""
+    if not pixels:
+        return instance
+    masks = [grown(mask, pixels) for mask in instance.dense()]
+    return replace(instance, packed=pack_masks(np.array(masks, bool).reshape(-1, instance.height, instance.width)))
+
+
+def grown(mask: Bool, pixels: int) -> Bool:
+    """A mask [H, W] with all within so many pixels of it, diagonals included."""
+    import cv2
+
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0

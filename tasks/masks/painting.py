@@ -1,0 +1,70 @@
+"""Labels of points, painted into a view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float64, Int32, Visibility
+from ss_flow.tasks.geometry.zbuffer import paint
+from ss_flow.tasks.masks.overlap import iou
+
+
+@dataclass(frozen=True)
+class PaintedView:
+    """The labels of the points in front, by pixel."""
+
+    pixel: Int32
+    """[P] flat indices of the pixels where a point falls, ascending."""
+    label: Int32
+    """[P] label of the point in front, 0 = unlabelled."""
+
+
+def paint_labels(view: Visibility, label: Int32) -> PaintedView:
+    """Paint the labels [N] of all dense points into a view; nearest depth wins a pixel."""
+    image = paint(label[view.point_index] + 1, view.pixel, view.depth, view.height * view.width)
+    pixel = np.flatnonzero(image).astype(np.int32)
+    return PaintedView(pixel, image[pixel] - 1)
+
+
+def labels_in_front(painted: PaintedView, min_points: int) -> list[int]:
+    """The labels that at least so many points in front carry, ascending."""
+    names, counts = np.unique(painted.label, return_counts=True)
+    found: list[int] = names[(names > 0) & (counts >= min_points)].tolist()
+    return found
+
+
+def nearest_labels(painted: PaintedView, height: int, width: int, reach: float) -> Int32:
+    """The label of the nearest painted pixel, at most `reach` pixels away: [H, W], 0 = unlabelled or none so near."""
+    import cv2
+
+    empty = np.ones(height * width, np.uint8)
+    empty[painted.pixel] = 0
+    distance, nearest = cv2.distanceTransformWithLabels(
+        empty.reshape(height, width), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    table = np.zeros(int(nearest.max()) + 1, np.int32)
+    table[nearest.ravel()[painted.pixel]] = painted.label
+    return np.where(distance <= reach, table[nearest], 0)
+
+
+def agreement(painted: PaintedView, mask: Bool, label: int) -> float:
+    """IoU of a mask [H, W] with the points of a label, on the pixels where points fall."""
+    return iou(mask.ravel()[painted.pixel], painted.label == label)
+
+
+def stack_exclusive(shown: dict[int, Bool], height: int, width: int) -> Int32:
+    """One label a pixel, smaller masks on top, equal ones by the lower label: [H, W], 0 = none."""
+    ids = np.zeros((height, width), np.int32)
+    for label in sorted(shown, key=lambda label: (-int(shown[label].sum()), -label)):
+        ids[shown[label]] = label
+    return ids
+
+
+def contradicted(painted: PaintedView, ids: Int32, num_labels: int) -> tuple[Float64, Float64]:
+    """For each label the painted pixels that its mask holds, and those of them with another label: [L + 1] each."""
+    under = ids.ravel()[painted.pixel]
+    held = np.bincount(under, minlength=num_labels + 1).astype(np.float64)
+    other = (painted.label > 0) & (painted.label != under)
+    return held, np.bincount(under[other], minlength=num_labels + 1).astype(np.float64)
