@@ -9,10 +9,10 @@ from typing import Any
 
 from ss_flow.errors import InputError
 from ss_flow.flows.params import CaptureParams
-from ss_flow.graph import each
+from ss_flow.graph import INDEX, each
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture import depth as depth_steps
-from ss_flow.tasks.capture import ingest, recordings, sensor_depth
+from ss_flow.tasks.capture import ingest, recordings, sensor_depth, views
 from ss_flow.tasks.capture.coco_masks import coco_masks
 from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
@@ -32,8 +32,12 @@ class Capture:
     frames: Any
     """tuple[Frame, ...]"""
     cameras: Any
+    by_view: Any
+    """tuple[Camera, ...]: the same, one by one."""
     depths: Any
     """tuple[DepthMap, ...]"""
+    unit: Any
+    """SceneUnit"""
     masks: Any | None
     """tuple[MaskSet, ...] where the capture brought its own masks."""
     truth: Any | None
@@ -68,16 +72,16 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         cameras = sfm(frames, params=params.sfm)
         frames = registered(frames, cameras)
     names = scene.names if scene.poses is not None else None
-    views: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
+    known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
     masks = truth = pointed = None
     if scene.ready_masks is not None:
-        masks = ready_masks(frames, cameras, files=_all(reference, scene.ready_masks), **views)
+        masks = ready_masks(frames, cameras, files=_all(reference, scene.ready_masks), **known)
     elif scene.coco_masks is not None:
-        masks = coco_masks(frames, cameras, file=reference(scene.coco_masks), **views)
+        masks = coco_masks(frames, cameras, file=reference(scene.coco_masks), **known)
     elif scene.hints is not None:
-        pointed = clicks(frames, cameras, hints=scene.hints, **views)
+        pointed = clicks(frames, cameras, hints=scene.hints, **known)
     if scene.ground_truth is not None:
-        truth = ground_truth(frames, cameras, files=_all(reference, scene.ground_truth), **views)
+        truth = ground_truth(frames, cameras, files=_all(reference, scene.ground_truth), **known)
     source = params.depth
     if source == "auto":
         source = "sensor" if scene.depths is not None or scene.kind == "sens" else "mvs"
@@ -93,7 +97,8 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
             "sensor's can be calibrated; leave --calibrate depth out."
         )
     objects = scene.hints.objects if scene.hints is not None else ()
-    return Capture(frames, cameras, depths, masks, truth, names, pointed, objects, placing)
+    by_view, length = views.by_view(cameras), views.unit(cameras, depths)
+    return Capture(frames, cameras, by_view, depths, length, masks, truth, names, pointed, objects, placing)
 
 
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> Any:
@@ -145,8 +150,9 @@ def _depths(
         raise InputError("capture.depth=mono needs a monocular depth network; `ss-flow models list` names some.")
     swept = each(
         frames,
+        INDEX,
         names=names,
-        build=lambda frame: depth_steps.sweep(frames, cameras, view=frame.index, params=params.sweep),
+        build=lambda _, index: depth_steps.sweep(frames, cameras, view=index, params=params.sweep),
     )
     agreed = depth_steps.agree(swept, cameras, params=params.agreement)
     if source == "mvs" or monodepth is None:

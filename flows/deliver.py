@@ -103,7 +103,7 @@ def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
 
     frames, cameras, scene = several("ingest"), one("cameras"), one("scene")
     split_maps, maps = several("masks_split"), several("masks")
-    instances = instances_document(several("refine"), scene, one("names"), frames, one("hierarchy"))
+    instances = instances_document(several("refine"), scene, one("names"), one("hierarchy"))
     write_scene(folder, scene, instances)
     write_cloud(folder, one("dense"), one("cut"), one("parts"))
     write_masks(folder / "masks_split", frames, split_maps)

@@ -11,7 +11,8 @@ from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.registration import RegistrationParams
 from ss_flow.tasks.capture.sfm import SfmParams
-from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive
+from ss_flow.tasks.geometry.visibility import VisibilityParams
+from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams
 from ss_flow.tasks.splat.merge import MergeParams
@@ -51,16 +52,6 @@ class CaptureParams:
     agreement: AgreementParams = field(default_factory=AgreementParams)
     registration: RegistrationParams = field(default_factory=RegistrationParams)
     mono: MonoParams = field(default_factory=MonoParams)
-
-
-@dataclass(frozen=True)
-class VisibilityParams:
-    """Which dense points a view sees."""
-
-    tau_depth: Positive = 0.02
-    """How far a point may lie from the view's depth, in scene units (metres where the scale is known)."""
-    tau_relative: NonNegative = 0.0
-    """The same as a fraction of the depth; the larger of the two counts."""
 
 
 @dataclass(frozen=True)

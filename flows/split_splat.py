@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 from ss_flow.errors import InputError
 from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import Params, SplitParams
-from ss_flow.graph import each, expand, gather, labelled, otherwise
+from ss_flow.graph import INDEX, each, expand, gather, labelled, otherwise, pick
 from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.evaluate.novel_view import novel_view
+from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.semantics.describe import describe
 from ss_flow.tasks.semantics.name import given_names, name
@@ -23,6 +25,7 @@ from ss_flow.tasks.splat.refine import refine
 from ss_flow.tasks.splat.render_masks import render_masks
 from ss_flow.tasks.splat.resolve import exclusive, resolve, resolve_refined
 from ss_flow.tasks.split import hints
+from ss_flow.tasks.split.appearances import appearances, shown_in
 from ss_flow.tasks.split.cut import cut, cut_parts
 from ss_flow.tasks.split.dense import dense
 from ss_flow.tasks.split.dense_splatting import dense_splatting
@@ -63,6 +66,8 @@ class Split:
     parts: Any
     instances: Any
     """tuple[InstanceMasks, ...], the background first."""
+    appearances: Any
+    """The views that see each of them."""
     embeddings: Any
     """tuple[Embedding, ...], one a view; () without a segmenter."""
     hinted: Any | None
@@ -102,12 +107,6 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
                 )
     if held_out is not None:
         results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])
-    results["describe"] = each(
-        results["refine"],
-        build=lambda instance: describe(
-            capture.frames, instance, encoder=networks.encoder, params=params.semantics.describe
-        ),
-    )
     results["names"] = name(results["describe"], encoder=networks.encoder)
     if halved.hinted is not None:
         results["names"] = given_names(results["names"], halved.hinted, halved.labels, objects=capture.objects)
@@ -118,23 +117,18 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     """Photos and depth -> view-consistent instances (Split&Splat, Sec. 3.1)."""
     views = (capture.frames, capture.cameras, capture.depths)
     if params.dense_source == "splatting":
-        points = dense_splatting(*views, params=params.dense, splatting=params.splatting)
+        points = dense_splatting(*views, capture.unit, params=params.dense, splatting=params.splatting)
     else:
-        points = dense(*views, params=params.dense)
+        points = dense(*views, capture.unit, params=params.dense)
     segmenter = networks.segmenter
     embeddings: Any = ()
     if segmenter is not None:
         embeddings = each(capture.frames, names=capture.names, build=lambda frame: embed(frame, model=segmenter))
     seen = each(
+        capture.by_view,
         capture.depths,
         names=capture.names,
-        build=lambda depth: visibility(
-            points,
-            capture.cameras,
-            depth,
-            view=depth.index,
-            **vars(params.visibility),
-        ),
+        build=lambda camera, depth: visibility(points, camera, depth, params=params.visibility),
     )
     hinted: Any | None = None
     if capture.masks is not None:
@@ -189,7 +183,8 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
             ),
         )
     instances = reproject(points, seen, masks, labels, parts, prompted, params=params.reproject)
-    return Split(points, seen, masks, pieces, tree, labels, parts, instances, embeddings, hinted)
+    seen_in = appearances(labels, seen)
+    return Split(points, seen, masks, pieces, tree, labels, parts, instances, seen_in, embeddings, hinted)
 
 
 def _masks_of_hints(
@@ -230,66 +225,109 @@ def _masks_of_hints(
 
 def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -> dict[str, Any]:
     """Instances -> Gaussians, each on its own; refined masks; one scene (Split&Splat, Sec. 3.2)."""
-    views = (capture.frames, capture.cameras, capture.depths)
-    tau = vars(params.split.visibility)
-    settings = params.splat
+    views = Views(capture.frames, capture.by_view, capture.depths, capture.unit)
+    settings, visibility = params.splat, params.split.visibility
 
-    def build(instance: Any) -> tuple[Any, Any]:
-        gaussians = reconstruct(*views, instance, params=settings.reconstruct, **tau)
-        better = refine(
-            *views,
-            instance,
-            gaussians,
-            halved.embeddings,
-            model=networks.segmenter,
-            params=settings.refine,
-            **tau,
+    def of_instance(row: int, build: Callable[[list[int]], Any]) -> Any:
+        """What `build` makes of the views that see an instance: a step for one instance depends on no others."""
+        return expand(halved.appearances, lambda seen_in: build(seen_in.views(row)))
+
+    @functools.cache
+    def reconstructed(row: int) -> Any:
+        return of_instance(
+            row,
+            lambda seen: reconstruct(
+                some(views, seen), halved.instances[row], params=settings.reconstruct, visibility=visibility
+            ),
         )
-        return gaussians, better
 
-    def again(instance: Any, gaussians: Any) -> Any:
-        return retrain(*views, exclusive(instance, masks), gaussians, params=settings.reconstruct, **tau)
+    @functools.cache
+    def refined(row: int) -> Any:
+        return of_instance(
+            row,
+            lambda seen: refine(
+                some(views, seen),
+                halved.instances[row],
+                reconstructed(row),
+                pick(halved.embeddings, seen) if networks.segmenter is not None else (),
+                model=networks.segmenter,
+                params=settings.refine,
+                visibility=visibility,
+            ),
+        )
 
-    first, better = each(halved.instances, build=build, outputs=2, on_error="skip")
+    def retrained(row: int) -> Any:
+        return of_instance(
+            row,
+            lambda seen: retrain(
+                some(views, seen),
+                exclusive(refined(row), pick(masks_refined, seen)),
+                reconstructed(row),
+                params=settings.reconstruct,
+                visibility=visibility,
+            ),
+        )
+
+    def described(row: int) -> Any:
+        return of_instance(
+            row,
+            lambda seen: describe(
+                pick(capture.frames, seen), refined(row), encoder=networks.encoder, params=params.semantics.describe
+            ),
+        )
+
+    def of_each(build: Callable[[int], Any]) -> Any:
+        return each(halved.instances, INDEX, build=lambda _, row: build(row), on_error="skip")
+
+    masks_of_each = of_each(refined)
     with labelled("splat"):
-        masks = resolve_refined(*views, better, params=settings.resolve, **tau)
-    groups = each(better, first, build=again, on_error="skip")
-    merged = merge_rounds(views, groups, masks, params, 0)
+        masks_refined = resolve_refined(views, masks_of_each, params=settings.resolve, visibility=visibility)
+        shown = shown_in(masks_refined)
+    merged = merge_rounds(views, of_each(retrained), masks_refined, shown, params, 0)
     assembled = assemble(merged)
-    scene = otherwise(global_pass(*views, assembled, masks, params=settings.merge), lambda: assembled)
+    scene = otherwise(global_pass(views, assembled, masks_refined, params=settings.merge), lambda: assembled)
     return {
-        "reconstruct": first,
-        "refine": better,
-        "masks_refined": masks,
+        "reconstruct": of_each(reconstructed),
+        "refine": masks_of_each,
+        "masks_refined": masks_refined,
         "merge": merged,
         "scene": scene,
-        "masks": render_masks(*views, scene, masks, params=settings.masks),
+        "masks": render_masks(views, scene, masks_refined, params=settings.masks),
+        "describe": of_each(described),
     }
 
 
-def merge_rounds(views: tuple[Any, Any, Any], groups: Any, masks: Any, params: Params, number: int) -> Any:
-    """Merge the pairs that collide, disjoint pairs side by side, until none is left (spec P4)."""
+def some(views: Views, rows: list[int]) -> Views:
+    """Some views of a scene, in a flow."""
+    return Views(pick(views.frames, rows), pick(views.cameras, rows), pick(views.depths, rows), views.unit)
+
+
+def merge_rounds(views: Views, groups: Any, masks: Any, shown: Any, params: Params, number: int) -> Any:
+    """Merge the pairs that collide, disjoint pairs side by side, until none is left (spec P4).
+
+    shown: which views show which instance.
+    """
 
     def build(planned: MergePlan) -> Any:
         if not len(planned.pairs):
             return groups
         merged: list[Any] = []
-        for a, b in planned.pairs.tolist():
-            pair = groups[a], groups[b]
+        for row, (a, b) in enumerate(planned.pairs.tolist()):
+            pair, seen = (groups[a], groups[b]), planned.views(row)
             with labelled(f"{number}.{a}+{b}"):
                 refined = merge_pair(
-                    *views,
+                    some(views, seen),
                     *pair,
-                    masks,
+                    pick(masks, seen),
                     params=params.splat.merge,
                     w_mask=planned.mask_weight,
-                    **vars(params.split.visibility),
+                    visibility=params.split.visibility,
                 )
                 # A pair that cannot be refined is joined as it is.
                 merged.append(otherwise(refined, functools.partial(assemble, pair)))
         rest = [groups[i] for i in planned.singles.tolist()]
-        return merge_rounds(views, gather([*merged, *rest]), masks, params, number + 1)
+        return merge_rounds(views, gather([*merged, *rest]), masks, shown, params, number + 1)
 
     with labelled(str(number)):
-        planned = plan(groups, params=params.splat.plan, round=number)
+        planned = plan(groups, shown, params=params.splat.plan, round=number)
     return expand(planned, build)

@@ -58,7 +58,7 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     surroundings = Surroundings(listener, max(1, invocation.resources.cores), checkpoint, warned)
     started = time.monotonic()
     with running(surroundings), _peaks.watching() as peak:
-        result = task.function(**arguments, **invocation.parameters)
+        result = task.run(arguments, invocation.parameters)
     seconds = time.monotonic() - started
     items = result if task.returns_list else (result,)
     action = Action(

@@ -7,7 +7,7 @@ comes next, `otherwise` says what stands in for a failed node, a plain sequence 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import networkx as nx
 
 OnError = Literal["fail", "skip"]
+INDEX: Any = object()
+"""In the place of a list of `each`: the position of the item, a plain number."""
 
 
 @dataclass(eq=False)
@@ -54,6 +56,14 @@ class Item(Node):
 
     source: Node
     index: int
+
+
+@dataclass(eq=False)
+class Pick(Node):
+    """Some artifacts of a list."""
+
+    source: Node
+    positions: tuple[int, ...]
 
 
 @dataclass(eq=False)
@@ -154,7 +164,7 @@ def sources_of(node: Node) -> list[Node]:
     match node:
         case Call():
             return list(node.inputs.values())
-        case Item() | Otherwise():
+        case Item() | Pick() | Otherwise():
             return [node.source]
         case Gather():
             return [source for row in node.rows for source in row]
@@ -174,6 +184,11 @@ def gather(nodes: Sequence[Any]) -> Any:
     return _gathered([(node,) for node in nodes], 0, "fail")
 
 
+def pick(nodes: Any, positions: Iterable[int]) -> Any:
+    """Some artifacts of a list, as a list: a task that gets them does not depend on the others."""
+    return _building().attach(Pick(nodes.flow, nodes.step, nodes.item, nodes, tuple(positions)))
+
+
 def _gathered(rows: list[tuple[Node, ...]], position: int, on_error: OnError) -> Gather:
     flow = _building()
     return flow.attach(Gather(flow, "gather", _item.get(), rows, position, on_error))
@@ -188,13 +203,15 @@ def each(
 ) -> Any:
     """Apply `build` to every item of one list, or of several lists of equal length side by side.
 
-    build: takes one node of every list, returns a node, or a tuple of `outputs` nodes. names: what to call the items
+    lists: nodes that stand for lists, or INDEX. build: takes one node of every list, and the position of the item for
+    INDEX; returns a node, or a tuple of `outputs` nodes. names: what to call the items
     (say, the frames' names). on_error: with "skip", an item of which anything fails is left out of every list of
     results, and the run is degraded.
     Returns a node that stands for the list of the results, or a tuple of such nodes.
     """
     flow = _building()
     rows: list[tuple[Node, ...]] = []
+    sources = [source for source in lists if source is not INDEX]
 
     def build_rows(lengths: tuple[int, ...]) -> None:
         if len(set(lengths)) != 1:
@@ -202,7 +219,7 @@ def each(
         with flow.building():
             for index in range(lengths[0]):
                 _item.set(names[index] if names else str(index))
-                result = build(*(source[index] for source in lists))
+                result = build(*(index if source is INDEX else source[index] for source in lists))
                 rows.append(result if isinstance(result, tuple) else (result,))
 
     def build_list(position: int, *lengths: int) -> Node:
@@ -211,9 +228,7 @@ def each(
         return _gathered(rows, position, on_error)
 
     nodes = tuple(
-        flow.attach(
-            Expand(flow, "each", _item.get(), list(lists), functools.partial(build_list, position), loads=False)
-        )
+        flow.attach(Expand(flow, "each", _item.get(), sources, functools.partial(build_list, position), loads=False))
         for position in range(outputs)
     )
     return nodes if outputs > 1 else nodes[0]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ss_flow.graph import Call, Expand, Gather, Item, Node, Otherwise, Stored, sources_of
+from ss_flow.graph import Call, Expand, Gather, Item, Node, Otherwise, Pick, Stored, sources_of
 from ss_flow.keys import Value
 
 
@@ -124,6 +124,13 @@ class Resolution:
                 value = self.values[node.source]
                 assert not isinstance(value, str), f"{node.label} is one of a list, but its source is a single artifact"
                 self.settle(node, value if isinstance(value, Failure) else value[node.index])
+            case Pick():
+                value = self.values[node.source]
+                assert not isinstance(value, str), (
+                    f"{node.label} is some of a list, but its source is a single artifact"
+                )
+                chosen = value if isinstance(value, Failure) else tuple(value[i] for i in node.positions)
+                self.settle(node, chosen)
             case Gather():
                 self.settle(node, self._gathered(node))
             case Expand():

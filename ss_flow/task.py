@@ -1,16 +1,17 @@
 """Tasks: plain functions with declared inputs, parameters and output.
 
-A task's positional parameters are artifacts: one `X`, a list `tuple[X, ...]`, or a list `Sequence[X]` that may be
-larger than memory, whose items are read when they are looked at. Its keyword-only parameters are hashed into its key.
-It reads nothing else. Called in a flow, a task returns a `Node`; called anywhere else, it runs.
+A task's positional parameters are artifacts: one `X`, a list `tuple[X, ...]`, a list `Sequence[X]` that may be larger
+than memory, whose items are read when they are looked at, or a `Bundle` of these. Its keyword-only parameters are
+hashed into its key. It reads nothing else. Called in a flow, a task returns a `Node`; called anywhere else, it runs.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
@@ -40,6 +41,14 @@ class FileRef:
     """blake3 of the content, hexadecimal."""
 
 
+class Bundle:
+    """Base of frozen dataclasses of artifacts that go together as one argument of a task, say the views of a scene.
+
+    Each field is an input of its own, named "views.frames": a bundle is neither stored nor hashed as a whole. In a flow
+    its fields hold nodes, or sequences of nodes for lists.
+    """
+
+
 @dataclass(eq=False)
 class Task(Generic[P, R]):
     """A declared task. `name` is its module below `ss_flow.tasks` and its function: "split.propagate"."""
@@ -67,13 +76,24 @@ class Task(Generic[P, R]):
         Raises TypeError when that does not fit the task.
         """
         defaults = self._defaults
-        if len(args) == len(self.inputs) and kwargs.keys() <= defaults.keys():
+        if len(args) == len(self._artifacts) and kwargs.keys() <= defaults.keys():
             parameters = {name: kwargs.get(name, default) for name, default in defaults.items()}
             if not any(value is inspect.Parameter.empty for value in parameters.values()):
-                return dict(zip(self.inputs, args, strict=True)), parameters
+                return _taken_apart(zip(self._artifacts, args, strict=True)), parameters
         bound = self.signature.bind(*args, **kwargs)  # slower; says what is wrong
         bound.apply_defaults()
-        return {name: bound.arguments.pop(name) for name in self.inputs}, dict(bound.arguments)
+        given = [(name, bound.arguments.pop(name)) for name in self._artifacts]
+        return _taken_apart(given), dict(bound.arguments)
+
+    def run(self, inputs: Mapping[str, Any], parameters: Mapping[str, Any]) -> Any:
+        """Run the function; inputs: artifacts by the names of `inputs`."""
+        whole = {
+            name: kind(**{field.name: inputs[f"{name}.{field.name}"] for field in dataclasses.fields(kind)})
+            if _is_bundle(kind)
+            else inputs[name]
+            for name, kind in self._artifacts.items()
+        }
+        return self.function(**whole, **parameters)  # type: ignore[call-arg]
 
     @functools.cached_property
     def _defaults(self) -> dict[str, Any]:
@@ -92,15 +112,42 @@ class Task(Generic[P, R]):
 
     @functools.cached_property
     def _kinds(self) -> dict[str, Any]:
+        """The outermost type of each input, those of bundles one by one."""
+        return {name: typing.get_origin(hint) for name, hint in _hints_taken_apart(self._artifacts)}
+
+    @functools.cached_property
+    def _artifacts(self) -> dict[str, Any]:
+        """The types of the positional parameters by name."""
         hints = typing.get_type_hints(self.function)
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        return {
-            p.name: typing.get_origin(hints[p.name]) for p in self.signature.parameters.values() if p.kind in positional
-        }
+        return {p.name: hints[p.name] for p in self.signature.parameters.values() if p.kind in positional}
 
     @functools.cached_property
     def returns_list(self) -> bool:
         return typing.get_origin(typing.get_type_hints(self.function)["return"]) is tuple
+
+
+def _is_bundle(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Bundle)
+
+
+def _taken_apart(given: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Arguments by name, those in bundles by the names of their fields."""
+    apart: dict[str, Any] = {}
+    for name, value in given:
+        if isinstance(value, Bundle):
+            apart |= {f"{name}.{f.name}": getattr(value, f.name) for f in dataclasses.fields(value)}  # type: ignore[arg-type]
+        else:
+            apart[name] = value
+    return apart
+
+
+def _hints_taken_apart(hints: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
+    for name, hint in hints.items():
+        if _is_bundle(hint):
+            yield from ((f"{name}.{field}", kind) for field, kind in typing.get_type_hints(hint).items())
+        else:
+            yield name, hint
 
 
 def task(

@@ -11,6 +11,7 @@ Conventions (said once, used everywhere):
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,6 +76,14 @@ class DepthMap:
     """[h, w] z-depth in world units, 0 where unknown."""
     source: str
     """Where it came from: "sensor", "mvs" or "mono"."""
+
+
+@dataclass(frozen=True)
+class SceneUnit:
+    """The unit of length that plays the part of one metre in an average room."""
+
+    length: float
+    """In world units; 1.0 where these are metres."""
 
 
 @dataclass(frozen=True)
@@ -301,11 +310,11 @@ class InstanceMasks(PackedMasks):
     """Mean vote share, less what other labels contradict."""
     height: int
     width: int
-    view: Int32
-    """[V] ascending indices of the views in which it has a mask."""
+    views: tuple[str, ...]
+    """[V] names of the views in which it has a mask, in the order of the frames."""
     packed: UInt8
     """[V, ceil(H * W / 8)] one bit a pixel (`np.packbits`), exclusive between instances."""
-    prompted: UInt8
+    origin: UInt8
     """[V] where the mask came from: FOUND, PROMPTED, REFINED or DRAWN."""
     weak: bool
     """Seen in too few views to be reconstructed: kept as points only."""
@@ -353,12 +362,41 @@ class Descriptors:
     instance_id: int
     embedding: Float32
     """[D] unit length; zeros when no view showed the instance well enough."""
-    views: Int32
-    """[V] the views that went in."""
+    views: tuple[str, ...]
+    """[V] names of the views that went in."""
     weights: Float32
     """[V] visible area of the instance in each of them, in pixels."""
     encoder: str
     """Name of the text-image encoder."""
+
+
+@dataclass(frozen=True)
+class Appearances:
+    """Which views show which instances: what the steps for one instance depend on."""
+
+    instance_id: Int32
+    """[I] ascending."""
+    first: Int32
+    """[I + 1] where the views of each instance begin in `view`."""
+    view: Int32
+    """[A] rows of the scene's views, ascending for each instance."""
+
+    def views(self, row: int) -> list[int]:
+        """The views that show the instance of this row."""
+        rows: list[int] = self.view[self.first[row] : self.first[row + 1]].tolist()
+        return rows
+
+    def of(self, ids: Int32) -> list[int]:
+        """The views that show any of these instances, ascending."""
+        return sorted(
+            {view for row in np.flatnonzero(np.isin(self.instance_id, ids)).tolist() for view in self.views(row)}
+        )
+
+    @classmethod
+    def listed(cls, instance_id: Int32, views: Sequence[Sequence[int]]) -> Appearances:
+        """views: of each instance, ascending."""
+        first = np.append(0, np.cumsum([len(of_one) for of_one in views])).astype(np.int32)
+        return cls(instance_id, first, np.array([view for of_one in views for view in of_one], np.int32))
 
 
 @dataclass(frozen=True)

@@ -54,12 +54,10 @@ class Context:
     view: int
     points: PointCloud | None
 
-    def photo(self, height: int, width: int, view: int | None = None) -> UInt8 | None:
-        """The photo behind a picture of this size; None where there is none of this size."""
-        if view is None:
-            frame = self.frame
-        else:
-            frame = self.frames[view] if view < len(self.frames) else self.frame if view == self.view else None
+    def photo(self, height: int, width: int, name: str | None = None) -> UInt8 | None:
+        """The photo behind a picture of this size, of the view of this name; None where there is none of this size."""
+        known = (*self.frames, *((self.frame,) if self.frame else ()))
+        frame = self.frame if name is None else next((frame for frame in known if frame.name == name), None)
         return decode_rgb(frame) if frame is not None and (frame.height, frame.width) == (height, width) else None
 
     def camera(self, points: Float32) -> Camera:
@@ -162,10 +160,9 @@ def _(value: InstanceMasks, context: Context) -> UInt8:
     masks = value.dense()
     for row in np.sort(order):
         ids = np.where(masks[row], value.instance_id, 0)
-        view = int(value.view[row])
-        pictures.append(paint_ids(ids, context.photo(value.height, value.width, view), 0.45))
-        name = context.frames[view].name if view < len(context.frames) else f"view {view}"
-        captions.append(name + _ORIGINS[int(value.prompted[row])])
+        name = value.views[row]
+        pictures.append(paint_ids(ids, context.photo(value.height, value.width, name), 0.45))
+        captions.append(name + _ORIGINS[int(value.origin[row])])
     if pictures:
         return contact_sheet(pictures, captions)
     if len(value.points):
@@ -275,7 +272,7 @@ def _(value: Descriptors, context: Context) -> UInt8:
     if value.encoder != ColourWords.name:
         rows = [("dimensions", str(len(value.embedding))), ("length", f"{np.linalg.norm(value.embedding):.3f}")]
         seen = zip(value.views, value.weights, strict=True)
-        return table_picture(title, [*rows, *((f"view {view}", f"{area:.0f} px") for view, area in seen)])
+        return table_picture(title, [*rows, *((view, f"{area:.0f} px") for view, area in seen)])
     figure = blank(800, 420)
     axes = figure.add_axes((0.12, 0.1, 0.84, 0.76))
     colors = [_TERM_COLORS.get(term, term) for term in TERMS]

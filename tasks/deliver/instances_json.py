@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Float32, Frame, Gaussians, Hierarchy, InstanceMasks
+from ss_flow.tasks.artifacts import Float32, Gaussians, Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.semantics.name import InstanceNames
@@ -20,14 +20,13 @@ def instances_document(
     instances: Sequence[InstanceMasks],
     gaussians: Gaussians | None,
     names: InstanceNames | None,
-    frames: Sequence[Frame],
     tree: Hierarchy | None = None,
 ) -> dict[str, Any]:
     """The content of instances.json, ready for `json.dumps`.
 
     instances: after Split or refinement; the background (id 0) is left out. gaussians: the whole scene; without them an
     instance has no Gaussians and its box is that of its points. names: without them, or where they know nothing, an
-    instance is "object 7" by its id. frames: of all views, in the scene's order. tree: what the instances are parts of
+    instance is "object 7" by its id. tree: what the instances are parts of
     and which are stuff; without it, all are things on their own.
 
     Each instance has: id, name, named_by (the encoder, "hints" for a name of the user's own, or null), kind ("thing" or
@@ -56,7 +55,7 @@ def instances_document(
             "parent": parents.get(instance.instance_id),
             "parts": _parts(instance),
             **_place(places),
-            "views": [frames[view].name for view in instance.view],
+            "views": list(instance.views),
             "confidence": round(float(instance.confidence), 4),
             "num_parts": int(instance.point_part.max(initial=0)),
             "num_points": len(instance.points),
@@ -118,7 +117,7 @@ def _parts(instance: InstanceMasks) -> list[dict[str, Any]]:
 
 
 def _is_crumb(instance: InstanceMasks) -> bool:
-    pixels = instance.height * instance.width * len(instance.view)
+    pixels = instance.height * instance.width * len(instance.views)
     return instance.weak or int(np.bitwise_count(instance.packed).sum()) < _CRUMB * pixels
 
 

@@ -93,9 +93,9 @@ def oracle_ious(frame: LabelledFrame, ids: Labels, candidates: Mapping[str, froz
     scores = []
     for category, target in oracle_targets(frame):
         free = sorted(candidates.get(category, frozenset()) & present)
-        iou = {i: iou(ids == i, target) for i in free}
-        chosen = max(free, key=iou.__getitem__, default=None)
-        scores.append(0.0 if chosen is None else iou[chosen])
+        fit = {i: iou(ids == i, target) for i in free}
+        chosen = max(free, key=fit.__getitem__, default=None)
+        scores.append(0.0 if chosen is None else fit[chosen])
         present.discard(-1 if chosen is None else chosen)
     return scores
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, Int32
-from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view
+from ss_flow.task import Bundle
+from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Float64, Frame, Int32, SceneUnit
+from ss_flow.tasks.geometry.cameras import Camera, pixels_in_view
+from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
-from ss_flow.tasks.geometry.units import scene_unit
+from ss_flow.tasks.geometry.visibility import VisibilityParams, surface_points
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 from ss_flow.tasks.ranges import Count, Natural
 
@@ -39,36 +42,46 @@ class TrainView:
 
 
 @dataclass(frozen=True)
-class SceneViews:
-    """The photos of a scene with their cameras and depths, all in one order."""
+class Views(Bundle):
+    """Views of a scene, all or some, in the order of their frames."""
 
-    frames: tuple[Frame, ...]
-    cameras: Cameras
-    depths: tuple[DepthMap, ...]
-    tau: float
-    """How far two depths of one surface may differ, world units."""
-    tau_relative: float
-    """The same as a fraction of the depth; the larger of the two counts."""
+    frames: Sequence[Frame]
+    cameras: Sequence[Camera]
+    depths: Sequence[DepthMap]
+    unit: SceneUnit
 
-    def surface_rows(self, view: int, points: Float32) -> tuple[Int32, Int32, Int32, Float32]:
-        """The points that a view really sees (Split&Splat, Eq. 1-2): rows of `points`, pixel columns, pixel rows, and
-        z-depths."""
-        camera = camera_of(self.cameras, view)
-        rows, column, row, z = pixels_in_view(points, camera)
-        measured = depth_at(self.depths[view], column, row, camera.width, camera.height)
-        seen = (measured > 0) & (np.abs(measured - z) < np.maximum(self.tau, self.tau_relative * z))
-        return rows[seen], column[seen], row[seen], z[seen].astype(np.float32)
+    def compared(self, visibility: VisibilityParams) -> SceneViews:
+        """The same with what tells whether two depths are of one surface."""
+        return SceneViews(self.frames, self.cameras, self.depths, self.unit, visibility)
 
 
-def scene_views(
-    frames: tuple[Frame, ...],
-    cameras: Cameras,
-    depths: tuple[DepthMap, ...],
-    tau_depth: float,
-    tau_relative: float,
-) -> SceneViews:
-    """The views of a scene, with the depth tolerance in world units (tau_depth is in scene units, spec 3.0)."""
-    return SceneViews(frames, cameras, depths, tau_depth * scene_unit(cameras, depths), tau_relative)
+@dataclass(frozen=True)
+class SceneViews(Views):
+    """Views of a scene, and when two depths are of one surface."""
+
+    visibility: VisibilityParams
+
+    def tolerance(self, depth: Float32) -> Float32:
+        """How far two depths of one surface may differ, world units."""
+        return np.asarray(self.visibility.tolerance(depth, self.unit.length), np.float32)
+
+    def surface_points(self, view: int, points: Float32) -> tuple[Int32, Int32, Int32, Float64]:
+        """The points [N, 3] that a view sees (Split&Splat, Eq. 1-2), as `surface_points` gives them."""
+        return surface_points(points, self.cameras[view], self.depths[view], self.visibility, self.unit.length)
+
+
+@dataclass(frozen=True)
+class PointSurface:
+    """The surface of what is trained, as points."""
+
+    points: Float32
+    """[N, 3] world."""
+    spacing: float
+    """Median distance to the nearest neighbour, world units."""
+
+    @classmethod
+    def of(cls, points: Float32) -> PointSurface:
+        return cls(points, nearest_spacing(points) if len(points) > 1 else 0.0)
 
 
 @dataclass(frozen=True)
@@ -141,44 +154,105 @@ def crop_camera(full: Camera, inside: Bool, points: Float32 | Float64, params: C
     return cropped.scaled(max(1, round(cropped.width * scale)), max(1, round(cropped.height * scale)))
 
 
-def training_view(
+def instance_view(
+    scene: SceneViews, view: int, mask: Bool, surface: PointSurface, *, crop: CropParams, ignore_occluded: bool = True
+) -> TrainView:
+    """One view of a single instance (spec P1). mask: [H, W]. The rest as for `group_view`."""
+    channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
+    return group_view(scene, view, channels, surface, crop=crop, ignore_occluded=ignore_occluded)
+
+
+def group_view(
     scene: SceneViews,
     view: int,
     channels: Int32,
-    points: Float32,
-    spacing: float,
+    surface: PointSurface,
     *,
     crop: CropParams,
     ignore_occluded: bool = True,
-    fills_scene: bool = False,
-    with_ids: bool = False,
     around: Float32 | None = None,
 ) -> TrainView:
-    """One view of a group of instances (spec P1).
+    """One view of a group of instances (spec P1, P4).
 
     Pixels are *inside* a mask of the group (colour counts), *free* (nothing of the group may be seen), or ignored:
     where something lies in front of the group's surface, where a depth needed to tell is unknown, or where the frame
     is masked out.
 
-    channels: [H, W] index of the group's instance at each pixel, -2 where there is none, -1 where the pixel says
-    nothing. around: [M, 3] the part of the group that the crop shows, in place of all of it. points: [N, 3] the group's
-    surface, `spacing` apart. ignore_occluded: False calls every pixel outside the masks free, as in the paper.
-    fills_scene: the group is the background, which goes on unseen behind all else: only pixels that look through its
-    surface are free.
+    channels: [H, W] index of the group's instance at each pixel, NONE_OF_MINE where there is none, IGNORED where the
+    pixel says nothing. surface: of the group. around: [M, 3] the part of the group that the crop shows, in place of all
+    of it. ignore_occluded: False calls every pixel outside the masks free, as in the paper.
     Raises InputError when the frame's size is not that of the masks.
     """
+    seen = _crop(scene, view, channels, crop, surface.points if around is None else around, masks=around is None)
+    free = seen.outside
+    if ignore_occluded:
+        depth = propagated_depth(surface.points, seen.camera, surface.spacing)
+        in_front = (depth > 0) & ((seen.depth == 0) | (seen.depth + scene.tolerance(depth) < depth))
+        free &= ~in_front
+    return seen.training(free)
+
+
+def background_view(
+    scene: SceneViews, view: int, mask: Bool, surface: PointSurface, *, crop: CropParams, ignore_occluded: bool = True
+) -> TrainView:
+    """One view of the background, which goes on unseen behind all else: only pixels that look through it are free.
+
+    mask: [H, W]. The rest as for `group_view`.
+    """
+    channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
+    seen = _crop(scene, view, channels, crop, surface.points)
+    free = seen.outside
+    if ignore_occluded:
+        depth = propagated_depth(surface.points, seen.camera, surface.spacing)
+        free &= (depth > 0) & (seen.depth > 0) & (seen.depth > depth + scene.tolerance(depth))
+    return seen.training(free)
+
+
+def whole_view(scene: SceneViews, view: int, channels: Int32, max_side: int) -> TrainView:
+    """One view of the whole scene: the entire photo, of which every valid pixel outside the masks is free.
+
+    channels: as for `group_view`. max_side: longest side, pixels; larger photos are scaled down.
+    """
+    everything = CropParams(margin_px=max(channels.shape), max_side=max_side)
+    seen = _crop(scene, view, channels, everything, np.zeros((0, 3), np.float32))
+    return seen.training(seen.outside)
+
+
+@dataclass(frozen=True)
+class _Crop:
+    """A part of a view, at the size at which it is trained on."""
+
+    camera: Camera
+    image: Float32
+    """[h, w, 3] RGB, 0..1."""
+    inside: Bool
+    """[h, w] valid pixels of the masks."""
+    outside: Bool
+    """[h, w] valid pixels of no mask that say something."""
+    channels: Int32
+    """[h, w]."""
+    depth: Float32
+    """[h, w] z-depth, world units, 0 = unknown."""
+
+    def training(self, free: Bool) -> TrainView:
+        ids = np.where(self.inside, self.channels, np.where(free, NONE_OF_MINE, IGNORED)).astype(np.int32)
+        depth = np.where(self.inside, self.depth, 0).astype(np.float32)
+        return TrainView(self.camera, self.image, self.inside, free, depth, ids)
+
+
+def _crop(
+    scene: SceneViews, view: int, channels: Int32, crop: CropParams, points: Float32, *, masks: bool = True
+) -> _Crop:
+    """The part of a view around points and, if so asked, the masks."""
     import cv2
 
-    frame, full = scene.frames[view], camera_of(scene.cameras, view)
+    frame, full = scene.frames[view], scene.cameras[view]
     if channels.shape != (frame.height, frame.width):
         raise InputError(
             f"Frame {frame.name} is {frame.width} x {frame.height} pixels and its masks are "
             f"{channels.shape[1]} x {channels.shape[0]}; both must have one size."
         )
-    if around is None:
-        camera = crop_camera(full, channels >= 0, points, crop)
-    else:
-        camera = crop_camera(full, np.zeros(channels.shape, bool), around, crop)
+    camera = crop_camera(full, channels >= 0 if masks else np.zeros(channels.shape, bool), points, crop)
     column, row = _pixels_of_crop(full, camera)
     x0, y0, width, height = _box(full, camera)
     photo = decode_rgb(frame)[y0 : y0 + height, x0 : x0 + width]
@@ -186,25 +260,13 @@ def training_view(
         photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     valid = decode_valid(frame)[np.ix_(row, column)]
     ids = channels[np.ix_(row, column)]
-    depth = sample_depth(scene.depths[view], full, camera)
-
-    inside = (ids >= 0) & valid
-    free = ~inside & valid & (ids != IGNORED)
-    if ignore_occluded:
-        surface = propagated_depth(points, camera, spacing)
-        tolerance = np.maximum(scene.tau, scene.tau_relative * surface)
-        known = (surface > 0) & (depth > 0)
-        if fills_scene:
-            free &= known & (depth > surface + tolerance)
-        else:
-            free &= (surface == 0) | (known & (depth + tolerance >= surface))
-    return TrainView(
+    return _Crop(
         camera=camera,
         image=photo.astype(np.float32) / np.float32(255),
-        inside=inside,
-        free=free,
-        depth=np.where(inside, depth, 0).astype(np.float32),
-        ids=np.where(inside, ids, np.where(free, NONE_OF_MINE, IGNORED)).astype(np.int32) if with_ids else None,
+        inside=(ids >= 0) & valid,
+        outside=(ids < 0) & (ids != IGNORED) & valid,
+        channels=ids,
+        depth=sample_depth(scene.depths[view], full, camera),
     )
 
 

@@ -47,6 +47,11 @@ def camera_of(cameras: Cameras, view: int) -> Camera:
     return Camera(width, height, fx, fy, cx, cy, cameras.world_to_camera[view])
 
 
+def cameras_by_view(cameras: Cameras) -> tuple[Camera, ...]:
+    """The cameras of all views, one by one."""
+    return tuple(camera_of(cameras, view) for view in range(len(cameras)))
+
+
 def project(points: Float32 | Float64, camera: Camera) -> tuple[Float64, Float64]:
     """Project world points (Split&Splat, Pi_k).
 

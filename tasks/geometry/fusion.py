@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Int32
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
+from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
 _CELLS = 1 << 21
 """Voxels a side that fit the 63-bit code of a voxel; farther points wrap around, which needs 40 km at 2 cm."""
@@ -83,3 +84,16 @@ def consistent_points(
         seen[rows] += known & (measured > z - tolerance)
         confirmed[rows] += known & (np.abs(measured - z) < tolerance)
     return confirmed >= np.clip(seen, 1, min_views)
+
+
+def with_sparse_points(cameras: Cameras, depths: tuple[DepthMap, ...]) -> tuple[DepthMap, ...]:
+    """The depth maps, with the sparse points that fall on pixels of unknown depth."""
+    maps = []
+    for view, known in enumerate(depths):
+        height, width = known.depth.shape
+        camera = camera_of(cameras, view).scaled(width, height)
+        _, column, row, z = pixels_in_view(cameras.sparse_points, camera)
+        front = nearest_per_pixel(row * width + column, z, height * width)
+        sparse = np.append(z, 0.0)[front].reshape(height, width)  # -1, no point there, takes the 0
+        maps.append(replace(known, depth=np.where(known.depth > 0, known.depth, sparse).astype(np.float32)))
+    return tuple(maps)

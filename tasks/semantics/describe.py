@@ -50,18 +50,19 @@ def describe(
 ) -> Descriptors:
     """The mean of an instance's pictures, as unit vectors weighted by visible area, brought back to unit length.
 
-    frames: all views of the scene, in the order that `instance.view` counts. encoder: None for colour words.
+    frames: at least those with a mask of the instance. encoder: None for colour words.
     Returns zeros and no views when no mask covers `min_area` of its image.
     Raises InputError when a frame's size is not that of the masks.
     """
     model = encoder_of(encoder)
+    by_name = {frame.name: i for i, frame in enumerate(frames)}
     masks = instance.dense()
     area = masks.sum(axis=(1, 2))
     large = np.argsort(-area, kind="stable")[: params.max_views]
     chosen = np.sort(large[area[large] >= max(1, params.min_area * instance.height * instance.width)])
     vectors = []
     for done, row in enumerate(chosen):
-        frame = frames[instance.view[row]]
+        frame = frames[by_name[instance.views[row]]]
         if (frame.height, frame.width) != (instance.height, instance.width):
             raise InputError(
                 f"Frame {frame.name} is {frame.width} x {frame.height} pixels and the masks of instance "
@@ -79,7 +80,9 @@ def describe(
     total = np.einsum("v,vd->d", weights, np.array(vectors, np.float32).reshape(len(chosen), model.dimension))
     length = np.linalg.norm(total)
     embedding = (total / length if length > 0 else total).astype(np.float32)
-    return Descriptors(instance.instance_id, embedding, instance.view[chosen].astype(np.int32), weights, model.name)
+    return Descriptors(
+        instance.instance_id, embedding, tuple(instance.views[row] for row in chosen), weights, model.name
+    )
 
 
 def crop(image: UInt8, mask: Bool, params: DescribeParams) -> UInt8:

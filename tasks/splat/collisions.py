@@ -32,6 +32,15 @@ class MergePlan:
     """w_mask of this round."""
     collisions: Float32
     """[G, G] the collision matrix C of all groups."""
+    first: Int32
+    """[P + 1] where the views of each pair begin in `view`."""
+    view: Int32
+    """[A] rows of the scene's views, those that show any instance of a pair, ascending for each pair."""
+
+    def views(self, pair: int) -> list[int]:
+        """The views that show any instance of a pair."""
+        rows: list[int] = self.view[self.first[pair] : self.first[pair + 1]].tolist()
+        return rows
 
 
 def group_box(gaussians: Gaussians, *, min_opacity: float, quantile: float) -> Float64:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, Gaussians, Int32, LabelMap
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, extents, select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
@@ -19,13 +19,15 @@ from ss_flow.tasks.gaussians.views import (
     IGNORED,
     NONE_OF_MINE,
     CropParams,
+    PointSurface,
     SceneViews,
     TrainView,
-    scene_views,
-    training_view,
+    Views,
+    group_view,
+    whole_view,
 )
-from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
-from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.geometry.cameras import pixels_in_view
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import group_box
 
@@ -99,17 +101,14 @@ class Quality:
     environment=backend_identity,
 )
 def merge_pair(
-    frames: tuple[Frame, ...],
-    cameras: Cameras,
-    depths: tuple[DepthMap, ...],
+    views: Views,
     a: Gaussians,
     b: Gaussians,
     masks: tuple[LabelMap, ...],
     *,
     params: MergeParams,
     w_mask: float,
-    tau_depth: float = 0.02,
-    tau_relative: float = 0.0,
+    visibility: VisibilityParams = VisibilityParams(),
 ) -> Gaussians:
     """Two groups as one, refined together where they collide (Split&Splat, Eqs. of l and l_mask).
 
@@ -119,7 +118,8 @@ def merge_pair(
     The loss is l_RGB + w_mask * l_mask with the masks of those instances composited jointly (spec A25, A26). When
     refinement makes masks or colours worse than `params` allows, the plain union comes back, with a warning (spec P4).
 
-    masks: exclusive label maps of all views, in the order of `cameras`. The order of a and b does not matter.
+    views: at least those that show an instance of a or b; masks: their exclusive label maps. The order of a and b does
+    not matter.
     """
     parts = sorted((part for part in (a, b) if len(part)), key=lambda part: int(part.instance_id.min()))
     if len(parts) < 2:
@@ -130,15 +130,14 @@ def merge_pair(
     near = np.isin(union.instance_id, union.instance_id[reach])
     colliding, reach = select(union, near), reach[near]
     ids = np.unique(colliding.instance_id)
-    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
-    views = _views(
-        scene, masks, ids, _surface(colliding), params, others=union.instance_id, around=colliding.means[reach]
+    seen = _group_views(
+        views.compared(visibility), masks, ids, colliding, params, others=union.instance_id, around=reach
     )
-    if not views:
+    if not seen:
         return union
     started = _faded(colliding, reach) if params.reset_opacity else colliding
     settings = TrainParams(
-        iterations=params.iterations(len(views)),
+        iterations=params.iterations(len(seen)),
         sh_degree=params.sh_degree,
         background=params.background,
         densify="none",
@@ -150,14 +149,14 @@ def merge_pair(
     )
     trained = train(
         started,
-        views,
+        seen,
         params=settings,
         extent=extents(colliding),
         seed=int(ids[0]),
         label_ids=ids.tolist(),
     ).gaussians
-    refined = select(trained, ~reach | _shows(trained, views, params))
-    merged = _guarded(colliding, refined, views, ids, params)
+    refined = select(trained, ~reach | _shows(trained, seen, params))
+    merged = _guarded(colliding, refined, seen, ids, params)
     return concatenate([select(union, ~near), merged]) if not near.all() else merged
 
 
@@ -168,7 +167,7 @@ def collision_box(group: Gaussians, margin: float) -> Float64:
     return np.array([low - wider, high + wider])
 
 
-def _surface(gaussians: Gaussians) -> Float32:
+def _solid_centres(gaussians: Gaussians) -> Float32:
     """Centres of the Gaussians that are not faint; of all where hardly any is left."""
     solid = gaussians.means[gaussians.opacity_logits >= np.log(0.1 / 0.9)]
     return solid if len(solid) > 1 else gaussians.means
@@ -206,9 +205,7 @@ def assemble(groups: tuple[Gaussians, ...]) -> Gaussians:
     environment=backend_identity,
 )
 def global_pass(
-    frames: tuple[Frame, ...],
-    cameras: Cameras,
-    depths: tuple[DepthMap, ...],
+    views: Views,
     scene: Gaussians,
     masks: tuple[LabelMap, ...],
     *,
@@ -222,7 +219,7 @@ def global_pass(
     if not len(scene) or not params.global_iterations:
         return scene
     ids = np.unique(scene.instance_id)
-    views = _views(scene_views(frames, cameras, depths, 0.0, 0.0), masks, ids, scene.means, params, whole=True)
+    seen = _whole_views(views.compared(VisibilityParams()), masks, ids, params.crop.max_side)
     settings = TrainParams(
         iterations=params.global_iterations,
         sh_degree=params.sh_degree,
@@ -236,13 +233,13 @@ def global_pass(
     )
     refined = train(
         scene,
-        views,
+        seen,
         params=settings,
         extent=extents(scene),
         seed=0,
         label_ids=ids.tolist(),
     ).gaussians
-    return _guarded(scene, refined, views, ids, params)
+    return _guarded(scene, refined, seen, ids, params)
 
 
 def quality(gaussians: Gaussians, views: Sequence[TrainView], ids: Int32) -> Quality:
@@ -262,48 +259,49 @@ def quality(gaussians: Gaussians, views: Sequence[TrainView], ids: Int32) -> Qua
     return Quality(float(np.mean(overlaps)) if overlaps else 1.0, -10 * float(np.log10(mse)))
 
 
-def _views(
+def _group_views(
     scene: SceneViews,
-    masks: tuple[LabelMap, ...],
+    masks: Sequence[LabelMap],
     ids: Int32,
-    surface: np.ndarray,
+    group: Gaussians,
     params: MergeParams,
     *,
-    others: Int32 | None = None,
-    around: Float32 | None = None,
-    whole: bool = False,
+    others: Int32,
+    around: Bool,
 ) -> list[TrainView]:
-    """The views that see any of the instances.
+    """The views that see any of a group's Gaussians that collide.
 
-    others: ids of instances that are not trained, whose pixels say nothing. around: [N, 3] what the crops show, where
-    that is not all of the instances. whole: the entire photos, in which no pixel is without an instance.
+    ids: its instances. others: ids of instances that are not trained, whose pixels say nothing. around: [N] the
+    Gaussians that collide, which the crops show.
     """
-    # On whole photos, what has no Gaussians of its own can only be explained by the background.
-    rest = 0 if whole and ids[0] == 0 else NONE_OF_MINE
-    channel_of = np.full(np.iinfo(np.uint16).max + 1, rest, np.int32)
-    if others is not None:
-        channel_of[others] = IGNORED
-    channel_of[ids] = np.arange(len(ids))
-    spacing = nearest_spacing(surface)
-    crop = replace(params.crop, margin_px=int(scene.cameras.sizes.max())) if whole else params.crop
+    surface, shown = PointSurface.of(_solid_centres(group)), group.means[around]
     views = []
-    for view, label_map in enumerate(masks):
-        channels = channel_of[label_map.ids]
-        in_sight = around is None or len(pixels_in_view(around, camera_of(scene.cameras, view))[0]) > 0
-        if in_sight and (channels >= 0).any():
-            built = training_view(
-                scene,
-                view,
-                channels,
-                surface,
-                spacing,
-                crop=crop,
-                ignore_occluded=params.ignore_occluded and not whole,
-                with_ids=True,
-                around=around,
-            )
-            views.append(built)
+    for view, channels in enumerate(_channels(masks, ids, NONE_OF_MINE, others)):
+        if (channels >= 0).any() and len(pixels_in_view(shown, scene.cameras[view])[0]):
+            views.append(
+                group_view(
+                    scene, view, channels, surface,
+                    crop=params.crop, ignore_occluded=params.ignore_occluded, around=shown,
+                )
+            )  # fmt: skip
     return [view for view in views if view.inside.any()]
+
+
+def _whole_views(scene: SceneViews, masks: Sequence[LabelMap], ids: Int32, max_side: int) -> list[TrainView]:
+    """The entire photos that show any of the instances."""
+    # What has no Gaussians of its own can only be explained by the background.
+    rest = 0 if ids[0] == 0 else NONE_OF_MINE
+    channels = _channels(masks, ids, rest, np.zeros(0, np.int32))
+    views = [whole_view(scene, view, c, max_side) for view, c in enumerate(channels) if (c >= 0).any()]
+    return [view for view in views if view.inside.any()]
+
+
+def _channels(masks: Sequence[LabelMap], ids: Int32, rest: int, others: Int32) -> Iterator[Int32]:
+    """[H, W] of each view: the place in `ids` of the instance at a pixel, IGNORED for `others`, else `rest`."""
+    channel_of = np.full(np.iinfo(np.uint16).max + 1, rest, np.int32)
+    channel_of[others] = IGNORED
+    channel_of[ids] = np.arange(len(ids))
+    return (channel_of[label_map.ids] for label_map in masks)
 
 
 def _guarded(before: Gaussians, after: Gaussians, views: list[TrainView], ids: Int32, params: MergeParams) -> Gaussians:

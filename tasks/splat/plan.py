@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Float64, Gaussians
+from ss_flow.tasks.artifacts import Appearances, Float64, Gaussians
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.ranges import Fraction, NonNegative, Positive, Range
 from ss_flow.tasks.splat.collisions import MergePlan, collision_matrix, group_box, match_pairs, voxel_collisions
@@ -37,10 +37,11 @@ class PlanParams:
 
 
 @task()
-def plan(groups: tuple[Gaussians, ...], *, params: PlanParams, round: int) -> MergePlan:
+def plan(groups: tuple[Gaussians, ...], shown: Appearances, *, params: PlanParams, round: int) -> MergePlan:
     """The pairs of groups that are merged in a round, and the weight of the mask loss for them.
 
-    groups: the instances, or what earlier rounds made of them, in any order. round: from 0. The background (instance 0)
+    groups: the instances, or what earlier rounds made of them, in any order. shown: the views of each instance. round:
+    from 0. The background (instance 0)
     reaches everywhere; it stays by itself until the pass over the whole scene. Merging is over when the plan has no
     pairs.
     """
@@ -55,12 +56,15 @@ def plan(groups: tuple[Gaussians, ...], *, params: PlanParams, round: int) -> Me
     pairs, scores = match_pairs(
         collisions, sizes, ids, min_score=params.min_score, collision_free=params.pairing == "collision_free"
     )
+    views = [shown.of(np.concatenate([groups[a].instance_id, groups[b].instance_id])) for a, b in pairs]
     return MergePlan(
         pairs=pairs,
         scores=scores.astype(np.float32),
         singles=np.setdiff1d(np.arange(len(groups)), pairs).astype(np.int32),
         mask_weight=params.mask_weights[min(round, len(params.mask_weights) - 1)],
         collisions=collisions.astype(np.float32),
+        first=np.append(0, np.cumsum([len(rows) for rows in views])).astype(np.int32),
+        view=np.array([view for rows in views for view in rows], np.int32),
     )
 
 

@@ -9,14 +9,14 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import REFINED, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks, Int32
+from ss_flow.tasks.artifacts import REFINED, Float32, Gaussians, InstanceMasks, Int32
 from ss_flow.tasks.gaussians.densification import Schedule
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, initialise
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
-from ss_flow.tasks.gaussians.views import NONE_OF_MINE, CropParams, SceneViews, scene_views, training_view
-from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.gaussians.views import CropParams, PointSurface, SceneViews, Views, background_view, instance_view
 from ss_flow.tasks.geometry.shape import box_diagonal
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import dilated
 from ss_flow.tasks.ranges import Count, HarmonicsDegree, Natural, NonNegative, Positive
 
@@ -68,7 +68,7 @@ class ReconstructParams:
 
     def iterations(self, instance: InstanceMasks) -> int:
         """Training steps for an instance, by the number of its views (spec row 22)."""
-        wanted = self.iterations_per_view * len(instance.view)
+        wanted = self.iterations_per_view * len(instance.views)
         return round(self.scale_of(instance) * float(np.clip(wanted, self.min_iterations, self.max_iterations)))
 
     def scale_of(self, instance: InstanceMasks) -> float:
@@ -83,30 +83,27 @@ class ReconstructParams:
     environment=backend_identity,
 )
 def reconstruct(
-    frames: tuple[Frame, ...],
-    cameras: Cameras,
-    depths: tuple[DepthMap, ...],
+    views: Views,
     instance: InstanceMasks,
     *,
     params: ReconstructParams,
-    tau_depth: float = 0.02,
-    tau_relative: float = 0.0,
+    visibility: VisibilityParams = VisibilityParams(),
 ) -> Gaussians:
     """Gaussians of one instance, or of the background (id 0), from its own pixels alone (spec P1, A28).
 
     Training starts from the labelled points and sees, in the views that have a mask, the three kinds of pixels that
-    `training_view` tells apart. A weak instance, and one without masks or points, gives no Gaussians: it is kept as
+    `group_view` tells apart. A weak instance, and one without masks or points, gives no Gaussians: it is kept as
     points alone (spec row 21), and the last pass over the whole scene lets the background fill its place.
 
-    frames, depths: all views of the scene, in the order of `cameras`. tau_depth: in scene units; tau_relative: as a
-    fraction of the depth; the larger of the two says when one surface is in front of another.
+    views: at least those that have a mask. visibility: when one surface is in front of another.
     Raises InputError when a frame's size is not that of the masks.
     """
-    if instance.weak or not len(instance.points) or not len(instance.view):
+    if instance.weak or not len(instance.points) or not instance.views:
         return NO_GAUSSIANS
     initial = _from_points(instance, params)
-    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
-    return _trained(scene, dilated(instance, params.dilation), initial, params, params.iterations(instance))
+    return _trained(
+        views.compared(visibility), dilated(instance, params.dilation), initial, params, params.iterations(instance)
+    )
 
 
 @task(
@@ -116,28 +113,24 @@ def reconstruct(
     environment=backend_identity,
 )
 def retrain(
-    frames: tuple[Frame, ...],
-    cameras: Cameras,
-    depths: tuple[DepthMap, ...],
+    views: Views,
     instance: InstanceMasks,
     gaussians: Gaussians,
     *,
     params: ReconstructParams,
-    tau_depth: float = 0.02,
-    tau_relative: float = 0.0,
+    visibility: VisibilityParams = VisibilityParams(),
 ) -> Gaussians:
     """The Gaussians of an instance after its masks were refined (spec row 31).
 
     instance: with the refined masks. gaussians: of the first training; they come back as they are where refinement
     changed no mask. The rest as for `reconstruct`.
     """
-    unchanged = not (instance.prompted == REFINED).any()
-    if unchanged or instance.weak or not len(instance.points) or not len(instance.view):
+    unchanged = not (instance.origin == REFINED).any()
+    if unchanged or instance.weak or not len(instance.points) or not instance.views:
         return gaussians
     initial = gaussians if params.warm_start and len(gaussians) else _from_points(instance, params)
-    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
     steps = max(1, round(params.retrain_share * params.iterations(instance)))
-    return _trained(scene, instance, initial, params, steps)
+    return _trained(views.compared(visibility), instance, initial, params, steps)
 
 
 def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussians:
@@ -168,21 +161,12 @@ def thin(points: Float32, limit: int) -> Int32:
 def _trained(
     scene: SceneViews, instance: InstanceMasks, initial: Gaussians, params: ReconstructParams, iterations: int
 ) -> Gaussians:
-    fills_scene = instance.instance_id == 0
-    surface = instance.points
-    spacing = nearest_spacing(surface) if len(surface) > 1 else 0.0
+    surface = PointSurface.of(instance.points)
+    build = background_view if instance.instance_id == 0 else instance_view
+    row = {frame.name: i for i, frame in enumerate(scene.frames)}
     views = [
-        training_view(
-            scene,
-            int(view),
-            np.where(instance.mask(row), 0, NONE_OF_MINE).astype(np.int32),
-            surface,
-            spacing,
-            crop=params.crop,
-            ignore_occluded=params.ignore_occluded,
-            fills_scene=fills_scene,
-        )
-        for row, view in enumerate(instance.view)
+        build(scene, row[name], mask, surface, crop=params.crop, ignore_occluded=params.ignore_occluded)
+        for name, mask in zip(instance.views, instance.dense(), strict=True)
     ]
     views = [view for view in views if view.inside.any()]
     if not views:
@@ -191,7 +175,7 @@ def _trained(
         initial,
         views,
         params=_settings(params, iterations, params.scale_of(instance)),
-        extent=max(box_diagonal(surface), spacing),
+        extent=max(box_diagonal(surface.points), surface.spacing),
         seed=instance.instance_id,
     )
     if not len(result.gaussians):

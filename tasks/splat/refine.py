@@ -10,15 +10,16 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import DRAWN, REFINED, Bool, Cameras, DepthMap, Float32, Frame, Gaussians, InstanceMasks
+from ss_flow.tasks.artifacts import DRAWN, REFINED, Bool, Float32, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.views import CropParams, SceneViews, crop_camera, sample_depth, scene_views
-from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.gaussians.views import CropParams, SceneViews, Views, crop_camera, sample_depth
+from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.geometry.shape import box_diagonal
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.masks.packing import grown
 from ss_flow.tasks.models.catalogue import Model
@@ -82,17 +83,14 @@ class RenderedMask:
     environment=backend_identity,
 )
 def refine(
-    frames: tuple[Frame, ...],
-    cameras: Cameras,
-    depths: tuple[DepthMap, ...],
+    views: Views,
     instance: InstanceMasks,
     gaussians: Gaussians,
     embeddings: tuple[Embedding, ...],
     *,
     params: RefineParams,
     model: Model | None = None,
-    tau_depth: float = 0.02,
-    tau_relative: float = 0.0,
+    visibility: VisibilityParams = VisibilityParams(),
 ) -> InstanceMasks:
     """The refined masks of one instance (Split&Splat, M^_{k,l}); they may overlap those of other instances.
 
@@ -102,40 +100,41 @@ def refine(
     came from the photo, whose borders are finer than the Gaussians'. Where the view has none, the segmenter's is added
     when its IoU with M^gs exceeds `tau_iou`.
 
-    model: the segmenter; embeddings: its embeddings of all views, none without a segmenter. Without one (None) no mask
-    is replaced; where one is missing, M^gs itself is taken when the view's depth confirms at least `min_support` of it.
-    New masks are marked as REFINED in `prompted`. The background (id 0) and an
-    instance without Gaussians come back as they are.
+    views: at least those that see the instance, or have a mask of it. model: the segmenter; embeddings: of these views,
+    none without a segmenter. Without one (None) no mask is replaced; where one is missing, M^gs itself is taken when
+    the view's depth confirms at least `min_support` of it. New masks are marked as REFINED in `origin`. The
+    background (id 0) and an instance without Gaussians come back as they are.
     """
     if instance.instance_id == 0 or not len(gaussians):
         return instance
-    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
+    scene = views.compared(visibility)
     solid = _solid(gaussians, params)
     segmenter = Sam(model) if model else None
-    held = {int(view): row for row, view in enumerate(instance.view)}
-    views, masks, prompted = [], [], []
-    for view, frame in enumerate(frames):
-        old = instance.mask(held[view]) if view in held else None
-        drawn = old is not None and instance.prompted[held[view]] == DRAWN
+    held = {name: row for row, name in enumerate(instance.views)}
+    names, masks, origins = [], [], []
+    for view, frame in enumerate(views.frames):
+        row = held.get(frame.name)
+        old = None if row is None else instance.mask(row)
+        drawn = row is not None and instance.origin[row] == DRAWN
         prompt = functools.partial(segmenter.predict_prompt, embeddings[view]) if segmenter else None
         new = _replacement(scene, view, solid, old, drawn, params, prompt)
         if new is not None:
-            views.append(view)
+            names.append(frame.name)
             masks.append(np.packbits(new))
-            prompted.append(REFINED)
-        elif old is not None:
-            views.append(view)
-            masks.append(instance.packed[held[view]])
-            prompted.append(int(instance.prompted[held[view]]))
-        progress(view + 1, len(frames), frame.name)
-    if not views:
+            origins.append(REFINED)
+        elif row is not None:
+            names.append(frame.name)
+            masks.append(instance.packed[row])
+            origins.append(int(instance.origin[row]))
+        progress(view + 1, len(views.frames), frame.name)
+    if not names:
         return instance
     return replace(
         instance,
-        view=np.array(views, np.int32),
+        views=tuple(names),
         packed=np.array(masks, np.uint8),
-        prompted=np.array(prompted, np.uint8),
-        weak=instance.weak and len(views) < params.min_views,
+        origin=np.array(origins, np.uint8),
+        weak=instance.weak and len(names) < params.min_views,
     )
 
 
@@ -148,7 +147,7 @@ def render_mask(
     part of, so the depth is that of the ordinary rendering wherever that is solid. Depth is compared no more finely
     than the Gaussians are thick and a pixel is wide.
     """
-    full = camera_of(scene.cameras, view)
+    full = scene.cameras[view]
     nothing = np.zeros((full.height, full.width), bool)
     whole = CropParams(margin_px=margin_px, max_side=max(full.width, full.height))
     camera = crop_camera(full, nothing, gaussians.means, whole)
@@ -158,7 +157,7 @@ def render_mask(
     depth = np.where(solid, total / np.maximum(weight, 1e-6), 0)
     measured = sample_depth(scene.depths[view], full, camera)
     thickness = float(np.median(np.exp(gaussians.log_scales.max(axis=1))))
-    tolerance = np.maximum(scene.tau, scene.tau_relative * depth) + thickness + depth / camera.fx
+    tolerance = scene.tolerance(depth) + thickness + depth / camera.fx
     visible = solid & ((measured == 0) | (measured + tolerance >= depth))
     agrees = visible & (measured > 0) & (np.abs(measured - depth) <= tolerance)
     return RenderedMask(_pasted(visible, camera, full), float(agrees.sum() / max(1, visible.sum())))
@@ -194,7 +193,7 @@ def _replacement(
     """
     if prompt is None and old is not None:
         return None
-    rows, column, row, _ = scene.surface_rows(view, gaussians.means)
+    rows, column, row, _ = scene.surface_points(view, gaussians.means)
     if len(rows) < params.min_visible:
         return None
     valid = decode_valid(scene.frames[view])

@@ -10,11 +10,12 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, Gaussians, LabelMap
+from ss_flow.tasks.artifacts import Bool, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.gaussians.views import Views
+from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import at_diagonal, decode_valid, depth_at_frame_size
 from ss_flow.tasks.ranges import Fraction
 
@@ -47,9 +48,7 @@ class RenderMasksParams:
     environment=backend_identity,
 )
 def render_masks(
-    frames: Sequence[Frame],
-    cameras: Cameras,
-    depths: Sequence[DepthMap],
+    views: Views,
     scene: Gaussians,
     refined: Sequence[LabelMap],
     *,
@@ -61,12 +60,12 @@ def render_masks(
     refined id where that weighs half as much or more, and where `params` holds the other instance or the background
     off; an instance that has masks but no Gaussians keeps what the scene calls background.
 
-    refined: the exclusive masks after refinement. frames, depths, refined: of all views.
+    views: all of the scene. refined: their exclusive masks after refinement.
     """
     absent = np.setdiff1d(np.arange(np.iinfo(np.uint16).max + 1), scene.instance_id)
     maps = []
-    for view, (frame, depth, known) in enumerate(zip(frames, depths, refined, strict=True)):
-        ids = _ids_of_view(scene, camera_of(cameras, view), known, params.share)
+    for view, (frame, depth, known) in enumerate(zip(views.frames, views.depths, refined, strict=True)):
+        ids = _ids_of_view(scene, views.cameras[view], known, params.share)
         keeps = np.isin(known.ids, absent)
         if params.background == "fringe":
             keeps |= ~(_at_border(known.ids) & (depth_at_frame_size(depth, frame) > 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,16 +13,15 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import (
     REFINED,
     Cameras,
-    DepthMap,
     Float32,
-    Frame,
     InstanceMasks,
     Int32,
     LabelMap,
     Visibility,
 )
-from ss_flow.tasks.gaussians.views import SceneViews, scene_views
+from ss_flow.tasks.gaussians.views import SceneViews, Views
 from ss_flow.tasks.geometry.images import at_diagonal, decode_valid
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import nearest_labels, paint_labels
 
@@ -46,36 +46,36 @@ def resolve(cameras: Cameras, instances: tuple[InstanceMasks, ...]) -> tuple[Lab
     instances: in any order; the background (id 0) is what remains. Equal areas: the lower id is on top.
     Raises InputError when masks and frames differ in size.
     """
-    return _painted(cameras, instances, kept_on_top=False)
+    sizes = dict(zip(cameras.names, ((int(h), int(w)) for w, h in cameras.sizes), strict=True))
+    return _painted(sizes, instances, kept_on_top=False)
 
 
 @task(uses=("opencv-contrib-python-headless",))
 def resolve_refined(
-    frames: tuple[Frame, ...],
-    cameras: Cameras,
-    depths: tuple[DepthMap, ...],
+    views: Views,
     instances: tuple[InstanceMasks, ...],
     *,
     params: ResolveParams,
-    tau_depth: float = 0.02,
-    tau_relative: float = 0.0,
+    visibility: VisibilityParams = VisibilityParams(),
 ) -> tuple[LabelMap, ...]:
     """The instance ids of every view after refinement; as `resolve`, but by `params`, 0 where a frame is not valid.
 
     Split's masks are exclusive, so of two masks that overlap at least one is new, made from this photo alone, while the
-    labels of points have the votes of all views. frames, depths: of all views. tau_depth, tau_relative: as in `refine`.
+    labels of points have the votes of all views. views: all of the scene.
     """
     by_points = params.contested == "points"
-    maps = _painted(cameras, instances, kept_on_top=by_points)
-    scene = scene_views(frames, cameras, depths, tau_depth, tau_relative)
+    sizes = {frame.name: (frame.height, frame.width) for frame in views.frames}
+    maps = _painted(sizes, instances, kept_on_top=by_points)
+    scene = views.compared(visibility)
     points = np.concatenate([instance.points for instance in instances])
     labels = np.repeat([i.instance_id for i in instances], [len(i.points) for i in instances]).astype(np.int32)
-    for view, (frame, label_map) in enumerate(zip(frames, maps, strict=True)):
+    for view, (frame, label_map) in enumerate(zip(views.frames, maps, strict=True)):
         if by_points:
             nearest = _nearest(scene, view, points, labels)
             for instance in instances:
-                for row in np.flatnonzero((instance.view == view) & (instance.instance_id > 0)).tolist():
-                    label_map.ids[instance.mask(row) & (nearest == instance.instance_id)] = instance.instance_id
+                if instance.instance_id and frame.name in instance.views:
+                    mask = instance.mask(instance.views.index(frame.name))
+                    label_map.ids[mask & (nearest == instance.instance_id)] = instance.instance_id
         label_map.ids[~decode_valid(frame)] = 0
     return maps
 
@@ -85,57 +85,62 @@ def _nearest(scene: SceneViews, view: int, points: Float32, labels: Int32) -> In
 
     points: [N, 3] world; labels: [N].
     """
-    width, height = (int(n) for n in scene.cameras.sizes[view])
-    rows, column, row, z = scene.surface_rows(view, points)
-    seen = Visibility(scene.cameras.names[view], rows, row * width + column, z, height, width)
+    height, width = scene.frames[view].height, scene.frames[view].width
+    rows, column, row, z = scene.surface_points(view, points)
+    seen = Visibility(scene.frames[view].name, rows, row * width + column, z.astype(np.float32), height, width)
     return nearest_labels(paint_labels(seen, labels), height, width, at_diagonal(_REACH, height, width))
 
 
-def _painted(cameras: Cameras, instances: tuple[InstanceMasks, ...], *, kept_on_top: bool) -> tuple[LabelMap, ...]:
-    """All masks painted one over the other, smaller ones on top; kept_on_top: of those that no refinement changed."""
-    maps = [np.zeros((int(height), int(width)), np.uint16) for width, height in cameras.sizes]
-    seen: list[list[tuple[bool, int, int, InstanceMasks, int]]] = [[] for _ in maps]
+def _painted(
+    sizes: Mapping[str, tuple[int, int]], instances: tuple[InstanceMasks, ...], *, kept_on_top: bool
+) -> tuple[LabelMap, ...]:
+    """All masks painted one over the other, smaller ones on top.
+
+    sizes: height and width of each view. kept_on_top: whether masks that no refinement changed come above the others.
+    """
+    maps = {name: np.zeros(size, np.uint16) for name, size in sizes.items()}
+    seen: dict[str, list[tuple[bool, int, int, InstanceMasks, int]]] = {name: [] for name in maps}
     for instance in instances:
         if instance.instance_id == 0:
             continue
-        for row, view in enumerate(instance.view):
+        for row, view in enumerate(instance.views):
             if maps[view].shape != (instance.height, instance.width):
                 raise InputError(
-                    f"Frame {cameras.names[view]} is {maps[view].shape[1]} x {maps[view].shape[0]} pixels and the "
+                    f"Frame {view} is {maps[view].shape[1]} x {maps[view].shape[0]} pixels and the "
                     f"masks of instance {instance.instance_id} are {instance.width} x {instance.height}; "
                     "both must have one size."
                 )
             area = int(instance.mask(row).sum())
-            on_top = kept_on_top and instance.prompted[row] != REFINED
+            on_top = kept_on_top and instance.origin[row] != REFINED
             seen[view].append((on_top, -area, -instance.instance_id, instance, row))
-    for ids, layers in zip(maps, seen, strict=True):
+    for view, layers in seen.items():
         for *_, instance, row in sorted(layers, key=lambda layer: layer[:3]):
-            ids[instance.mask(row)] = instance.instance_id
-    return tuple(LabelMap(name, ids) for name, ids in zip(cameras.names, maps, strict=True))
+            maps[view][instance.mask(row)] = instance.instance_id
+    return tuple(LabelMap(name, ids) for name, ids in maps.items())
 
 
 @task()
 def exclusive(instance: InstanceMasks, maps: tuple[LabelMap, ...]) -> InstanceMasks:
     """An instance with the masks that label maps give it; for the background all that no instance has.
 
-    maps: of all views, in their order. Views where it has no pixel left drop out. Masks that differ from those in
-    `instance` are marked as refined.
+    maps: at least those with a pixel of it, in the order of the frames. Views where it has no pixel left drop out.
+    Masks that differ from those in `instance` are marked as refined.
     """
-    old = {int(view): row for row, view in enumerate(instance.view)}
-    views, masks, prompted = [], [], []
-    for view, label_map in enumerate(maps):
+    old = {name: row for row, name in enumerate(instance.views)}
+    views, masks, origins = [], [], []
+    for label_map in maps:
         mask = label_map.ids == instance.instance_id
         if not mask.any():
             continue
-        row = old.get(view)
+        row = old.get(label_map.name)
         same = row is not None and np.array_equal(mask, instance.mask(row))
-        views.append(view)
+        views.append(label_map.name)
         masks.append(mask)
-        prompted.append(instance.prompted[row] if same else REFINED)
+        origins.append(instance.origin[row] if same else REFINED)
     stack = np.array(masks, bool).reshape(-1, instance.height, instance.width)
     return replace(
         instance,
-        view=np.array(views, np.int32),
+        views=tuple(views),
         packed=pack_masks(stack),
-        prompted=np.array(prompted, np.uint8),
+        origin=np.array(origins, np.uint8),
     )

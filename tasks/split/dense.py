@@ -9,12 +9,11 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, PointCloud
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, PointCloud, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, sum_by_voxel
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
-from ss_flow.tasks.geometry.units import scene_unit
 from ss_flow.tasks.ranges import Count, NonNegative, Positive
 
 
@@ -38,16 +37,15 @@ class DenseParams:
 
 @task(uses=("opencv-contrib-python-headless", "scipy"))
 def dense(
-    frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...], *, params: DenseParams
+    frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...], unit: SceneUnit, *, params: DenseParams
 ) -> PointCloud:
     """Dense points P_dense, by back-projection of all depth maps (spec S2, row 11).
 
     Known depth pixels that their frame does not mask out become world points; the points of one voxel are averaged;
     those that other views contradict are dropped (see `consistent_points`). The points are ordered by voxel.
 
-    Raises InputError when no depth is known in any view, or no two views agree.
+    Raises InputError when no two views agree.
     """
-    unit = scene_unit(cameras, depths)
     voxel = voxel_side(cameras, depths, unit, params)
     views = []
     for view, (frame, depth) in enumerate(zip(frames, depths, strict=True)):
@@ -67,7 +65,7 @@ def consistent_cloud(
     depths: tuple[DepthMap, ...],
     *,
     voxel: float,
-    unit: float,
+    unit: SceneUnit,
     params: DenseParams,
 ) -> PointCloud:
     """The voxels whose means the views' depth confirms, in cubes large enough that no more than `max_points` remain.
@@ -80,7 +78,7 @@ def consistent_cloud(
             means,
             cameras,
             depths,
-            tau=params.tolerance * unit,
+            tau=params.tolerance * unit.length,
             tau_relative=params.relative_tolerance,
             min_views=params.min_views,
         )
@@ -91,12 +89,12 @@ def consistent_cloud(
         cloud = sum_by_voxel([cloud.take(kept)], voxel)
     points = means[kept].astype(np.float32)
     rounded = np.rint(colors[kept]).astype(np.uint8)
-    return PointCloud(points=points, colors=rounded, unit=unit, spacing=nearest_spacing(points))
+    return PointCloud(points=points, colors=rounded, unit=unit.length, spacing=nearest_spacing(points))
 
 
-def voxel_side(cameras: Cameras, depths: tuple[DepthMap, ...], unit: float, params: DenseParams) -> float:
+def voxel_side(cameras: Cameras, depths: tuple[DepthMap, ...], unit: SceneUnit, params: DenseParams) -> float:
     """Side of the sampling cube, in world units."""
-    return min(params.voxel * unit, params.voxel_pixels * _pixel_footprint(cameras, depths))
+    return min(params.voxel * unit.length, params.voxel_pixels * _pixel_footprint(cameras, depths))
 
 
 def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:

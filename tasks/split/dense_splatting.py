@@ -8,17 +8,16 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud, SceneUnit
 from ss_flow.tasks.gaussians.initialise import SH_ZERO, initialise
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, train
-from ss_flow.tasks.gaussians.views import CropParams, SceneViews, TrainView, training_view
-from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
-from ss_flow.tasks.geometry.fusion import VoxelSums, sum_by_voxel
+from ss_flow.tasks.gaussians.views import SceneViews, TrainView, whole_view
+from ss_flow.tasks.geometry.cameras import cameras_by_view
+from ss_flow.tasks.geometry.fusion import VoxelSums, sum_by_voxel, with_sparse_points
 from ss_flow.tasks.geometry.shape import box_diagonal
-from ss_flow.tasks.geometry.units import scene_unit
-from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.dense import DenseParams, consistent_cloud, depth_samples, voxel_side
 
@@ -64,6 +63,7 @@ def dense_splatting(
     frames: tuple[Frame, ...],
     cameras: Cameras,
     depths: tuple[DepthMap, ...],
+    unit: SceneUnit,
     *,
     params: DenseParams,
     splatting: DenseSplattingParams,
@@ -76,16 +76,17 @@ def dense_splatting(
 
     Raises InputError when a scene has neither depth nor sparse points to start from, or no centre is confirmed.
     """
-    seeds = _with_sparse_points(cameras, depths)
+    seeds = with_sparse_points(cameras, depths)
     known = depths if any(depth.depth.any() for depth in depths) else seeds
-    unit = scene_unit(cameras, known)
     voxel = voxel_side(cameras, known, unit, params)
     samples = [
         sum_by_voxel([depth_samples(frame, cameras, view, seed)], voxel)
         for view, (frame, seed) in enumerate(zip(frames, seeds, strict=True))
     ]
     initial = _first_gaussians(sum_by_voxel(samples, voxel), voxel, splatting.initial_points)
-    views = _whole_views(frames, cameras, depths, splatting.max_side)
+    seen = SceneViews(frames, cameras_by_view(cameras), depths, unit, VisibilityParams())
+    everything = [np.zeros((frame.height, frame.width), np.int32) for frame in frames]
+    views = [whole_view(seen, view, all_of_it, splatting.max_side) for view, all_of_it in enumerate(everything)]
     trained = train(
         initial,
         [view for view in views if view.inside.any()],
@@ -116,19 +117,6 @@ def dense_splatting(
     return cloud
 
 
-def _with_sparse_points(cameras: Cameras, depths: tuple[DepthMap, ...]) -> tuple[DepthMap, ...]:
-    """The depth maps, with the sparse points that fall on pixels of unknown depth."""
-    maps = []
-    for view, known in enumerate(depths):
-        height, width = known.depth.shape
-        camera = camera_of(cameras, view).scaled(width, height)
-        _, column, row, z = pixels_in_view(cameras.sparse_points, camera)
-        front = nearest_per_pixel(row * width + column, z, height * width)
-        sparse = np.append(z, 0.0)[front].reshape(height, width)  # -1, no point there, takes the 0
-        maps.append(replace(known, depth=np.where(known.depth > 0, known.depth, sparse).astype(np.float32)))
-    return tuple(maps)
-
-
 def _first_gaussians(samples: VoxelSums, voxel: float, limit: int) -> Gaussians:
     """Gaussians at no more than `limit` of the points, in larger voxels where there are more."""
     while len(samples.weight) > limit:
@@ -139,26 +127,6 @@ def _first_gaussians(samples: VoxelSums, voxel: float, limit: int) -> Gaussians:
         raise InputError("All known depth and sparse points of this scene lie in pixels that its frames mask out.")
     first = initialise(points.astype(np.float32), np.rint(colors).astype(np.uint8), 0, 1.0)
     return replace(first, log_scales=first.log_scales + np.float32(np.log(_WIDTH)))
-
-
-def _whole_views(
-    frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...], max_side: int
-) -> list[TrainView]:
-    """All photos to train on, every valid pixel of them."""
-    scene = SceneViews(frames, cameras, depths, tau=0.0, tau_relative=0.0)
-    nothing = np.zeros((0, 3), np.float32)
-    return [
-        training_view(
-            scene,
-            view,
-            np.zeros((frame.height, frame.width), np.int32),
-            nothing,
-            0.0,
-            crop=CropParams(margin_px=0, max_side=max_side),
-            ignore_occluded=False,
-        )
-        for view, frame in enumerate(frames)
-    ]
 
 
 def _centres(gaussians: Gaussians, min_opacity: float) -> VoxelSums:

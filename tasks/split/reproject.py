@@ -16,7 +16,6 @@ from ss_flow.tasks.artifacts import (
     PROMPTED,
     Bool,
     InstanceMasks,
-    Int32,
     MaskSet,
     PointCloud,
     PointLabels,
@@ -108,10 +107,31 @@ def reproject(
         for total, part in zip((held, against), contradicted(painted, ids, num_labels), strict=True):
             total += part
     agreed = 1 - against / np.maximum(held, 1)
-    return tuple(
-        _instance(int(label), points, labels, parts, views, first, float(agreed[label]), params.min_views)
-        for label in np.union1d([0], labels.label)
-    )
+    names = tuple(view.name for view in visibility)
+    found = []
+    for label in np.union1d([0], labels.label).tolist():
+        rows = labels.label == label
+        shown_in = [k for k, view in enumerate(views) if label in view]
+        share = labels.confidence[rows]
+        found.append(
+            InstanceMasks(
+                instance_id=label,
+                points=points.points[rows],
+                colors=points.colors[rows],
+                point_confidence=share,
+                point_part=parts.part[rows],
+                confidence=float(share.mean(dtype=np.float64)) * float(agreed[label]) if share.size else 0.0,
+                height=first.height,
+                width=first.width,
+                views=tuple(names[k] for k in shown_in),
+                packed=np.array([views[k][label][0] for k in shown_in], np.uint8).reshape(
+                    len(shown_in), (first.height * first.width + 7) // 8
+                ),
+                origin=np.array([views[k][label][1] for k in shown_in], np.uint8),
+                weak=label > 0 and len(shown_in) < params.min_views,
+            )
+        )
+    return tuple(found)
 
 
 def _drawn(painted: PaintedView, view: Visibility, shown: set[int], params: ReprojectParams) -> dict[int, Bool]:
@@ -126,35 +146,3 @@ def _drawn(painted: PaintedView, view: Visibility, shown: set[int], params: Repr
     nearest = nearest_labels(painted, view.height, view.width, reach)
     masks = {label: smoothed(nearest == label, round(reach)) for label in missing}
     return {label: mask for label, mask in masks.items() if agreement(painted, mask, label) >= params.selection.min_iou}
-
-
-def _instance(
-    label: int,
-    points: PointCloud,
-    labels: PointLabels,
-    parts: PointParts,
-    views: list[dict[int, tuple[np.ndarray, int]]],
-    size: Visibility,
-    agreed: float,
-    min_views: int,
-) -> InstanceMasks:
-    """The points and masks of one label. agreed: share of its painted pixels that no other label contradicts."""
-    rows = labels.label == label
-    seen: Int32 = np.array([k for k, view in enumerate(views) if label in view], np.int32)
-    share = labels.confidence[rows]
-    return InstanceMasks(
-        instance_id=label,
-        points=points.points[rows],
-        colors=points.colors[rows],
-        point_confidence=share,
-        point_part=parts.part[rows],
-        confidence=float(share.mean(dtype=np.float64)) * agreed if share.size else 0.0,
-        height=size.height,
-        width=size.width,
-        view=seen,
-        packed=np.array([views[k][label][0] for k in seen], np.uint8).reshape(
-            len(seen), (size.height * size.width + 7) // 8
-        ),
-        prompted=np.array([views[k][label][1] for k in seen], np.uint8),
-        weak=label > 0 and len(seen) < min_views,
-    )

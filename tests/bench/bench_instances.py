@@ -39,12 +39,15 @@ from ss_flow.tasks.artifacts import (
     PointCloud,
     PointLabels,
     PointParts,
+    SceneUnit,
     Visibility,
 )
 from ss_flow.tasks.evaluate.contingency import contingency
 from ss_flow.tasks.evaluate.instances import evaluate_masks, pooled
 from ss_flow.tasks.evaluate.panoptic import average_precision
+from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.pool import masks_by_id
 from ss_flow.tasks.models.catalogue import available, default_folders, find
 from ss_flow.tasks.splat.resolve import resolve
@@ -121,11 +124,11 @@ def scene(objects: int, seed: int) -> Scene:
         Frame(name, width, height, np.frombuffer(encode_png(rgb).tobytes(), np.uint8), nothing, width, height)
         for name, rgb in zip(names, room.rgb, strict=True)
     )
-    cloud = dense(frames, room.cameras, depths, params=SplitParams().dense)
+    cloud = dense(frames, room.cameras, depths, SceneUnit(1.0), params=SplitParams().dense)
     truth = tuple(LabelMap(name, ids.astype(np.uint16)) for name, ids in zip(names, room.ids, strict=True))
     counts = np.zeros((len(cloud.points), int(room.ids.max()) + 1), np.uint16)
     for k, depth in enumerate(depths):
-        seen = visibility(cloud, room.cameras, depth, view=k, tau_depth=0.02)
+        seen = visibility(cloud, camera_of(room.cameras, k), depth, params=VisibilityParams())
         counts[seen.point_index, room.ids[k].ravel()[seen.pixel]] += 1
     label = np.where(counts.any(axis=1), counts.argmax(axis=1), -1).astype(np.int32)
     return Scene(cloud, room.cameras, depths, frames, truth, label)
@@ -179,7 +182,7 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
     """The columns of the table, and the seconds from visibility to labels."""
     begun = time.perf_counter()
     seen = tuple(
-        visibility(room.cloud, room.cameras, depth, view=k, **vars(split.visibility))
+        visibility(room.cloud, camera_of(room.cameras, k), depth, params=split.visibility)
         for k, depth in enumerate(room.depths)
     )
     observed = tuple(
@@ -194,7 +197,7 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
     maps = resolve(room.cameras, instances)
     values = evaluate_masks(maps, room.truth, tree).values
     table = contingency(*pooled(maps, room.truth)).without(truth=0, predicted=0)
-    confidence = {i.instance_id: i.confidence * np.sqrt(len(i.view)) for i in instances}
+    confidence = {i.instance_id: i.confidence * np.sqrt(len(i.views)) for i in instances}
     known = room.true_label >= 0
     on_points = contingency(room.true_label[known], labels.label[known]).without(truth=0, predicted=0)
     return values | {

@@ -38,7 +38,7 @@ def load(path: Path, store: Store) -> tuple[list[Frame], Cameras, list[DepthMap]
 
     def build() -> dict[str, object]:
         nodes = capture(open_scene(path), lambda p: FileRef(p, blake3_of(p)), CaptureParams(), None)
-        points = dense(nodes.frames, nodes.cameras, nodes.depths, params=DenseParams())
+        points = dense(nodes.frames, nodes.cameras, nodes.depths, nodes.unit, params=DenseParams())
         return {"frames": nodes.frames, "cameras": nodes.cameras, "depths": nodes.depths, "points": points}
 
     values = run_flow(build, store, scene=str(path), header={}).values

@@ -176,11 +176,11 @@ def total_steps(found: Outcome, params: Params) -> tuple[int, int]:
     of, merge = params.splat.reconstruct, params.splat.merge
     steps, photos, shares = 0, 0.0, []
     for before, after in zip(found.split, found.instances, strict=True):
-        if before.weak or not len(before.view):
+        if before.weak or not before.views:
             continue
-        share = float(np.mean([crop_share(found.cameras, before, row, of.crop) for row in range(len(before.view))]))
+        share = float(np.mean([crop_share(found.cameras, before, row, of.crop) for row in range(len(before.views))]))
         count = of.iterations(before)
-        if (after.prompted == REFINED).any():
+        if (after.origin == REFINED).any():
             count += max(1, round(of.retrain_share * of.iterations(after)))
         steps, photos = steps + count, photos + share * count
         shares.append(share)
@@ -192,7 +192,7 @@ def total_steps(found: Outcome, params: Params) -> tuple[int, int]:
 
 def crop_share(cameras: Cameras, instance: InstanceMasks, row: int, crop: CropParams) -> float:
     """How much of a photo's pixels are rendered to train on one view of an instance."""
-    full = camera_of(cameras, int(instance.view[row]))
+    full = camera_of(cameras, cameras.names.index(instance.views[row]))
     camera = crop_camera(full, instance.mask(row), instance.points, crop)
     return camera.width * camera.height / (full.width * full.height)
 
@@ -218,7 +218,8 @@ def cleanliness(found: Outcome) -> Iterator[Cleanliness]:
             continue
         dark = shown = 0
         changes = []
-        for view in instance.view[:: -(-len(instance.view) // 8)].tolist():
+        for name in instance.views[:: -(-len(instance.views) // 8)]:
+            view = found.cameras.names.index(name)
             camera = camera_of(found.cameras, view)
             fringe, pixels = fringe_share(own, camera)
             dark, shown = dark + fringe, shown + pixels
@@ -249,9 +250,9 @@ def look(found: Outcome, plainly: Gaussians | None, place: Path) -> None:
     tiles = []
     for instance in found.instances:
         own = select(found.scene, found.scene.instance_id == instance.instance_id)
-        if instance.instance_id and len(own) and len(instance.view):
-            largest = int(instance.view[instance.dense().sum(axis=(1, 2)).argmax()])
-            mask = instance.dense()[list(instance.view).index(largest)]
+        if instance.instance_id and len(own) and instance.views:
+            row = int(instance.dense().sum(axis=(1, 2)).argmax())
+            largest, mask = found.cameras.names.index(instance.views[row]), instance.mask(row)
             y, x = np.nonzero(mask)
             margin = 20
             box = np.s_[max(0, y.min() - margin) : y.max() + margin, max(0, x.min() - margin) : x.max() + margin]

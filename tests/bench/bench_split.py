@@ -31,6 +31,7 @@ from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import DepthMap, PointCloud
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.pool import masks_by_id
 from ss_flow.tasks.split.observe import observe
 from ss_flow.tasks.split.propagate import propagate
@@ -86,7 +87,7 @@ def main() -> None:
 
         def look(k: int) -> tuple[str, str, float, float, int]:
             began = time.perf_counter()
-            seen = visibility(cloud, cameras, depths[k % taken], view=k % taken, tau_depth=0.02)
+            seen = visibility(cloud, camera_of(cameras, k % taken), depths[k % taken], params=VisibilityParams())
             middle = time.perf_counter()
             observed = observe(cloud, seen, masks_by_id(ids[k % taken], names[k % taken]), params=split.observe)
             ended = time.perf_counter()

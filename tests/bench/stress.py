@@ -57,10 +57,10 @@ import functools
 from ss_flow.tasks.splat import reconstruct as module
 inner = module.reconstruct.function
 @functools.wraps(inner)
-def failing(frames, cameras, depths, instance, **options):
+def failing(views, instance, **options):
     if instance.instance_id % 10 == 3:
         raise RuntimeError("injected")
-    return inner(frames, cameras, depths, instance, **options)
+    return inner(views, instance, **options)
 module.reconstruct.function = failing
 """
 

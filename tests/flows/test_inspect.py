@@ -35,7 +35,7 @@ def test_the_graph_is_mermaid_with_a_box_a_step_and_what_feeds_it(tiny):
     lines = ss_flow("graph", "--cache", tiny.store).out.splitlines()
     assert lines[0] == "flowchart TD"
     boxes = dict(match.groups() for line in lines if (match := re.fullmatch(r'  ([\w.]+)\["(.+)"\]', line)))
-    arrows = {match.groups() for line in lines if (match := re.fullmatch(r"  ([\w.]+) -->\|(\w+)\| ([\w.]+)", line))}
+    arrows = {match.groups() for line in lines if (match := re.fullmatch(r"  ([\w.]+) -->\|([\w.]+)\| ([\w.]+)", line))}
     assert len(boxes) + len(arrows) + 1 == len(lines)
     assert boxes["split.visibility"] == "split.visibility x 5"
     assert {a for a, _, _ in arrows} | {b for _, _, b in arrows} <= set(boxes)

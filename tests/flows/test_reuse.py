@@ -165,7 +165,7 @@ def test_an_edited_helper_computes_its_task_again_and_stops_where_the_result_is_
     again = run_tiny(warm.scene, warm.store, out=warm.out)
     assert again.computed() == {"split.propagate": 1}
     told = ss_flow("why", "propagate", "--cache", warm.store).out
-    assert told.strip() == "split.propagate: code of tasks.split.smoothing._REACH changed"
+    assert told.strip() == "split.propagate: code of tasks.split.votes.smoothing._REACH changed"
 
 
 def test_a_task_that_is_retuned_but_not_rewritten_keeps_its_results(warm, edited):

@@ -10,7 +10,7 @@ import ss_flow_toy as toy
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
-from ss_flow.graph import Flow, each, gather, otherwise
+from ss_flow.graph import INDEX, Flow, each, gather, otherwise, pick
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
 
@@ -41,6 +41,37 @@ def test_a_sequence_is_read_item_by_item(store, executor):
 
     report = run(store, flow, executor=executor)
     assert value(store, report.values["total"]) == (1 + 2 + 3) + (1 + 3) + 3
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_a_bundle_is_taken_apart_into_inputs_and_put_together_for_the_task(store, executor):
+    def flow(last: float = 3.0):
+        xs = toy.source(values=(1.0, 2.0, last))
+        return {"total": toy.shifted_total(toy.Pair(xs[0], [xs[1], xs[0]]), xs[0], by=0.5)}
+
+    report = run(store, flow, executor=executor)
+    assert value(store, report.values["total"]) == 1 + 2 + 1 + 1 + 0.5
+    inputs = store.action(report.nodes[-1]["key"]).components["inputs"]
+    assert list(inputs) == ["pair.one", "pair.rest", "more"]
+    assert "shifted_total" not in ran(run(store, lambda: flow(last=4.0), executor=executor))
+    assert float(toy.shifted_total(toy.Pair(toy.number(1), [toy.number(2)]), toy.number(3), by=0.0).value[0]) == 6
+
+
+def test_who_gets_some_of_a_list_does_not_depend_on_the_others(store):
+    def flow(*values: float):
+        xs = toy.source(values=values)
+        return {"total": toy.total(pick(xs, [2, 0]))}
+
+    assert value(store, run(store, lambda: flow(1.0, 2.0, 4.0)).values["total"]) == 5
+    assert ran(run(store, lambda: flow(1.0, 3.0, 4.0, 8.0))) == ["ss_flow_toy.source"]
+
+
+def test_each_hands_out_positions(store):
+    def flow():
+        return {"clipped": each(toy.source(values=(5.0, 5.0)), INDEX, build=lambda x, i: toy.clip(x, limit=float(i)))}
+
+    report = run(store, flow)
+    assert [value(store, digest) for digest in report.values["clipped"]] == [0.0, 1.0]
 
 
 def test_an_item_that_is_lost_while_a_sequence_is_read_is_computed_again(store):

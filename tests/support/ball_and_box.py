@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, InstanceMasks, LabelMap
-from ss_flow.tasks.geometry.cameras import backproject, camera_of
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, InstanceMasks, LabelMap, SceneUnit
+from ss_flow.tasks.gaussians.views import Views
+from ss_flow.tasks.geometry.cameras import backproject, camera_of, cameras_by_view
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.masks.packing import pack_masks
 
@@ -45,6 +46,11 @@ class SmallScene:
         self.points = np.concatenate(points).astype(np.float32)
         self.colors, self.labels = np.concatenate(colors), np.concatenate(labels)
 
+    @property
+    def views(self) -> Views:
+        """All of them, as a run gives them to a step."""
+        return Views(self.frames, cameras_by_view(self.cameras), self.depths, SceneUnit(1.0))
+
     def instance(self, instance_id: int, views: tuple[int, ...] = tuple(range(VIEWS)), every: int = 3) -> InstanceMasks:
         mine = np.flatnonzero(self.labels == instance_id)[::every]
         masks = np.array([self.ids[k] == instance_id for k in views], bool).reshape(-1, HEIGHT, WIDTH)
@@ -57,9 +63,9 @@ class SmallScene:
             confidence=0.9,
             height=HEIGHT,
             width=WIDTH,
-            view=np.array(views, np.int32),
+            views=tuple(self.frames[k].name for k in views),
             packed=pack_masks(masks),
-            prompted=np.zeros(len(views), np.uint8),
+            origin=np.zeros(len(views), np.uint8),
             weak=False,
         )
 

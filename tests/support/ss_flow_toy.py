@@ -13,7 +13,7 @@ import numpy as np
 
 from ss_flow.graph import each, expand
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
-from ss_flow.task import Resources, task
+from ss_flow.task import Bundle, Resources, task
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,18 @@ def clip(x: Number, *, limit: float) -> Number:
 def total(xs: tuple[Number, ...]) -> Number:
     progress(1, 1, "adding")
     return number(sum(float(x.value[0]) for x in xs))
+
+
+@dataclass(frozen=True)
+class Pair(Bundle):
+    one: Number
+    rest: Sequence[Number]
+
+
+@task()
+def shifted_total(pair: Pair, more: Number, *, by: float) -> Number:
+    assert not isinstance(pair.rest, tuple)
+    return number(float(pair.one.value[0]) + sum(float(x.value[0]) for x in pair.rest) + float(more.value[0]) + by)
 
 
 @task()

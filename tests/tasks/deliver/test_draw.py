@@ -48,7 +48,7 @@ def instance_of(masks: np.ndarray, views: list[int]) -> InstanceMasks:
     n = len(views)
     return InstanceMasks(
         2, POINTS, CLOUD.colors, np.ones(500, np.float32), np.zeros(500, np.int32), 0.9, H, W,
-        np.array(views, np.int32), np.packbits(masks.reshape(n, H * W), axis=1),
+        tuple(("left", "b", "c", "right")[k] for k in views), np.packbits(masks.reshape(n, H * W), axis=1),
         np.zeros(n, np.uint8), False,
     )  # fmt: skip
 

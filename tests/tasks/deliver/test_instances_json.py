@@ -2,13 +2,12 @@ import json
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Frame, Gaussians, Hierarchy, InstanceMasks
+from ss_flow.tasks.artifacts import Gaussians, Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.instances_json import instance_file, instances_document
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.semantics.name import InstanceNames
 
 NOTHING = np.zeros(0, np.uint8)
-FRAMES = tuple(Frame(name, 4, 2, NOTHING, NOTHING, 4, 2) for name in "abc")
 
 
 def instance(instance_id: int, points, views=(0, 2), weak: bool = False, shown: int = 0b11110000) -> InstanceMasks:
@@ -16,7 +15,7 @@ def instance(instance_id: int, points, views=(0, 2), weak: bool = False, shown: 
     n, v = len(points), len(views)
     return InstanceMasks(
         instance_id, points, np.zeros((n, 3), np.uint8), np.ones(n, np.float32), np.arange(n, dtype=np.int32),
-        0.87654321, 2, 4, np.array(views, np.int32), np.full((v, 1), shown, np.uint8), np.zeros(v, np.uint8), weak,
+        0.87654321, 2, 4, tuple("abc"[k] for k in views), np.full((v, 1), shown, np.uint8), np.zeros(v, np.uint8), weak,
     )  # fmt: skip
 
 
@@ -30,7 +29,7 @@ def gaussians(means, ids) -> Gaussians:
 
 
 def test_an_instance_is_described_by_its_points():
-    document = instances_document([instance(7, [[0, 0, 0], [2, 4, 6]])], None, None, FRAMES)
+    document = instances_document([instance(7, [[0, 0, 0], [2, 4, 6]])], None, None)
     assert json.loads(json.dumps(document)) == {
         "version": 1,
         "background_id": 0,
@@ -64,14 +63,14 @@ def test_an_instance_is_described_by_its_points():
 
 def test_where_there_are_gaussians_they_say_where_it_is():
     scene = gaussians([[9, 9, 9], [1, 0, 0], [5, 5, 5], [3, 0, 0]], [0, 7, 8, 7])
-    entry = instances_document([instance(7, [[0, 0, 0]])], scene, None, FRAMES)["instances"][0]
+    entry = instances_document([instance(7, [[0, 0, 0]])], scene, None)["instances"][0]
     assert entry["bbox"] == {"min": [1, 0, 0], "max": [3, 0, 0]} and entry["centroid"] == [2, 0, 0]
     assert entry["num_gaussians"] == 2 and entry["file"] == instance_file(7) == "instances/0007.ply"
 
 
 def test_a_weak_instance_has_points_but_no_file():
     scene = gaussians([[1, 0, 0]], [8])
-    entry = instances_document([instance(7, [[1, 1, 1]], weak=True)], scene, None, FRAMES)["instances"][0]
+    entry = instances_document([instance(7, [[1, 1, 1]], weak=True)], scene, None)["instances"][0]
     assert entry["weak"] and entry["file"] is None and entry["centroid"] == [1, 1, 1]
 
 
@@ -79,7 +78,7 @@ def test_names_are_unique_and_the_unknown_go_by_their_id():
     names = InstanceNames(
         np.array([3, 1, 2, 4], np.int32), ("mug", "mug", "object", "sofa"), np.ones(4, np.float32), "clip"
     )
-    document = instances_document([instance(i, [[0, 0, 0]]) for i in (5, 4, 3, 2, 1)], None, names, FRAMES)
+    document = instances_document([instance(i, [[0, 0, 0]]) for i in (5, 4, 3, 2, 1)], None, names)
     found = [(e["id"], e["name"], e["named_by"]) for e in document["instances"]]
     assert found == [
         (1, "mug", "clip"),
@@ -93,7 +92,7 @@ def test_names_are_unique_and_the_unknown_go_by_their_id():
 def test_names_that_the_user_gave_stay_and_are_told_from_those_of_the_encoder():
     ids, given = np.array([1, 2, 3], np.int32), np.array([2, 3], np.int32)
     names = InstanceNames(ids, ("mug", "mug", "my lamp"), np.ones(3, np.float32), "clip", given)
-    document = instances_document([instance(i, [[0, 0, 0]]) for i in (1, 2, 3)], None, names, FRAMES)
+    document = instances_document([instance(i, [[0, 0, 0]]) for i in (1, 2, 3)], None, names)
     found = [(e["name"], e["named_by"]) for e in document["instances"]]
     assert found == [("mug 2", "clip"), ("mug", "hints"), ("my lamp", "hints")]
 
@@ -107,7 +106,7 @@ def test_the_background_is_no_instance_and_instances_know_their_groups_and_kind(
         np.array([False, False, False, True, False, False]),
     )
     known = [instance(i, [[0, 0, 0]]) for i in (0, 1, 2, 3, 4)]
-    document = instances_document(known, None, None, FRAMES, tree)
+    document = instances_document(known, None, None, tree)
     found = [(e["id"], e["parent"], e["kind"]) for e in document["instances"]]
     assert found == [(1, 5, "thing"), (2, 5, "thing"), (3, 6, "thing"), (4, None, "stuff")]
     assert document["groups"] == [
@@ -118,11 +117,11 @@ def test_the_background_is_no_instance_and_instances_know_their_groups_and_kind(
 
 def test_crumbs_are_counted_and_have_no_file():
     scene = gaussians([[1, 0, 0], [1, 0, 0]], [7, 8])
-    document = instances_document([instance(7, [[0, 0, 0]], shown=0), instance(8, [[0, 0, 0]])], scene, None, FRAMES)
+    document = instances_document([instance(7, [[0, 0, 0]], shown=0), instance(8, [[0, 0, 0]])], scene, None)
     assert [(e["crumb"], e["file"]) for e in document["instances"]] == [(True, None), (False, "instances/0008.ply")]
     assert document["num_crumbs"] == 1
 
 
 def test_an_instance_without_points_has_no_place():
-    entry = instances_document([instance(1, [])], None, None, FRAMES)["instances"][0]
+    entry = instances_document([instance(1, [])], None, None)["instances"][0]
     assert entry["bbox"] is None and entry["centroid"] is None

@@ -12,14 +12,19 @@ from ss_flow.tasks.gaussians.views import (
     IGNORED,
     NONE_OF_MINE,
     CropParams,
+    PointSurface,
     SceneViews,
+    background_view,
     crop_camera,
+    group_view,
+    instance_view,
     propagated_depth,
     sample_depth,
-    training_view,
+    whole_view,
 )
 from ss_flow.tasks.geometry.cameras import camera_of, project
 from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 
 
 @pytest.fixture(scope="module")
@@ -28,14 +33,15 @@ def small() -> SmallScene:
 
 
 def views_of(small: SmallScene, **changes) -> SceneViews:
-    return replace(SceneViews(small.frames, small.cameras, small.depths, 0.02, 0.0), **changes)
+    return replace(small.views.compared(VisibilityParams()), **changes)
 
 
-def built(small: SmallScene, view: int, instance_id: int, scene: SceneViews | None = None, **options):
-    channels = np.where(small.ids[view] == instance_id, 0, NONE_OF_MINE).astype(np.int32)
-    points = small.points[small.labels == instance_id][::3]
-    crop = options.pop("crop", CropParams())
-    return training_view(scene or views_of(small), view, channels, points, 0.02, crop=crop, with_ids=True, **options)
+def built(
+    small: SmallScene, view: int, instance_id: int, scene: SceneViews | None = None, build=instance_view, **options
+):
+    surface = PointSurface(small.points[small.labels == instance_id][::3], 0.02)
+    mask = small.ids[view] == instance_id
+    return build(scene or views_of(small), view, mask, surface, crop=CropParams(), **options)
 
 
 def hidden_by_box(small: SmallScene, view: int) -> np.ndarray:
@@ -92,7 +98,7 @@ def test_the_paper_calls_hidden_pixels_empty(small):
 
 
 def test_the_background_is_unknown_behind_the_objects(small):
-    made = built(small, 0, 0, fills_scene=True)
+    made = built(small, 0, 0, build=background_view)
     # At the foot of an object the floor in front of it is taken to go on for a pixel.
     assert made.free.sum() <= 0.05 * (small.ids[0] != 0).sum()
     assert built(small, 0, 0).free.sum() > made.free.sum()
@@ -146,4 +152,19 @@ def test_propagated_depth_is_close_to_the_true_depth_of_a_surface_seen_by_points
 
 def test_masks_of_another_size_than_the_frame_are_refused(small):
     with pytest.raises(InputError, match=r"Frame v0 is 96 x 72 pixels and its masks are 5 x 4"):
-        training_view(views_of(small), 0, np.zeros((4, 5), np.int32), small.points[:9], 0.02, crop=CropParams())
+        group_view(
+            views_of(small), 0, np.zeros((4, 5), np.int32), PointSurface(small.points[:9], 0.02), crop=CropParams()
+        )
+
+
+def test_the_view_of_a_whole_scene_is_the_entire_photo(small):
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[:, :10] = 0
+    frames = (replace(small.frames[0], valid=encode_png(valid)), *small.frames[1:])
+    channels = np.where(small.ids[0] == 1, 0, np.where(small.ids[0] == 2, NONE_OF_MINE, IGNORED)).astype(np.int32)
+    made = whole_view(views_of(small, frames=frames), 0, channels, WIDTH)
+    assert (made.camera.width, made.camera.height) == (WIDTH, HEIGHT)
+    np.testing.assert_array_equal(made.inside, (small.ids[0] == 1) & (valid > 0))
+    np.testing.assert_array_equal(made.free, (small.ids[0] == 2) & (valid > 0))
+    half = whole_view(views_of(small), 0, channels, WIDTH // 2)
+    assert (half.camera.width, half.camera.height) == (WIDTH // 2, HEIGHT // 2)

@@ -4,11 +4,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.artifacts import Appearances, Gaussians
 from ss_flow.tasks.splat.collisions import collision_matrix, group_box, match_pairs
 from ss_flow.tasks.splat.plan import PlanParams, plan
 
 EXACT = PlanParams(bbox_quantile=0.0)
+NOWHERE_SHOWN = Appearances.listed(np.zeros(0, np.int32), [])
 
 
 def group(points, instance_id: int, opacity: float = 0.9) -> Gaussians:
@@ -77,25 +78,25 @@ def test_the_golden_scene_has_the_collision_shares_of_the_specification():
 def test_table_cup_book_and_floor_merge_in_the_golden_order_and_the_lamp_never():
     a, b, c, d, e = table_cup_book_floor_lamp().values()
 
-    first = plan((a, b, c, d, e), params=EXACT, round=0)
+    first = plan((a, b, c, d, e), NOWHERE_SHOWN, params=EXACT, round=0)
     assert first.pairs.tolist() == [[0, 1]] and first.singles.tolist() == [2, 3, 4]
     np.testing.assert_allclose(first.scores, [0.9])
     assert first.mask_weight == 0.05
 
     ab = union(a, b)
-    second = plan((ab, c, d, e), params=EXACT, round=1)
+    second = plan((ab, c, d, e), NOWHERE_SHOWN, params=EXACT, round=1)
     assert second.pairs.tolist() == [[0, 1]] and second.singles.tolist() == [2, 3]
     np.testing.assert_allclose(second.scores, [0.6])
     np.testing.assert_allclose(second.collisions[0, 2], 30 / 120)
     assert second.mask_weight == 0.15
 
     abc = union(ab, c)
-    third = plan((abc, d, e), params=EXACT, round=2)
+    third = plan((abc, d, e), NOWHERE_SHOWN, params=EXACT, round=2)
     assert third.pairs.tolist() == [[0, 1]]
     np.testing.assert_allclose(third.scores, [0.2])
     assert third.mask_weight == 0.25
 
-    last = plan((union(abc, d), e), params=EXACT, round=3)
+    last = plan((union(abc, d), e), NOWHERE_SHOWN, params=EXACT, round=3)
     assert last.pairs.shape == (0, 2) and last.singles.tolist() == [0, 1]
     assert last.mask_weight == 0.25
 
@@ -140,13 +141,13 @@ def test_the_box_ignores_faint_and_outlying_centres():
 
 def test_a_group_without_gaussians_collides_with_nothing():
     empty = group(np.zeros((0, 3)), 1)
-    result = plan((empty, empty, group(spread(9, [0, 0, 0], [1, 1, 1]), 2)), params=EXACT, round=0)
+    result = plan((empty, empty, group(spread(9, [0, 0, 0], [1, 1, 1]), 2)), NOWHERE_SHOWN, params=EXACT, round=0)
     assert not len(result.pairs) and result.singles.tolist() == [0, 1, 2]
 
 
 def test_pairs_below_the_least_score_stay_apart():
     a, b, *_ = table_cup_book_floor_lamp().values()
-    assert not len(plan((a, b), params=PlanParams(bbox_quantile=0, min_score=0.95), round=0).pairs)
+    assert not len(plan((a, b), NOWHERE_SHOWN, params=PlanParams(bbox_quantile=0, min_score=0.95), round=0).pairs)
 
 
 def test_taken_literally_a_pair_waits_while_it_collides_with_another():
@@ -166,16 +167,16 @@ def test_cubes_tell_what_touches_a_floor_from_what_hangs_over_a_step_of_it():
     steps = np.concatenate([np.c_[low, np.zeros(len(low))], np.c_[high, np.ones(len(high))]])
     standing, hanging = (np.array([[0.5, 0.5, z], [0.52, 0.5, z]]) for z in (0.04, 0.5))
     groups = (group(steps, 1), group(standing, 2), group(hanging, 3))
-    boxes = plan(groups, params=EXACT, round=0).collisions
+    boxes = plan(groups, NOWHERE_SHOWN, params=EXACT, round=0).collisions
     assert boxes[1, 0] == boxes[2, 0] == 1
-    cubes = plan(groups, params=PlanParams(overlap="voxel"), round=0).collisions
+    cubes = plan(groups, NOWHERE_SHOWN, params=PlanParams(overlap="voxel"), round=0).collisions
     assert cubes[1, 0] == 1 and cubes[0, 1] > 0 and not cubes[2].any() and not cubes[:, 2].any()
 
 
 def merged_to_the_end(groups: list[Gaussians], params: PlanParams) -> tuple[set[frozenset[int]], int]:
     """Which instances end in one group, and after how many rounds."""
     for rounds in range(len(groups) + 1):
-        found = plan(tuple(groups), params=params, round=rounds)
+        found = plan(tuple(groups), NOWHERE_SHOWN, params=params, round=rounds)
         if not len(found.pairs):
             return {frozenset(g.instance_id.tolist()) for g in groups}, rounds
         groups = [union(groups[a], groups[b]) for a, b in found.pairs] + [groups[i] for i in found.singles]

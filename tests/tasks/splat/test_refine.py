@@ -10,14 +10,15 @@ from ball_and_box import VIEWS, SmallScene
 
 from ss_flow.tasks.artifacts import DRAWN, REFINED, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import initialise, select
-from ss_flow.tasks.gaussians.views import SceneViews
 from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.splat import refine as module
 from ss_flow.tasks.splat.refine import RefineParams, refine, render_mask
 
 PARAMS = RefineParams()
+NAMES = tuple(f"v{k}" for k in range(VIEWS))
 SEGMENTER = Model("stand-in", "segmenter", (), (), ())
 
 
@@ -53,8 +54,7 @@ def refined(small: SmallScene, box: Gaussians, instance: InstanceMasks, monkeypa
     if answer is not None:
         monkeypatch.setattr(module, "Sam", Scripted)
         monkeypatch.setattr(Scripted, "answer", staticmethod(answer))
-    views = (small.frames, small.cameras, small.depths)
-    return refine(*views, instance, box, embeddings, params=RefineParams(**params), model=model)
+    return refine(small.views, instance, box, embeddings, params=RefineParams(**params), model=model)
 
 
 def assert_outline(mask: np.ndarray, truth: np.ndarray) -> None:
@@ -66,7 +66,7 @@ def assert_outline(mask: np.ndarray, truth: np.ndarray) -> None:
 
 
 def test_the_rendered_mask_leaves_out_what_the_ball_hides(small, box):
-    scene = SceneViews(small.frames, small.cameras, small.depths, 0.02, 0.0)
+    scene = small.views.compared(VisibilityParams())
     for view in range(VIEWS):
         rendered = render_mask(box, scene, view)
         assert_outline(rendered.mask, small.ids[view] == 1)
@@ -79,14 +79,14 @@ def test_the_rendered_mask_leaves_out_what_the_ball_hides(small, box):
 
 def test_without_a_segmenter_masks_stay_and_missing_ones_are_drawn_where_depth_confirms_them(small, box):
     result = refined(small, box, small.instance(1, views=(0, 3, 4)))
-    assert result.view.tolist() == list(range(VIEWS))
-    assert result.prompted.tolist() == [0, REFINED, REFINED, 0, 0, REFINED, REFINED, REFINED]
-    for view, mask in zip(result.view, result.dense(), strict=True):
+    assert result.views == NAMES
+    assert result.origin.tolist() == [0, REFINED, REFINED, 0, 0, REFINED, REFINED, REFINED]
+    for view, mask in enumerate(result.dense()):
         assert_outline(mask, small.ids[view] == 1)
     wrong = replace(small.depths[2], depth=small.depths[2].depth + np.float32(1))
     depths = (*small.depths[:2], wrong, *small.depths[3:])
-    again = refine(small.frames, small.cameras, depths, small.instance(1, views=(0, 3)), box, (), params=PARAMS)
-    assert 2 not in again.view
+    again = refine(replace(small.views, depths=depths), small.instance(1, views=(0, 3)), box, (), params=PARAMS)
+    assert NAMES[2] not in again.views
 
 
 def moved(instance: InstanceMasks, pixels: int, **fields) -> InstanceMasks:
@@ -98,14 +98,14 @@ def test_a_mask_stays_unless_the_segmenters_agrees_better(small, box, monkeypatc
     truth = small.instance(1)
     same = refined(small, box, truth, monkeypatch, lambda view, _: small.ids[view] == 1)
     np.testing.assert_array_equal(same.packed, truth.packed)
-    assert not same.prompted.any()
+    assert not same.origin.any()
 
     worse = refined(small, box, truth, monkeypatch, lambda view, _: np.roll(small.ids[view] == 1, 6, axis=1))
     np.testing.assert_array_equal(worse.packed, truth.packed)
 
     better = refined(small, box, moved(truth, 6), monkeypatch, lambda view, _: small.ids[view] == 1)
     np.testing.assert_array_equal(better.packed, truth.packed)
-    assert (better.prompted == REFINED).all()
+    assert (better.origin == REFINED).all()
 
 
 def test_a_mask_of_the_photo_gives_way_only_by_a_margin_and_one_drawn_from_points_to_anything_better(
@@ -116,11 +116,11 @@ def test_a_mask_of_the_photo_gives_way_only_by_a_margin_and_one_drawn_from_point
     kept = refined(small, box, nearly, monkeypatch, right)
     np.testing.assert_array_equal(kept.packed, nearly.packed)
     for instance, params in (
-        (replace(nearly, prompted=np.full(VIEWS, DRAWN, np.uint8)), {}),
+        (replace(nearly, origin=np.full(VIEWS, DRAWN, np.uint8)), {}),
         (nearly, {"margin": 0.0}),
     ):
         replaced = refined(small, box, instance, monkeypatch, right, **params)
-        assert (replaced.prompted == REFINED).any()
+        assert (replaced.origin == REFINED).any()
 
 
 def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small, box, monkeypatch):
@@ -130,7 +130,7 @@ def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small,
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
     np.testing.assert_array_equal(refined(small, box, part, monkeypatch, right).packed, part.packed)
     np.testing.assert_array_equal(refined(small, box, part, monkeypatch, right, max_change=0.0).packed, truth.packed)
-    drawn = replace(part, prompted=np.full(VIEWS, DRAWN, np.uint8))
+    drawn = replace(part, origin=np.full(VIEWS, DRAWN, np.uint8))
     np.testing.assert_array_equal(refined(small, box, drawn, monkeypatch, right).packed, truth.packed)
 
 
@@ -140,7 +140,7 @@ def test_an_answer_that_the_segmenter_itself_doubts_is_not_taken(small, box, mon
     few = moved(small.instance(1, views=(0, 1)), 6)
     doubted = refined(small, box, few, monkeypatch, right)
     np.testing.assert_array_equal(doubted.packed, few.packed)
-    assert len(refined(small, box, few, monkeypatch, right, pred_iou=0.7).view) == VIEWS
+    assert len(refined(small, box, few, monkeypatch, right, pred_iou=0.7).views) == VIEWS
 
 
 def test_new_masks_leave_out_what_is_not_valid(small, box, monkeypatch):
@@ -151,18 +151,18 @@ def test_new_masks_leave_out_what_is_not_valid(small, box, monkeypatch):
     part = small.instance(1, views=(0, 1))
     for answer in (None, lambda view, _: small.ids[view] == 1):
         result = refined(masked, box, part, monkeypatch, answer)
-        new = result.dense()[result.prompted == REFINED]
+        new = result.dense()[result.origin == REFINED]
         assert len(new) and new.any() and not new[:, :, 48:].any()
 
 
 def test_a_missing_mask_is_added_only_above_tau_iou(small, box, monkeypatch):
     part = small.instance(1, views=(0, 1))
     good = refined(small, box, part, monkeypatch, lambda view, _: small.ids[view] == 1)
-    assert good.view.tolist() == list(range(VIEWS))
+    assert good.views == NAMES
     strict = refined(small, box, part, monkeypatch, lambda view, _: small.ids[view] == 1, tau_iou=0.999)
-    assert strict.view.tolist() == [0, 1]
+    assert strict.views == NAMES[:2]
     bad = refined(small, box, part, monkeypatch, lambda view, _: small.ids[view] == 2)
-    assert bad.view.tolist() == [0, 1]
+    assert bad.views == NAMES[:2]
 
 
 def test_prompts_lie_on_visible_parts_of_the_instance(small, box, monkeypatch):

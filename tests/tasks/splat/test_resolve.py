@@ -21,7 +21,7 @@ def masks_of(instance_id: int, masks: dict[int, list[str]]) -> InstanceMasks:
     dense = np.array([[[c == "x" for c in row] for row in rows] for rows in masks.values()], bool)
     return InstanceMasks(
         instance_id, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32),
-        np.zeros(0, np.int32), 1.0, 3, 4, np.array(list(masks), np.int32),
+        np.zeros(0, np.int32), 1.0, 3, 4, tuple("ab"[view] for view in masks),
         pack_masks(dense), np.zeros(len(masks), np.uint8), False,
     )  # fmt: skip
 
@@ -55,17 +55,17 @@ def test_masks_of_another_size_are_refused_by_name():
 def test_exclusive_masks_are_cut_marked_and_dropped_where_nothing_is_left():
     maps = resolve(CAMERAS, (SMALL, LARGE))
     cut = exclusive(LARGE, maps)
-    assert cut.view.tolist() == [0, 1] and cut.prompted.tolist() == [REFINED, 0]
+    assert cut.views == ("a", "b") and cut.origin.tolist() == [REFINED, 0]
     assert cut.dense()[0].sum() == 5
     covered = (LabelMap("a", np.full((3, 4), 2, np.uint16)), maps[1])
-    assert exclusive(LARGE, covered).view.tolist() == [1]
+    assert exclusive(LARGE, covered).views == ("b",)
 
 
 def test_the_background_gets_all_that_no_instance_has():
     before = masks_of(0, {0: ["...x", "...x", "xxxx"], 1: ["..xx", "xxxx", "xxxx"]})
     after = exclusive(before, resolve(CAMERAS, (SMALL, LARGE)))
     assert after.dense()[0].astype(int).tolist() == [[0, 0, 0, 0], [0, 0, 0, 1], [1, 1, 1, 1]]
-    assert after.prompted.tolist() == [REFINED, 0]
+    assert after.origin.tolist() == [REFINED, 0]
 
 
 @pytest.fixture(scope="module")
@@ -75,15 +75,15 @@ def small() -> SmallScene:
 
 def settled(small: SmallScene, *instances: InstanceMasks, contested: str = "points", frames=None) -> np.ndarray:
     """[VIEWS, H, W] ids after refinement."""
-    views = frames or small.frames, small.cameras, small.depths
-    maps = resolve_refined(*views, instances, params=ResolveParams(contested))
+    views = replace(small.views, frames=frames or small.frames)
+    maps = resolve_refined(views, instances, params=ResolveParams(contested))
     return np.stack([m.ids for m in maps])
 
 
 def grown_over(instance: InstanceMasks, other: InstanceMasks) -> InstanceMasks:
     """What refinement may make of an instance: its masks with those of another one."""
     masks = instance.dense() | other.dense()
-    return replace(instance, packed=pack_masks(masks), prompted=np.full(VIEWS, REFINED, np.uint8))
+    return replace(instance, packed=pack_masks(masks), origin=np.full(VIEWS, REFINED, np.uint8))
 
 
 def test_a_contested_pixel_goes_to_the_instance_whose_points_are_near_whatever_the_sizes(small):
@@ -107,7 +107,7 @@ def test_without_points_a_kept_mask_is_above_a_refined_one_and_of_two_refined_th
     for kept, other in ((box, ball), (ball, box)):
         ids = settled(small, kept, grown_over(other, kept))
         assert (ids == truth).all()
-    both = settled(small, grown_over(box, ball), replace(ball, prompted=np.full(VIEWS, REFINED, np.uint8)))
+    both = settled(small, grown_over(box, ball), replace(ball, origin=np.full(VIEWS, REFINED, np.uint8)))
     assert (both == truth).all()
 
 

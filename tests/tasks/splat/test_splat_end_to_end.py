@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
 
-from ss_flow.tasks.artifacts import REFINED, Gaussians
+from ss_flow.tasks.artifacts import REFINED, Appearances, Gaussians
 from ss_flow.tasks.gaussians.initialise import concatenate, extents, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
@@ -36,24 +36,23 @@ class Built:
 
     @property
     def views(self):
-        return self.scene.frames, self.scene.cameras, self.scene.depths
+        return self.scene.views
 
 
 @pytest.fixture(scope="module")
 def built() -> Built:
     scene = SmallScene()
-    views = scene.frames, scene.cameras, scene.depths
-    return Built(scene, *(reconstruct(*views, scene.instance(i), params=TRAIN) for i in (1, 2, 0)))
+    return Built(scene, *(reconstruct(scene.views, scene.instance(i), params=TRAIN) for i in (1, 2, 0)))
 
 
 @pytest.fixture(scope="module")
 def merged(built: Built) -> Gaussians:
-    return merge_pair(*built.views, built.box, built.ball, built.scene.maps, params=MERGE, w_mask=0.05)
+    return merge_pair(built.views, built.box, built.ball, built.scene.maps, params=MERGE, w_mask=0.05)
 
 
 @pytest.fixture(scope="module")
 def whole(built: Built, merged: Gaussians) -> Gaussians:
-    return global_pass(*built.views, assemble((merged, built.background)), built.scene.maps, params=MERGE)
+    return global_pass(built.views, assemble((merged, built.background)), built.scene.maps, params=MERGE)
 
 
 def psnr(a, b) -> float:
@@ -97,26 +96,28 @@ def test_gaussians_keep_the_part_of_the_points_that_they_grew_from(whole):
 
 
 def test_training_twice_gives_the_same_bytes_and_the_order_of_a_pair_does_not_matter(built, merged):
-    again = reconstruct(*built.views, built.scene.instance(2), params=TRAIN)
+    again = reconstruct(built.views, built.scene.instance(2), params=TRAIN)
     assert same(again, built.ball)
-    assert same(merge_pair(*built.views, built.ball, built.box, built.scene.maps, params=MERGE, w_mask=0.05), merged)
+    assert same(merge_pair(built.views, built.ball, built.box, built.scene.maps, params=MERGE, w_mask=0.05), merged)
 
 
 def test_touching_instances_collide_and_are_planned_as_a_pair(built):
-    assert plan((built.ball, built.box), params=PlanParams(), round=0).pairs.tolist() == [[1, 0]]
+    shown = Appearances.listed(np.array([0, 1, 2], np.int32), [[0, 1, 2], [0], [0, 2]])
+    made = plan((built.ball, built.box), shown, params=PlanParams(), round=0)
+    assert made.pairs.tolist() == [[1, 0]] and made.views(0) == [0, 2]
 
 
 def test_a_weak_instance_and_one_without_masks_or_points_give_no_gaussians(built):
     few = built.scene.instance(2)
     empty = replace(few, points=few.points[:0], colors=few.colors[:0], point_confidence=few.point_confidence[:0])
     for instance in (replace(few, weak=True), built.scene.instance(2, views=()), empty):
-        assert len(reconstruct(*built.views, instance, params=TRAIN)) == 0
+        assert len(reconstruct(built.views, instance, params=TRAIN)) == 0
 
 
 def test_a_merge_leaves_what_is_far_from_the_smaller_group_as_it_was(built):
     far = replace(built.box, means=built.box.means + np.float32(50), instance_id=np.full(len(built.box), 3, np.int32))
     merged = merge_pair(
-        *built.views, concatenate([built.box, far]), built.ball, built.scene.maps, params=MERGE, w_mask=0.05
+        built.views, concatenate([built.box, far]), built.ball, built.scene.maps, params=MERGE, w_mask=0.05
     )
     assert same(select(merged, merged.instance_id == 3), far)
     assert not same(select(merged, merged.instance_id == 1), built.box)
@@ -124,9 +125,9 @@ def test_a_merge_leaves_what_is_far_from_the_smaller_group_as_it_was(built):
 
 def test_retraining_happens_only_where_refinement_changed_a_mask(built):
     instance = built.scene.instance(2)
-    assert retrain(*built.views, instance, built.ball, params=TRAIN) is built.ball
-    changed = replace(instance, prompted=np.where(instance.view == 3, REFINED, 0).astype(np.uint8))
-    result = retrain(*built.views, changed, built.ball, params=replace(TRAIN, retrain_share=0.1))
+    assert retrain(built.views, instance, built.ball, params=TRAIN) is built.ball
+    changed = replace(instance, origin=np.where(np.arange(VIEWS) == 3, REFINED, 0).astype(np.uint8))
+    result = retrain(built.views, changed, built.ball, params=replace(TRAIN, retrain_share=0.1))
     assert not same(result, built.ball) and len(result)
 
 
@@ -139,18 +140,18 @@ def test_a_refinement_that_ruins_the_pair_is_undone_with_a_warning(built, monkey
 
     monkeypatch.setattr(module, "train", ruined)
     with pytest.warns(UserWarning, match="Refining instances 1, 2 together was undone"):
-        result = merge_pair(*built.views, built.box, built.ball, built.scene.maps, params=MERGE, w_mask=0.05)
+        result = merge_pair(built.views, built.box, built.ball, built.scene.maps, params=MERGE, w_mask=0.05)
     assert len(result) == len(built.box) + len(built.ball)
     np.testing.assert_array_equal(result.means[: len(built.box)], built.box.means)
 
 
 def test_merging_with_nothing_or_without_views_is_the_plain_union(built):
     nothing = module.NO_GAUSSIANS
-    assert same(merge_pair(*built.views, nothing, built.ball, built.scene.maps, params=MERGE, w_mask=0.05), built.ball)
+    assert same(merge_pair(built.views, nothing, built.ball, built.scene.maps, params=MERGE, w_mask=0.05), built.ball)
     unseen = tuple(replace(m, ids=np.zeros_like(m.ids)) for m in built.scene.maps)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        union = merge_pair(*built.views, built.box, built.ball, unseen, params=MERGE, w_mask=0.05)
+        union = merge_pair(built.views, built.box, built.ball, unseen, params=MERGE, w_mask=0.05)
     assert same(union, assemble((built.ball, built.box)))
     assert len(assemble(())) == 0
 
@@ -166,9 +167,7 @@ def test_thinning_keeps_points_spread_over_the_whole_surface():
 def drawn(built, scene, maps=None, frames=None, depths=None, **params):
     """The masks that a finished scene shows."""
     return render_masks(
-        frames or built.scene.frames,
-        built.scene.cameras,
-        depths or built.scene.depths,
+        replace(built.views, frames=frames or built.scene.frames, depths=depths or built.scene.depths),
         scene,
         maps or built.scene.maps,
         params=RenderMasksParams(**params),
@@ -253,7 +252,7 @@ def test_no_gaussian_outgrows_its_instance_unless_it_starts_larger(built):
     start = float(np.exp(initialise(instance.points, instance.colors, 1, 1.0).log_scales).max())
     for share in (0.1, 0.001):
         params = replace(TRAIN, max_scale=share, max_points=len(instance.points))
-        longest = float(np.exp(reconstruct(*built.views, instance, params=params).log_scales).max())
+        longest = float(np.exp(reconstruct(built.views, instance, params=params).log_scales).max())
         limit = max(share * box_diagonal(instance.points), start)
         assert 0.5 * limit < longest <= limit * (1 + 1e-5)
 

@@ -5,14 +5,16 @@ import numpy as np
 import pytest
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import DepthMap
+from ss_flow.tasks.artifacts import DepthMap, SceneUnit
+from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.geometry.units import scene_unit
 from ss_flow.tasks.split.dense import DenseParams, dense
 
 
 def fuse(**changes):
-    return dense(box_scene.frames(), box_scene.cameras(), box_scene.depths(), params=DenseParams(**changes))
+    return dense(
+        box_scene.frames(), box_scene.cameras(), box_scene.depths(), SceneUnit(1.0), params=DenseParams(**changes)
+    )
 
 
 def test_dense_points_lie_on_the_surfaces_with_their_colours():
@@ -44,7 +46,7 @@ def test_flying_pixels_of_one_view_are_dropped():
     wrong = depths[0].depth.copy()
     wrong[30:40, 40:50] *= 0.6
     depths[0] = DepthMap("0", wrong, "sensor")
-    cloud = dense(box_scene.frames(), box_scene.cameras(), tuple(depths), params=DenseParams())
+    cloud = dense(box_scene.frames(), box_scene.cameras(), tuple(depths), SceneUnit(1.0), params=DenseParams())
     assert (box_scene.distance_to_scene(cloud.points) > 0.1).mean() < 0.002
 
 
@@ -52,21 +54,21 @@ def test_pixels_that_a_frame_masks_out_give_no_points():
     nothing = encode_png(np.zeros((box_scene.HEIGHT, box_scene.WIDTH), np.uint8))
     frames = tuple(replace(frame, valid=nothing) for frame in box_scene.frames())
     one_left = (*frames[:-1], replace(frames[-1], valid=np.zeros(0, np.uint8)))
-    cloud = dense(one_left, box_scene.cameras(), box_scene.depths(), params=DenseParams())
+    cloud = dense(one_left, box_scene.cameras(), box_scene.depths(), SceneUnit(1.0), params=DenseParams())
     assert len(cloud.points) <= box_scene.WIDTH * box_scene.HEIGHT
 
 
 def test_the_unit_is_a_metre_or_half_the_median_depth():
     cameras = box_scene.cameras()
-    assert scene_unit(cameras, box_scene.depths()) == 1.0
+    assert unit(cameras, box_scene.depths()).length == 1.0
     maps = tuple(DepthMap("x", np.array([[0, d]], np.float32), "mvs") for d in (2.0, 6.0, 8.0))
-    assert scene_unit(replace(cameras, metric=False), maps) == 3.0
+    assert unit(replace(cameras, metric=False), maps).length == 3.0
 
 
 def test_depth_that_is_unknown_everywhere_is_bad_input():
     blind = tuple(DepthMap(d.name, np.zeros_like(d.depth), "sensor") for d in box_scene.depths())
     with pytest.raises(InputError, match="known depth"):
-        dense(box_scene.frames(), box_scene.cameras(), blind, params=DenseParams())
+        unit(box_scene.cameras(), blind)
 
 
 def test_depth_that_never_agrees_is_bad_input():
@@ -86,4 +88,4 @@ def test_depth_that_never_agrees_is_bad_input():
     far[35:37, 47:49] = 9.2
     depths = (DepthMap("a", near, "sensor"), DepthMap("b", far, "sensor"))
     with pytest.raises(InputError, match="agree in no point"):
-        dense(box_scene.frames()[:2], cameras, depths, params=DenseParams())
+        dense(box_scene.frames()[:2], cameras, depths, SceneUnit(1.0), params=DenseParams())

@@ -6,21 +6,23 @@ import pytest
 from tiny_runs import run_tiny, write_room
 
 from ss_flow.errors import InputError
+from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.geometry.units import scene_unit
 from ss_flow.tasks.split.dense import DenseParams
-from ss_flow.tasks.split.dense_splatting import DenseSplattingParams, _with_sparse_points, dense_splatting
+from ss_flow.tasks.split.dense_splatting import DenseSplattingParams, dense_splatting, with_sparse_points
 
 STEPS = 150
 COARSE = DenseParams(voxel=0.05, voxel_pixels=100)
 
 
 def splatted(frames=None, cameras=None, depths=None, params=DenseParams(), **changes):
+    cameras, depths = cameras or box_scene.cameras(), depths or box_scene.depths()
     return dense_splatting(
         frames or box_scene.frames(),
-        cameras or box_scene.cameras(),
-        depths or box_scene.depths(),
+        cameras,
+        depths,
+        unit(cameras, depths),
         params=params,
         splatting=DenseSplattingParams(**{"min_iterations": STEPS, "iterations_per_view": 1, **changes}),
     )
@@ -102,7 +104,7 @@ def test_without_depth_and_scale_the_unit_comes_from_the_sparse_points():
     cameras = box_scene.cameras(scale=2.0)
     cameras = replace(cameras, sparse_points=on_the_surfaces(3000, cameras))
     cloud = splatted(cameras=cameras, depths=blind())
-    assert cloud.unit == pytest.approx(scene_unit(cameras, box_scene.depths(2.0)), rel=0.1)
+    assert cloud.unit == pytest.approx(unit(cameras, box_scene.depths(2.0)).length, rel=0.1)
 
 
 def test_known_depth_wins_over_sparse_points_and_the_nearest_of_these_over_others():
@@ -115,7 +117,7 @@ def test_known_depth_wins_over_sparse_points_and_the_nearest_of_these_over_other
     known = depths[0].depth.copy()
     known[40, 30] = 3.0
     depths[0] = replace(depths[0], depth=known)
-    filled = _with_sparse_points(replace(cameras, sparse_points=world.astype(np.float32)), tuple(depths))[0].depth
+    filled = with_sparse_points(replace(cameras, sparse_points=world.astype(np.float32)), tuple(depths))[0].depth
     assert filled[20, 10] == pytest.approx(1.2, rel=1e-5)
     assert filled[40, 30] == 3.0
     assert np.count_nonzero(filled) == 2

@@ -10,6 +10,9 @@ import pytest
 from box_scene import HEIGHT, VIEWS, WIDTH, row_of_points
 
 from ss_flow.tasks.artifacts import Clicks, PointCloud, PointLabels, PromptedMasks, Visibility
+from ss_flow.tasks.capture.views import unit
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.erosion import ErosionParams
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView
@@ -162,8 +165,8 @@ def test_the_segmenter_finds_what_was_clicked_and_not_what_was_excluded(segmente
 
 def test_what_is_clicked_in_two_views_gets_masks_in_all_that_see_it(segmenter):
     frames, cameras, depths = box_scene.frames(), box_scene.cameras(), box_scene.depths()
-    points = dense(frames, cameras, depths, params=DenseParams())
-    seen = tuple(visibility(points, cameras, depths[k], view=k, tau_depth=0.02) for k in range(VIEWS))
+    points = dense(frames, cameras, depths, unit(cameras, depths), params=DenseParams())
+    seen = tuple(visibility(points, camera_of(cameras, k), depths[k], params=VisibilityParams()) for k in range(VIEWS))
     ids = [box_scene.cast(k)[1] for k in range(VIEWS)]
     embeddings = [embed(frame, model=segmenter) for frame in frames]
     clicks = [clicks_on(ids[k], {1: 1, 2: 2}, f"{k}") if k in (0, 3) else no_clicks(f"{k}") for k in range(VIEWS)]

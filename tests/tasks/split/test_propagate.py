@@ -9,6 +9,9 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from ss_flow.tasks.artifacts import PointCloud
+from ss_flow.tasks.capture.views import unit
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.observe import ClusterParams, ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
@@ -137,8 +140,8 @@ def test_views_at_once_outvote_one_mask_that_holds_two_objects():
 @pytest.fixture(scope="module")
 def boxes():
     cameras, depths = box_scene.cameras(), box_scene.depths()
-    cloud = dense(box_scene.frames(), cameras, depths, params=DenseParams())
-    seen = tuple(visibility(cloud, cameras, d, view=k, tau_depth=0.02) for k, d in enumerate(depths))
+    cloud = dense(box_scene.frames(), cameras, depths, unit(cameras, depths), params=DenseParams())
+    seen = tuple(visibility(cloud, camera_of(cameras, k), d, params=VisibilityParams()) for k, d in enumerate(depths))
     return cloud, seen
 
 
@@ -215,8 +218,10 @@ def test_scaling_the_world_changes_no_label_from_depth_to_labels(scale):
     labels = []
     for size in (0.5, scale):
         cameras, depths = box_scene.cameras(size), box_scene.depths(size)
-        cloud = dense(box_scene.frames(), cameras, depths, params=DenseParams())
-        seen = tuple(visibility(cloud, cameras, d, view=k, tau_depth=0.02) for k, d in enumerate(depths))
+        cloud = dense(box_scene.frames(), cameras, depths, unit(cameras, depths), params=DenseParams())
+        seen = tuple(
+            visibility(cloud, camera_of(cameras, k), d, params=VisibilityParams()) for k, d in enumerate(depths)
+        )
         labels.append(run(cloud, seen, degraded(3), PropagateParams()).label)
     assert labels[0].tobytes() == labels[1].tobytes()
 

@@ -16,6 +16,9 @@ from ss_flow.tasks.artifacts import (
     PromptedMasks,
     Visibility,
 )
+from ss_flow.tasks.capture.views import unit
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView, nearest_labels, paint_labels, stack_exclusive
 from ss_flow.tasks.masks.pool import smoothed
@@ -81,16 +84,16 @@ def test_each_label_takes_the_mask_that_agrees_best():
 def test_two_masks_of_an_object_cut_in_two_are_united():
     found = run([columns(0, 3), columns(3, 5)], halves())
     assert (found[1].dense()[0] == columns(0, 5)).all()
-    assert not len(found[2].view)
+    assert not found[2].views
 
 
 def test_a_mask_that_agrees_too_little_shows_nothing():
     found = run([columns(4, 10)], halves(right=1))
-    assert not len(found[1].view) or (found[1].dense()[0] == columns(4, 10)).all()
+    assert not found[1].views or (found[1].dense()[0] == columns(4, 10)).all()
     # Four of the eight columns of label 1, and two without label: IoU 4 / 10.
-    assert len(found[1].view) == 1
+    assert len(found[1].views) == 1
     strict = replace(FOUND_ONLY, selection=SelectionParams(min_iou=0.5))
-    assert not len(run([columns(4, 10)], halves(right=1), strict)[1].view)
+    assert not len(run([columns(4, 10)], halves(right=1), strict)[1].views)
 
 
 def test_the_paper_unites_all_masks_whose_majority_a_label_has():
@@ -126,8 +129,8 @@ def test_an_instance_seen_in_one_view_is_weak():
     cloud, labels = labelled(halves())
     masks = (mask_set(columns(0, 5)[None], "a"), mask_set(np.stack([columns(0, 5), columns(5, 8)]), "b"))
     _, one, two = reproject(cloud, (view("a"), view("b")), masks, labels, WHOLE, (), params=FOUND_ONLY)
-    assert (one.view.tolist(), one.weak) == ([0, 1], False)
-    assert (two.view.tolist(), two.weak) == ([1], True)
+    assert (one.views, one.weak) == (("a", "b"), False)
+    assert (two.views, two.weak) == (("b",), True)
 
 
 def test_confidence_is_the_mean_share_less_what_other_labels_contradict():
@@ -147,20 +150,20 @@ def prompt(label, mask):
 def test_a_prompted_mask_stands_in_where_no_mask_shows_a_label():
     found = run([columns(0, 5)], halves(), prompted=prompt(2, columns(5, 9)))
     assert (found[2].dense()[0] == columns(5, 9)).all()
-    assert (found[2].prompted.tolist(), found[1].prompted.tolist()) == ([1], [0])
+    assert (found[2].origin.tolist(), found[1].origin.tolist()) == ([1], [0])
 
 
 def test_a_prompted_mask_that_misses_its_label_is_refused():
-    assert not len(run([columns(0, 5)], halves(), prompted=prompt(2, columns(0, 6)))[2].view)
+    assert not len(run([columns(0, 5)], halves(), prompted=prompt(2, columns(0, 6)))[2].views)
 
 
 def test_a_prompted_mask_replaces_the_views_own_only_where_it_agrees_better():
     found = run([columns(0, 5)], halves(), prompted=prompt(1, columns(0, 4)))
     assert (found[1].dense()[0] == columns(0, 5)).all()
-    assert found[1].prompted.tolist() == [FOUND]
+    assert found[1].origin.tolist() == [FOUND]
     found = run([columns(0, 3)], halves(), prompted=prompt(1, columns(0, 4)))
     assert (found[1].dense()[0] == columns(0, 4)).all()
-    assert found[1].prompted.tolist() == [PROMPTED]
+    assert found[1].origin.tolist() == [PROMPTED]
 
 
 def test_the_point_in_front_gives_a_pixel_its_label():
@@ -187,8 +190,8 @@ def test_the_order_of_masks_does_not_matter(masks):
 @pytest.mark.parametrize("params", [ReprojectParams(), ALL])
 def test_true_masks_come_back_with_one_id_in_every_view(params):
     cameras, depths, masks = box_scene.cameras(), box_scene.depths(), box_scene.true_masks()
-    cloud = dense(box_scene.frames(), cameras, depths, params=DenseParams())
-    seen = tuple(visibility(cloud, cameras, d, view=k, tau_depth=0.02) for k, d in enumerate(depths))
+    cloud = dense(box_scene.frames(), cameras, depths, unit(cameras, depths), params=DenseParams())
+    seen = tuple(visibility(cloud, camera_of(cameras, k), d, params=VisibilityParams()) for k, d in enumerate(depths))
     observed = tuple(observe(cloud, view, pool, params=ObserveParams()) for view, pool in zip(seen, masks, strict=True))
     labels = propagate(cloud, seen, observed, params=PropagateParams())
     whole = PointParts(np.zeros(len(cloud.points), np.int32))
@@ -198,11 +201,11 @@ def test_true_masks_come_back_with_one_id_in_every_view(params):
     boxes = set()
     for instance in found[1:]:
         dense_masks = instance.dense()
-        box = int(np.bincount(truth[instance.view][dense_masks]).argmax())
+        box = int(np.bincount(truth[list(map(int, instance.views))][dense_masks]).argmax())
         boxes.add(box)
-        for k, mask in zip(instance.view, dense_masks, strict=True):
+        for k, mask in zip(map(int, instance.views), dense_masks, strict=True):
             assert (mask == (truth[k] == box)).all()
-        assert instance.view.tolist() == [k for k in range(box_scene.VIEWS) if (truth[k] == box).any()]
+        assert list(map(int, instance.views)) == [k for k in range(box_scene.VIEWS) if (truth[k] == box).any()]
         assert instance.confidence > 0.9
     assert boxes == {1, 2, 3}
     assert (found[0].dense() == (truth == 0)).all()
@@ -220,9 +223,9 @@ def test_a_label_without_a_mask_is_drawn_from_its_points():
     params = ReprojectParams(min_points=10, reach=0.0)
     instances = run([columns(0, 5)], halves(), params)
     np.testing.assert_array_equal(instances[2].dense()[0], columns(5, 8))
-    assert instances[1].prompted.tolist() == [FOUND]
-    assert instances[2].prompted.tolist() == [DRAWN]
-    assert not len(run([columns(0, 5)], halves(), replace(params, min_points=13))[2].view)
+    assert instances[1].origin.tolist() == [FOUND]
+    assert instances[2].origin.tolist() == [DRAWN]
+    assert not len(run([columns(0, 5)], halves(), replace(params, min_points=13))[2].views)
 
 
 def test_a_drawn_mask_reaches_a_little_round_its_points():

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap, PointCloud
 from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.split.visibility import visibility
 
 
@@ -31,7 +32,7 @@ def test_only_points_on_the_measured_surface_are_visible():
             [1.2, 0.1, 1.0],  # right of the image: u = 4.4
         ]
     )
-    seen = visibility(points, cameras, depth, view=0, tau_depth=0.02)
+    seen = visibility(points, camera_of(cameras, 0), depth, params=VisibilityParams(0.02))
     assert seen.point_index.tolist() == [0, 1]
     assert seen.pixel.tolist() == [1 * 4 + 2, 0]
     np.testing.assert_allclose(seen.depth, [1.0, 1.01])
@@ -40,15 +41,19 @@ def test_only_points_on_the_measured_surface_are_visible():
 
 def test_unknown_depth_shows_nothing_even_close_to_the_camera():
     cameras, depth = one_camera(0.0)
-    assert not len(visibility(cloud([[0, 0, 0.01]]), cameras, depth, view=0, tau_depth=0.02).point_index)
+    assert not len(
+        visibility(cloud([[0, 0, 0.01]]), camera_of(cameras, 0), depth, params=VisibilityParams(0.02)).point_index
+    )
 
 
 def test_the_tolerance_grows_with_the_unit_and_with_depth():
     cameras, depth = one_camera(10.0)
     points = cloud([[0, 0, 10.05]])
-    assert not len(visibility(points, cameras, depth, view=0, tau_depth=0.02).pixel)
-    assert len(visibility(points, cameras, depth, view=0, tau_depth=0.02, tau_relative=0.01).pixel)
-    assert len(visibility(cloud([[0, 0, 10.05]], unit=3.0), cameras, depth, view=0, tau_depth=0.02).pixel)
+    assert not len(visibility(points, camera_of(cameras, 0), depth, params=VisibilityParams(0.02)).pixel)
+    assert len(visibility(points, camera_of(cameras, 0), depth, params=VisibilityParams(0.02, 0.01)).pixel)
+    assert len(
+        visibility(cloud([[0, 0, 10.05]], unit=3.0), camera_of(cameras, 0), depth, params=VisibilityParams(0.02)).pixel
+    )
 
 
 @settings(deadline=None, max_examples=20)
@@ -64,7 +69,7 @@ def test_it_agrees_with_equations_1_and_2_point_by_point(view, seed):
         inside = z > 0 and 0 <= w < camera.width and 0 <= h < camera.height
         if inside and depth.depth[h, w] > 0 and abs(depth.depth[h, w] - z) < 0.02:
             expected.append((i, h * camera.width + w))
-    seen = visibility(points, cameras, depth, view=view, tau_depth=0.02)
+    seen = visibility(points, camera_of(cameras, view), depth, params=VisibilityParams(0.02))
     assert list(zip(seen.point_index.tolist(), seen.pixel.tolist(), strict=True)) == expected
 
 
@@ -73,7 +78,9 @@ def test_it_agrees_with_equations_1_and_2_point_by_point(view, seed):
 def test_raising_the_threshold_removes_no_point(view, seed, thresholds):
     points = cloud(np.random.default_rng(seed).uniform((-1, -1, -0.1), (1, 1, 0.1), (300, 3)))
     cameras, depth = box_scene.cameras(), box_scene.depths()[view]
-    few, many = (visibility(points, cameras, depth, view=view, tau_depth=tau) for tau in sorted(thresholds))
+    few, many = (
+        visibility(points, camera_of(cameras, view), depth, params=VisibilityParams(tau)) for tau in sorted(thresholds)
+    )
     assert set(zip(few.point_index.tolist(), few.pixel.tolist(), strict=True)) <= set(
         zip(many.point_index.tolist(), many.pixel.tolist(), strict=True)
     )
