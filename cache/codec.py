@@ -132,7 +132,7 @@ def read(folder: Path) -> Any:
 def is_current(folder: Path) -> bool:
     """Whether an object was written in the format that `read` reads."""
     try:
-        return _header(folder)[0] == FORMAT
+        return bool(_header(folder)[0] == FORMAT)
     except ValueError:
         return False
 

@@ -11,6 +11,7 @@ from ss_flow.errors import InputError
 from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import INDEX, each
 from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Cameras, Clicks, DepthMap, Frame, LabelMap, MaskSet, Registration, SceneUnit
 from ss_flow.tasks.capture import depth as depth_steps
 from ss_flow.tasks.capture import ingest, recordings, sensor_depth, views
 from ss_flow.tasks.capture.coco_masks import coco_masks
@@ -20,6 +21,7 @@ from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.registration import calibrated, registration
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.sfm import registered, sfm
+from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.models.catalogue import Model
 
 Reference = Callable[[Path], FileRef]
@@ -27,29 +29,26 @@ Reference = Callable[[Path], FileRef]
 
 @dataclass(frozen=True)
 class Capture:
-    """Nodes of a capture: what every later step starts from."""
+    """Nodes of a capture, by the artifacts that they stand for: what every later step starts from."""
 
-    frames: Any
-    """tuple[Frame, ...]"""
-    cameras: Any
-    by_view: Any
-    """tuple[Camera, ...]: the same, one by one."""
-    depths: Any
-    """tuple[DepthMap, ...]"""
-    unit: Any
-    """SceneUnit"""
-    masks: Any | None
-    """tuple[MaskSet, ...] where the capture brought its own masks."""
-    truth: Any | None
-    """tuple[LabelMap, ...] where it is annotated."""
+    frames: tuple[Frame, ...]
+    cameras: Cameras
+    by_view: tuple[Camera, ...]
+    """The cameras one by one."""
+    depths: tuple[DepthMap, ...]
+    unit: SceneUnit
+    masks: tuple[MaskSet, ...] | None
+    """Where the capture brought its own masks."""
+    truth: tuple[LabelMap, ...] | None
+    """Where it is annotated."""
     names: tuple[str, ...] | None
     """Names of the views where they are known beforehand."""
-    clicks: Any | None = None
-    """tuple[Clicks, ...] where its user pointed at objects."""
+    clicks: tuple[Clicks, ...] | None = None
+    """Where its user pointed at objects."""
     objects: tuple[str, ...] = ()
     """What the user calls these objects."""
-    registration: Any | None = None
-    """Registration of a sensor's depth."""
+    registration: Registration | None = None
+    """Of a sensor's depth."""
 
 
 def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, monodepth: Model | None) -> Capture:
@@ -101,7 +100,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     return Capture(frames, cameras, by_view, depths, length, masks, truth, names, pointed, objects, placing)
 
 
-def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> Any:
+def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> tuple[Frame, ...]:
     if scene.kind == "video":
         assert scene.recording is not None
         return recordings.video_frames(video=reference(scene.recording), params=params.video)
@@ -125,10 +124,10 @@ def _depths(
     reference: Reference,
     params: CaptureParams,
     monodepth: Model | None,
-    frames: Any,
-    cameras: Any,
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
     names: tuple[str, ...] | None,
-) -> Any:
+) -> tuple[DepthMap, ...]:
     """The sensor's depth, a plane sweep over several views ("mvs"), or a network's ("mono")."""
     if source == "sensor":
         if scene.kind == "sens" and scene.recording is not None:

@@ -5,16 +5,32 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from ss_flow.errors import InputError
 from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import Params, SplitParams
 from ss_flow.graph import INDEX, each, expand, gather, labelled, otherwise, pick
+from ss_flow.tasks.artifacts import (
+    Appearances,
+    Clicks,
+    Descriptors,
+    Gaussians,
+    Hierarchy,
+    InstanceMasks,
+    LabelMap,
+    MaskSet,
+    PointCloud,
+    PointLabels,
+    PointParts,
+    PromptedMasks,
+    Visibility,
+)
 from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.evaluate.novel_view import novel_view
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.sam import Embedding
 from ss_flow.tasks.semantics.describe import describe
 from ss_flow.tasks.semantics.name import given_names, name
 from ss_flow.tasks.splat.collisions import MergePlan
@@ -41,6 +57,8 @@ from ss_flow.tasks.split.segment_rgbd import segment_rgbd
 from ss_flow.tasks.split.tally import tally
 from ss_flow.tasks.split.visibility import visibility
 
+R = TypeVar("R")
+
 
 @dataclass(frozen=True)
 class Networks:
@@ -53,25 +71,25 @@ class Networks:
 
 @dataclass(frozen=True)
 class Split:
-    """Nodes of the first half."""
+    """Nodes of the first half, by the artifacts that they stand for."""
 
-    points: Any
-    visibility: Any
-    masks: Any
-    pieces: Any
-    """PointLabels: the leaves of the tree."""
-    tree: Any
-    labels: Any
-    """PointLabels: the instances, which the cut through the tree leaves."""
-    parts: Any
-    instances: Any
-    """tuple[InstanceMasks, ...], the background first."""
-    appearances: Any
+    points: PointCloud
+    visibility: tuple[Visibility, ...]
+    masks: tuple[MaskSet, ...]
+    pieces: PointLabels
+    """The leaves of the tree."""
+    tree: Hierarchy
+    labels: PointLabels
+    """The instances, which the cut through the tree leaves."""
+    parts: PointParts
+    instances: tuple[InstanceMasks, ...]
+    """The background first."""
+    appearances: Appearances
     """The views that see each of them."""
-    embeddings: Any
-    """tuple[Embedding, ...], one a view; () without a segmenter."""
-    hinted: Any | None
-    """PointLabels by the objects that were clicked, where some were."""
+    embeddings: tuple[Embedding, ...]
+    """One a view; none without a segmenter."""
+    hinted: PointLabels | None
+    """By the objects that were clicked, where some were."""
 
 
 def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Any]:
@@ -121,7 +139,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     else:
         points = dense(*views, capture.unit, params=params.dense)
     segmenter = networks.segmenter
-    embeddings: Any = ()
+    embeddings: tuple[Embedding, ...] = ()
     if segmenter is not None:
         embeddings = each(capture.frames, names=capture.names, build=lambda frame: embed(frame, model=segmenter))
     seen = each(
@@ -130,11 +148,11 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         names=capture.names,
         build=lambda camera, depth: visibility(points, camera, depth, params=params.visibility),
     )
-    hinted: Any | None = None
+    hinted: PointLabels | None = None
     if capture.masks is not None:
         masks = capture.masks
     elif capture.clicks is not None:
-        masks, hinted = _masks_of_hints(capture, embeddings, points, seen, segmenter, params)
+        masks, hinted = _masks_of_hints(capture, capture.clicks, embeddings, points, seen, segmenter, params)
     elif segmenter is not None:
         masks = each(
             capture.frames,
@@ -163,7 +181,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     tree = hierarchy(points, capture.cameras, pieces, counted, params=params.hierarchy)
     labels = cut(pieces, tree, granularity=granularity)
     parts = cut_parts(pieces, find_parts(observed, masks, pieces, params=params.parts), labels)
-    prompted: Any = ()
+    prompted: tuple[PromptedMasks, ...] = ()
     if segmenter is not None and capture.masks is None:
         prompted = each(
             capture.frames,
@@ -188,8 +206,14 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
 
 
 def _masks_of_hints(
-    capture: Capture, embeddings: Any, points: Any, seen: Any, segmenter: Model | None, params: SplitParams
-) -> tuple[Any, Any]:
+    capture: Capture,
+    clicks: tuple[Clicks, ...],
+    embeddings: tuple[Embedding, ...],
+    points: PointCloud,
+    seen: tuple[Visibility, ...],
+    segmenter: Model | None,
+    params: SplitParams,
+) -> tuple[tuple[MaskSet, ...], PointLabels]:
     """The masks of all views from points clicked in a few, and the points labelled by the clicked objects."""
     if segmenter is None:
         raise InputError(
@@ -198,9 +222,9 @@ def _masks_of_hints(
     clicked = each(
         capture.frames,
         embeddings,
-        capture.clicks,
+        clicks,
         names=capture.names,
-        build=lambda frame, embedding, clicks: hints.clicked(frame, embedding, clicks, model=segmenter),
+        build=lambda frame, embedding, own: hints.clicked(frame, embedding, own, model=segmenter),
     )
     hinted = hints.label(points, seen, clicked, erosion=params.observe.erosion, tau_label=params.propagate.tau_label)
     masks = each(
@@ -228,12 +252,12 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
     views = Views(capture.frames, capture.by_view, capture.depths, capture.unit)
     settings, visibility = params.splat, params.split.visibility
 
-    def of_instance(row: int, build: Callable[[list[int]], Any]) -> Any:
+    def of_instance(row: int, build: Callable[[list[int]], R]) -> R:
         """What `build` makes of the views that see an instance: a step for one instance depends on no others."""
         return expand(halved.appearances, lambda seen_in: build(seen_in.views(row)))
 
     @functools.cache
-    def reconstructed(row: int) -> Any:
+    def reconstructed(row: int) -> Gaussians:
         return of_instance(
             row,
             lambda seen: reconstruct(
@@ -242,7 +266,7 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
         )
 
     @functools.cache
-    def refined(row: int) -> Any:
+    def refined(row: int) -> InstanceMasks:
         return of_instance(
             row,
             lambda seen: refine(
@@ -256,7 +280,7 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
             ),
         )
 
-    def retrained(row: int) -> Any:
+    def retrained(row: int) -> Gaussians:
         return of_instance(
             row,
             lambda seen: retrain(
@@ -268,7 +292,7 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
             ),
         )
 
-    def described(row: int) -> Any:
+    def described(row: int) -> Descriptors:
         return of_instance(
             row,
             lambda seen: describe(
@@ -276,7 +300,7 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
             ),
         )
 
-    def of_each(build: Callable[[int], Any]) -> Any:
+    def of_each(build: Callable[[int], R]) -> tuple[R, ...]:
         return each(halved.instances, INDEX, build=lambda _, row: build(row), on_error="skip")
 
     masks_of_each = of_each(refined)
@@ -302,16 +326,23 @@ def some(views: Views, rows: list[int]) -> Views:
     return Views(pick(views.frames, rows), pick(views.cameras, rows), pick(views.depths, rows), views.unit)
 
 
-def merge_rounds(views: Views, groups: Any, masks: Any, shown: Any, params: Params, number: int) -> Any:
+def merge_rounds(
+    views: Views,
+    groups: tuple[Gaussians, ...],
+    masks: tuple[LabelMap, ...],
+    shown: Appearances,
+    params: Params,
+    number: int,
+) -> tuple[Gaussians, ...]:
     """Merge the pairs that collide, disjoint pairs side by side, until none is left (spec P4).
 
     shown: which views show which instance.
     """
 
-    def build(planned: MergePlan) -> Any:
+    def build(planned: MergePlan) -> tuple[Gaussians, ...]:
         if not len(planned.pairs):
             return groups
-        merged: list[Any] = []
+        merged: list[Gaussians] = []
         for row, (a, b) in enumerate(planned.pairs.tolist()):
             pair, seen = (groups[a], groups[b]), planned.views(row)
             with labelled(f"{number}.{a}+{b}"):

@@ -118,7 +118,7 @@ def _store_of_this_process(location: str) -> Store:
 def find_task(reference: str) -> Task[..., Any]:
     """The task that "module:function" names."""
     module, _, name = reference.partition(":")
-    found: Any = getattr(importlib.import_module(module), name)
+    found: Task[..., Any] = getattr(importlib.import_module(module), name)
     return found
 
 

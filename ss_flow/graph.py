@@ -1,5 +1,7 @@
 """Flows: ordinary functions in which calling a task adds a node to a graph instead of running it.
 
+For type checkers a node is the artifact that it stands for, so a flow is checked like any other function.
+
 A node stands for one artifact, or for a list of artifacts. `each` fans a list out, `expand` lets a result decide what
 comes next, `otherwise` says what stands in for a failed node, a plain sequence of nodes passed to a task is a list.
 """
@@ -11,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
 
 from ss_flow.task import Task
 
@@ -19,7 +21,14 @@ if TYPE_CHECKING:
     import networkx as nx
 
 OnError = Literal["fail", "skip"]
-INDEX: Any = object()
+A = TypeVar("A")
+B = TypeVar("B")
+C = TypeVar("C")
+D = TypeVar("D")
+R = TypeVar("R")
+N = TypeVar("N", bound="Node")
+
+INDEX: Sequence[int] = cast(Any, object())
 """In the place of a list of `each`: the position of the item, a plain number."""
 
 
@@ -136,7 +145,7 @@ class Flow:
             _current.reset(flow_token)
             _item.reset(item_token)
 
-    def attach(self, node: Any) -> Any:
+    def attach(self, node: N) -> N:
         self.nodes.append(node)
         return node
 
@@ -146,7 +155,9 @@ class Flow:
         Raises TypeError when the arguments do not fit the task, or an input is not a node.
         """
         given = task.arguments(args, kwargs)
-        inputs = {name: value if isinstance(value, Node) else gather(value) for name, value in given[0].items()}
+        inputs: dict[str, Any] = {
+            n: value if isinstance(value, Node) else gather(value) for n, value in given[0].items()
+        }
         return self.attach(Call(self, task.name, _item.get(), task, inputs, given[1]))
 
     def graph(self) -> nx.DiGraph:
@@ -173,7 +184,7 @@ def sources_of(node: Node) -> list[Node]:
     return []
 
 
-def gather(nodes: Sequence[Any]) -> Any:
+def gather(nodes: Sequence[A]) -> tuple[A, ...]:
     """A list of the artifacts of several nodes.
 
     Raises TypeError when one of them is not a node.
@@ -181,12 +192,15 @@ def gather(nodes: Sequence[Any]) -> Any:
     for node in nodes:
         if not isinstance(node, Node):
             raise TypeError(f"an input of a task in a flow must be a node, not {type(node).__name__}")
-    return _gathered([(node,) for node in nodes], 0, "fail")
+    rows: list[Any] = [(node,) for node in nodes]
+    return cast(tuple[A, ...], _gathered(rows, 0, "fail"))
 
 
-def pick(nodes: Any, positions: Iterable[int]) -> Any:
+def pick(nodes: Sequence[A], positions: Iterable[int]) -> tuple[A, ...]:
     """Some artifacts of a list, as a list: a task that gets them does not depend on the others."""
-    return _building().attach(Pick(nodes.flow, nodes.step, nodes.item, nodes, tuple(positions)))
+    assert isinstance(nodes, Node)
+    picked = Pick(nodes.flow, nodes.step, nodes.item, nodes, tuple(positions))
+    return cast(tuple[A, ...], _building().attach(picked))
 
 
 def _gathered(rows: list[tuple[Node, ...]], position: int, on_error: OnError) -> Gather:
@@ -194,6 +208,25 @@ def _gathered(rows: list[tuple[Node, ...]], position: int, on_error: OnError) ->
     return flow.attach(Gather(flow, "gather", _item.get(), rows, position, on_error))
 
 
+@overload
+def each(
+    a: Sequence[A], /, *, build: Callable[[A], R], names: Sequence[str] | None = None, on_error: OnError = "fail"
+) -> tuple[R, ...]: ...
+@overload
+def each(
+    a: Sequence[A], b: Sequence[B], /, *, build: Callable[[A, B], R],
+    names: Sequence[str] | None = None, on_error: OnError = "fail",
+) -> tuple[R, ...]: ...  # fmt: skip
+@overload
+def each(
+    a: Sequence[A], b: Sequence[B], c: Sequence[C], /, *, build: Callable[[A, B, C], R],
+    names: Sequence[str] | None = None, on_error: OnError = "fail",
+) -> tuple[R, ...]: ...  # fmt: skip
+@overload
+def each(
+    a: Sequence[A], b: Sequence[B], c: Sequence[C], d: Sequence[D], /, *, build: Callable[[A, B, C, D], R],
+    names: Sequence[str] | None = None, on_error: OnError = "fail",
+) -> tuple[R, ...]: ...  # fmt: skip
 def each(
     *lists: Any,
     build: Callable[..., Any],
@@ -234,19 +267,20 @@ def each(
     return nodes if outputs > 1 else nodes[0]
 
 
-def expand(plan: Any, build: Callable[[Any], Any]) -> Any:
+def expand(plan: A, build: Callable[[A], R]) -> R:
     """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes."""
     flow = _building()
-    return flow.attach(Expand(flow, "expand", _item.get(), [plan], build, loads=True))
+    node = Expand(flow, "expand", _item.get(), [cast(Any, plan)], cast(Any, build), loads=True)
+    return cast(R, flow.attach(node))
 
 
-def otherwise(node: Any, build: Callable[[], Any]) -> Any:
+def otherwise(node: R, build: Callable[[], R]) -> R:
     """A node for the result of `node`, or where that failed, for the result of the node that `build` adds.
 
     The run is then degraded.
     """
     flow = _building()
-    return flow.attach(Otherwise(flow, "otherwise", _item.get(), node, build))
+    return cast(R, flow.attach(Otherwise(flow, "otherwise", _item.get(), cast(Any, node), cast(Any, build))))
 
 
 def stored(name: str, value: str | Sequence[str]) -> Any:

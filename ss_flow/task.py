@@ -170,7 +170,7 @@ def task(
         step = name or _default_name(function)
         declared: Any = Task(function, step, resources, uses, isolate, environment)
         functools.update_wrapper(declared, function)
-        return declared
+        return typing.cast(Task[P, R], declared)
 
     return declare
 

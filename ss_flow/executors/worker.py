@@ -15,7 +15,7 @@ import sys
 import threading
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, cast
 
 from ss_flow.cache.store import Action
 from ss_flow.execute import Cancelled, Invocation, execute_here
@@ -57,7 +57,7 @@ class Worker:
                 elif kind == "raised":
                     raise content
                 else:
-                    return content
+                    return cast(Action, content)
         except (EOFError, BrokenPipeError, ConnectionResetError):
             raise WorkerDied(f"the process of {invocation.label} {self._ending()}") from None
 

@@ -19,12 +19,12 @@ from pathlib import Path
 from ss_flow.flows.generated import RoomParams, generate, write_scene
 
 SHORT = ("reconstruct.min_iterations=10", "reconstruct.max_iterations=10", "merge.min_iterations=2",
-         "merge.max_iterations=2", "merge.global_iterations=5", "split.dense.max_points=60000")  # fmt: skip
+         "merge.max_iterations=2", "merge.global_iterations=5", "split.dense.max_points=400000")  # fmt: skip
 
 
 def run(scene: Path, store: Path) -> list[dict[str, object]]:
     """The nodes of a run."""
-    options = ["--out", str(store.parent / scene.name), "--cache", str(store), "--json", "--preset", "fast"]
+    options = ["--out", str(scene) + "-out", "--cache", str(store), "--json", "--preset", "fast"]
     sets = [f"--set={assignment}" for assignment in SHORT]
     command = [sys.executable, "-c", "from ss_flow.flows.cli.main import entry; entry()", "run", str(scene)]
     return json.loads(subprocess.run([*command, *options, *sets], check=True, capture_output=True).stdout)["nodes"]
