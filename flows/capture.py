@@ -70,7 +70,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     else:
         cameras = sfm(frames, params=params.sfm)
         frames = registered(frames, cameras)
-    names = scene.names if scene.poses is not None else None
+    names = _known_names(scene)
     known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
     masks = truth = pointed = None
     if scene.ready_masks is not None:
@@ -84,7 +84,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     source = params.depth
     if source == "auto":
         source = "sensor" if scene.depths is not None or scene.kind == "sens" else "mvs"
-    depths, placing = _depths(source, scene, reference, params, monodepth, frames, cameras, names), None
+    depths, placing = _depths(source, scene, reference, params, monodepth, frames, cameras), None
     if source == "sensor":
         calibrates = params.calibrate == "depth"
         placing = registration(frames, cameras, depths, advise=not calibrates, params=params.registration)
@@ -98,6 +98,11 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     objects = scene.hints.objects if scene.hints is not None else ()
     by_view, length = views.by_view(cameras), views.unit(cameras, depths)
     return Capture(frames, cameras, by_view, depths, length, masks, truth, names, pointed, objects, placing)
+
+
+def _known_names(scene: SceneFiles) -> tuple[str, ...] | None:
+    """Names of the views, where no photo can still drop out for want of a pose."""
+    return scene.names if scene.poses is not None else None
 
 
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> tuple[Frame, ...]:
@@ -126,9 +131,9 @@ def _depths(
     monodepth: Model | None,
     frames: tuple[Frame, ...],
     cameras: Cameras,
-    names: tuple[str, ...] | None,
 ) -> tuple[DepthMap, ...]:
     """The sensor's depth, a plane sweep over several views ("mvs"), or a network's ("mono")."""
+    names = _known_names(scene)
     if source == "sensor":
         if scene.kind == "sens" and scene.recording is not None:
             return recordings.sens_depth(

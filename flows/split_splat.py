@@ -30,7 +30,7 @@ from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.evaluate.novel_view import novel_view
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.models.catalogue import Model
-from ss_flow.tasks.models.sam import Embedding
+from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
 from ss_flow.tasks.semantics.describe import describe
 from ss_flow.tasks.semantics.name import given_names, name
 from ss_flow.tasks.splat.collisions import MergePlan
@@ -190,8 +190,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
             masks,
             names=capture.names,
             build=lambda frame, embedding, visible, pool: reprompt(
-                frame,
-                embedding,
+                EmbeddedPhoto(frame, embedding),
                 visible,
                 pool,
                 labels,
@@ -224,7 +223,7 @@ def _masks_of_hints(
         embeddings,
         clicks,
         names=capture.names,
-        build=lambda frame, embedding, own: hints.clicked(frame, embedding, own, model=segmenter),
+        build=lambda frame, embedding, own: hints.clicked(EmbeddedPhoto(frame, embedding), own, model=segmenter),
     )
     hinted = hints.label(points, seen, clicked, erosion=params.observe.erosion, tau_label=params.propagate.tau_label)
     masks = each(
@@ -234,8 +233,7 @@ def _masks_of_hints(
         clicked,
         names=capture.names,
         build=lambda frame, embedding, visible, own: hints.spread(
-            frame,
-            embedding,
+            EmbeddedPhoto(frame, embedding),
             visible,
             own,
             hinted,

@@ -41,6 +41,8 @@ class Request:
     """Run only what this output needs."""
     reporter: Reporter | None = None
     """Hears of this flow."""
+    done: Callable[[Report], None] = lambda report: None
+    """Called as soon as this flow has ended."""
 
 
 @dataclass(frozen=True)
@@ -92,14 +94,12 @@ def run_flows(
     executor: str = "threads",
     dry: bool = False,
     recorded: bool = True,
-    done: Callable[[int, Report], None] = lambda position, report: None,
 ) -> list[Report]:
     """Run several flows as one graph; what they share is computed once. Earlier flows go first.
 
     jobs: how many cores to use, 0 = all. memory_mb: how much memory tasks may declare together, 0 = what is free. Both
     are this machine's, or those of the cluster that the executor speaks to.
-    recorded: whether the run is kept among the store's runs; a question about a result need not be. done: called with
-    a flow's position and report as soon as it has ended.
+    recorded: whether the run is kept among the store's runs; a question about a result need not be.
 
     Raises KeyError when `until` names no output, StoreFailure when the store cannot be used, ExecutorLost when whoever
     ran the calls is gone, and KeyboardInterrupt when interrupted: what runs is then told to stop at its next sign of
@@ -108,7 +108,7 @@ def run_flows(
     with contextlib.ExitStack() as stack:
         claims = store.open_claims()
         stack.callback(claims.release_all)
-        run = _Run(requests, store, claims, recorded=recorded and not dry, done=done)
+        run = _Run(requests, store, claims, recorded=recorded and not dry)
         stack.callback(run.close)
         workers = open_executor(executor, jobs or usable_cores(), store, run.progressed)
         try:
@@ -164,9 +164,8 @@ class _Run:
         claims: Claims,
         *,
         recorded: bool,
-        done: Callable[[int, Report], None],
     ) -> None:
-        self._requests, self._store, self._claims, self._done = requests, store, claims, done
+        self._requests, self._store, self._claims = requests, store, claims
         self._recorders = [_Recorder() for _ in requests]
         self._folders = ["" for _ in requests]
         self._healed: set[str] = set()
@@ -220,7 +219,7 @@ class _Run:
             self._reporters[position].event("run ended", failed=len(failures), results=results)
             report = Report(values, settled(self._recorders[position].events), failures, self._folders[position])
             if position not in self._reported:
-                self._done(position, report)
+                self._requests[position].done(report)
             self._reported[position] = report
 
         try:

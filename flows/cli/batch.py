@@ -9,7 +9,8 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -101,7 +102,10 @@ class Batch:
                     book.add(_row(path, "failed", error=words))
                 places = [self.out / folders[path] if options.delivers else None for path in scenes]
                 with _Finishing(store, book, list(zip(scenes.items(), places, strict=True))) as finishing:
-                    run_flows(requests, store, done=finishing.done, **engine)
+                    watched = [
+                        replace(r, done=partial(finishing.done, position)) for position, r in enumerate(requests)
+                    ]
+                    run_flows(watched, store, **engine)
         finally:
             digests.save()
         if options.json:

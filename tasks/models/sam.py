@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, UInt8
+from ss_flow.task import Bundle
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, UInt8
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import open_session, run
 
@@ -32,6 +33,14 @@ class Embedding:
     def scale(self) -> float:
         """Pixels of the network's frame per pixel of the image."""
         return FRAME / max(self.height, self.width)
+
+
+@dataclass(frozen=True)
+class EmbeddedPhoto(Bundle):
+    """A photo and the segmenter's embedding of it: what a prompt needs."""
+
+    frame: Frame
+    embedding: Embedding
 
 
 class Sam:

@@ -14,7 +14,6 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     Bool,
     Clicks,
-    Frame,
     MaskSet,
     PointCloud,
     PointLabels,
@@ -25,7 +24,7 @@ from ss_flow.tasks.masks.erosion import ErosionParams
 from ss_flow.tasks.masks.painting import PaintedView, paint_labels
 from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.models.catalogue import Model
-from ss_flow.tasks.models.sam import Embedding
+from ss_flow.tasks.models.sam import EmbeddedPhoto
 from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.reprompt import Prompt, RepromptParams, prompt, spread_prompts
 from ss_flow.tasks.split.votes.votes import Votes
@@ -38,16 +37,16 @@ _MOST = 0.5
     resources=Resources(cores=1, memory_mb=1500),
     uses=("onnxruntime", "onnx", "opencv-contrib-python-headless"),
 )
-def clicked(frame: Frame, embedding: Embedding, clicks: Clicks, *, model: Model) -> PromptedMasks:
+def clicked(photo: EmbeddedPhoto, clicks: Clicks, *, model: Model) -> PromptedMasks:
     """One mask for each object that was clicked in a view, none in a view without clicks.
 
-    embedding, clicks: those of the frame. Raises InputError when the model cannot be opened.
+    clicks: those of the photo. Raises InputError when the model cannot be opened.
     """
     prompts = {}
     for label in np.unique(clicks.label).tolist():
         of_object = clicks.label == label
         prompts[label] = Prompt(clicks.points[of_object], clicks.inside[of_object])
-    return prompt(frame, embedding, prompts, model)
+    return prompt(photo, prompts, model)
 
 
 @task(uses=("opencv-contrib-python-headless",))
@@ -90,8 +89,7 @@ def label(
     uses=("onnxruntime", "onnx", "opencv-contrib-python-headless", "scipy"),
 )
 def spread(
-    frame: Frame,
-    embedding: Embedding,
+    photo: EmbeddedPhoto,
     visibility: Visibility,
     clicked: PromptedMasks,
     labels: PointLabels,
@@ -102,19 +100,19 @@ def spread(
 ) -> MaskSet:
     """The masks of one view: those of the objects clicked in it, and one for each other object that it sees.
 
-    embedding, visibility, clicked: those of the frame. labels: from `label`. params: from how many points on an object
+    visibility, clicked: those of the photo. labels: from `label`. params: from how many points on an object
     counts as seen, and how prompts are spread over them. An answer of the segmenter is left out that misses most of the
     label's pixels, or holds other labels mostly. contained: as `mask_tree` takes it.
     Raises InputError when the model cannot be opened.
     """
     painted = paint_labels(visibility, labels.label)
-    prompts = spread_prompts(painted, frame.width, set(clicked.label.tolist()), params)
-    found = prompt(frame, embedding, prompts, model)
+    prompts = spread_prompts(painted, photo.frame.width, set(clicked.label.tolist()), params)
+    found = prompt(photo, prompts, model)
     masks = found.dense()
     fits = [_fits(painted, mask, name) for mask, name in zip(masks, found.label.tolist(), strict=True)]
     kept = np.array(fits, bool)
     return mask_set(
-        frame.name,
+        photo.frame.name,
         np.concatenate([clicked.dense(), masks[kept]]),
         np.concatenate([clicked.predicted_iou, found.predicted_iou[kept]]),
         model.name,

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Float64, Frame, Int32, MaskSet, PointLabels, PromptedMasks, Visibility
+from ss_flow.tasks.artifacts import Float64, Int32, MaskSet, PointLabels, PromptedMasks, Visibility
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView, agreement, labels_in_front, paint_labels
 from ss_flow.tasks.masks.selection import SelectionParams, select_masks
 from ss_flow.tasks.models.catalogue import Model
-from ss_flow.tasks.models.sam import Embedding, Sam
+from ss_flow.tasks.models.sam import EmbeddedPhoto, Sam
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 
 
@@ -40,8 +40,7 @@ class RepromptParams:
     uses=("onnxruntime", "onnx", "opencv-contrib-python-headless", "scipy"),
 )
 def reprompt(
-    frame: Frame,
-    embedding: Embedding,
+    photo: EmbeddedPhoto,
     visibility: Visibility,
     masks: MaskSet,
     labels: PointLabels,
@@ -52,14 +51,14 @@ def reprompt(
 ) -> PromptedMasks:
     """Masks for the labels that are visible in a view but that none of its masks shows, or shows well (spec S5).
 
-    embedding, visibility, masks: those of the frame. selection: how the view's own masks are matched to labels, as in
+    visibility, masks: those of the photo. selection: how the view's own masks are matched to labels, as in
     the re-projection. Each such label gets one mask, prompted at points spread over it. Whether the mask agrees with
     the label is for `split.reproject` to judge. Raises InputError when the model cannot be opened.
     """
     painted = paint_labels(visibility, labels.label)
     shown = select_masks(painted, masks, selection)
     good = {label for label, mask in shown.items() if agreement(painted, mask, label) >= params.min_agreement}
-    return prompt(frame, embedding, spread_prompts(painted, frame.width, good, params), model)
+    return prompt(photo, spread_prompts(painted, photo.frame.width, good, params), model)
 
 
 @dataclass(frozen=True)
@@ -84,8 +83,9 @@ def spread_prompts(painted: PaintedView, width: int, shown: set[int], params: Re
     return prompts
 
 
-def prompt(frame: Frame, embedding: Embedding, prompts: dict[int, Prompt], model: Model) -> PromptedMasks:
+def prompt(photo: EmbeddedPhoto, prompts: dict[int, Prompt], model: Model) -> PromptedMasks:
     """The masks of one frame that prompts ask for, by label in ascending order; without any the model is not opened."""
+    frame = photo.frame
     masks = np.zeros((len(prompts), frame.height, frame.width), bool)
     predicted = np.zeros(len(prompts), np.float32)
     if prompts:
@@ -93,7 +93,7 @@ def prompt(frame: Frame, embedding: Embedding, prompts: dict[int, Prompt], model
         valid = decode_valid(frame)
         for row, label in enumerate(sorted(prompts)):
             asked = prompts[label]
-            mask, predicted[row] = sam.predict_prompt(embedding, asked.points, asked.inside)
+            mask, predicted[row] = sam.predict_prompt(photo.embedding, asked.points, asked.inside)
             masks[row] = mask & valid
     return PromptedMasks(
         name=frame.name,

@@ -17,7 +17,7 @@ from ss_flow.tasks.masks.erosion import ErosionParams
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView
 from ss_flow.tasks.models.catalogue import Model, find
-from ss_flow.tasks.models.sam import Embedding
+from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.embed import embed
@@ -100,7 +100,7 @@ def test_without_any_mask_no_point_is_labelled():
 
 
 def test_a_view_without_clicks_opens_no_model():
-    found = hints.clicked(box_scene.frames()[0], NOTHING, no_clicks(), model=ABSENT)
+    found = hints.clicked(EmbeddedPhoto(box_scene.frames()[0], NOTHING), no_clicks(), model=ABSENT)
     assert found.dense().shape == (0, HEIGHT, WIDTH) and len(found.label) == 0
 
 
@@ -109,7 +109,9 @@ def spread_in(seen: Visibility, own: PromptedMasks, label: np.ndarray, model=ABS
     share = np.ones(len(label), np.float32)
     labels = PointLabels(label, share, 3, none, none, none, np.zeros(0, np.float32))
     frame = box_scene.frames()[int(seen.name)]
-    return hints.spread(frame, embedding, seen, own, labels, params=RepromptParams(), contained=0.9, model=model)
+    return hints.spread(
+        EmbeddedPhoto(frame, embedding), seen, own, labels, params=RepromptParams(), contained=0.9, model=model
+    )
 
 
 def every_pixel(view: int) -> tuple[np.ndarray, Visibility]:
@@ -149,7 +151,7 @@ def test_the_segmenter_finds_what_was_clicked_and_not_what_was_excluded(segmente
     ids = box_scene.cast(0)[1]
     frame = box_scene.frames()[0]
     embedding = embed(frame, model=segmenter)
-    found = hints.clicked(frame, embedding, clicks_on(ids, {2: 5, 3: 7}, "0"), model=segmenter)
+    found = hints.clicked(EmbeddedPhoto(frame, embedding), clicks_on(ids, {2: 5, 3: 7}, "0"), model=segmenter)
     assert found.label.tolist() == [5, 7]
     for mask, i in zip(found.dense(), (2, 3), strict=True):
         assert iou(mask, ids == i) > 0.7
@@ -158,7 +160,7 @@ def test_the_segmenter_finds_what_was_clicked_and_not_what_was_excluded(segmente
     both = Clicks(
         "0", np.array([5, 5], np.int32), np.concatenate([inside.points, beside.points]), np.array([1, 0], np.int32)
     )
-    (mask,) = hints.clicked(frame, embedding, both, model=segmenter).dense()
+    (mask,) = hints.clicked(EmbeddedPhoto(frame, embedding), both, model=segmenter).dense()
     column, row = both.points[1].astype(int)
     assert not mask[row, column] and mask[ids == 2].mean() > 0.7
 
@@ -168,12 +170,12 @@ def test_what_is_clicked_in_two_views_gets_masks_in_all_that_see_it(segmenter):
     points = dense(frames, cameras, depths, unit(cameras, depths), params=DenseParams())
     seen = tuple(visibility(points, camera_of(cameras, k), depths[k], params=VisibilityParams()) for k in range(VIEWS))
     ids = [box_scene.cast(k)[1] for k in range(VIEWS)]
-    embeddings = [embed(frame, model=segmenter) for frame in frames]
+    photos = [EmbeddedPhoto(frame, embed(frame, model=segmenter)) for frame in frames]
     clicks = [clicks_on(ids[k], {1: 1, 2: 2}, f"{k}") if k in (0, 3) else no_clicks(f"{k}") for k in range(VIEWS)]
-    own = tuple(hints.clicked(*view, model=segmenter) for view in zip(frames, embeddings, clicks, strict=True))
+    own = tuple(hints.clicked(*view, model=segmenter) for view in zip(photos, clicks, strict=True))
     labels = hints.label(points, seen, own, erosion=ErosionParams(), tau_label=0.7)
     assert set(np.unique(labels.label)) == {0, 1, 2}
-    for k, view in enumerate(zip(frames, embeddings, seen, own, strict=True)):
+    for k, view in enumerate(zip(photos, seen, own, strict=True)):
         found = hints.spread(*view, labels, params=RepromptParams(), contained=0.9, model=segmenter)
         assert found.name == f"{k}"
         for i in (1, 2):

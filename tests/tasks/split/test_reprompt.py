@@ -8,7 +8,7 @@ from box_scene import mask_set
 from ss_flow.tasks.artifacts import PointLabels, Visibility
 from ss_flow.tasks.masks.selection import SelectionParams
 from ss_flow.tasks.models.catalogue import Model, find
-from ss_flow.tasks.models.sam import Embedding
+from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
 from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.reprompt import RepromptParams, reprompt
 
@@ -32,8 +32,7 @@ def test_where_all_labels_have_masks_the_model_is_not_even_opened():
     absent = Model("absent", "sam", (), (), ())
     nothing = Embedding(np.zeros((1, 256, 64, 64), np.float32), box_scene.HEIGHT, box_scene.WIDTH)
     found = reprompt(
-        box_scene.frames()[0],
-        nothing,
+        EmbeddedPhoto(box_scene.frames()[0], nothing),
         seen,
         masks,
         labels,
@@ -52,8 +51,7 @@ def test_a_label_without_a_mask_gets_one_from_the_segmenter():
     ids, seen, masks, labels = box_view(missing=(2,))
     frame = box_scene.frames()[0]
     found = reprompt(
-        frame,
-        embed(frame, model=model),
+        EmbeddedPhoto(frame, embed(frame, model=model)),
         seen,
         masks,
         labels,
@@ -75,11 +73,10 @@ def test_a_mask_that_agrees_badly_with_its_label_is_asked_for_again():
     _, columns = np.nonzero(part[1])
     part[1, :, int(np.quantile(columns, 0.4)) :] = False
     frame = box_scene.frames()[0]
-    embedding = embed(frame, model=model)
+    photo = EmbeddedPhoto(frame, embed(frame, model=model))
     asked = {
         least: reprompt(
-            frame,
-            embedding,
+            photo,
             seen,
             mask_set(part, "0"),
             labels,
