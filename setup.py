@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import shutil
@@ -13,6 +14,7 @@ from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
 NATIVE = Path("tasks/gaussians/native")
+SOURCES, HEADERS = sorted(NATIVE.glob("*.cpp")), sorted(NATIVE.glob("*.h"))
 COMMON = [
     "-std=c++17",
     "-O3",
@@ -44,6 +46,12 @@ def compiler() -> list[str]:
     )
 
 
+def sources_digest() -> str:
+    """As `sources_digest` of tasks/gaussians/library.py finds it when it opens what is built here."""
+    digests = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (*SOURCES, *HEADERS)}
+    return hashlib.sha256(" ".join(f"{name} {digests[name]}" for name in sorted(digests)).encode()).hexdigest()
+
+
 class BuildSharedObjects(build_ext):
     """Compiles each extension to a shared object without a Python ABI."""
 
@@ -56,7 +64,8 @@ class BuildSharedObjects(build_ext):
         # Replaced by a rename: a process that has the old object open keeps it.
         fresh = target.with_suffix(f".{os.getpid()}.tmp")
         more = os.environ.get("CXXFLAGS", "").split()
-        command = [*compiler(), *COMMON, *ext.extra_compile_args, *more, *ext.sources, "-o", str(fresh)]
+        told = f'-DSS_SOURCES="{sources_digest()}"'
+        command = [*compiler(), *COMMON, *ext.extra_compile_args, *more, told, *ext.sources, "-o", str(fresh)]
         try:
             subprocess.run(command, check=True)
             fresh.replace(target)
@@ -83,8 +92,8 @@ setup(
     ext_modules=[
         Extension(
             f"ss_flow.tasks.gaussians._rasterizer_{name}",
-            sources=[str(path) for path in sorted(NATIVE.glob("*.cpp"))],
-            depends=[str(path) for path in sorted(NATIVE.glob("*.h"))],
+            sources=[str(path) for path in SOURCES],
+            depends=[str(path) for path in HEADERS],
             extra_compile_args=flags,
             language="c++",
         )

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import platform
+import hashlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.processor import widest_instruction_set
+
+_FOLDER = Path(__file__).parent
 
 _INT, _INT32, _INT64, _DOUBLE, _FLOAT, _POINTER = (
     ctypes.c_int,
@@ -25,7 +30,9 @@ NATIVE_SOURCES = (
     "native/parallel.h", "native/projection.h", "native/rasterizer.cpp", "native/rows.h", "native/scene.h",
     "native/workspace.h",
 )  # fmt: skip
-"""What the results depend on besides this module: its digests count in the keys of the tasks that use it."""
+"""What the results depend on besides this module: its digests count in the keys of the tasks that use it.
+
+A library that was built from others is refused, or what an old build computes would be kept under new keys."""
 
 
 class Scene(ctypes.Structure):
@@ -59,36 +66,40 @@ class Gradients(ctypes.Structure):
     )
 
 
-_NEEDS = {"avx512": {"avx512f", "avx512bw", "avx512dq", "avx512vl", "fma"}, "avx2": {"avx2", "fma"}, "baseline": set()}
-
-
-def _processor_flags() -> set[str]:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("flags"):
-                return set(line.split(":", 1)[1].split())
-    if platform.system() == "Darwin" and platform.machine() == "x86_64":
-        return {"avx2", "fma"}
-    return set()
+BUILDS = ("avx512", "avx2", "baseline")
+"""The instruction sets that the library is built for (on other processors than x86, the last one alone)."""
 
 
 @functools.cache
 def instruction_set() -> str:
-    """The widest instruction set that this processor has and the library was built for."""
-    flags, folder = _processor_flags(), Path(__file__).parent
-    for name, needs in _NEEDS.items():
-        if needs <= flags and (folder / f"_rasterizer_{name}.so").exists():
-            return name
-    raise RuntimeError(
-        f"The CPU rasterizer is not built in {folder}: install the package again with a C++17 compiler at hand."
-    )
+    """The widest instruction set that this processor has and the library was built for.
+
+    Raises InputError when the library is not built, or was built from other sources.
+    """
+    built = [name for name in BUILDS if _place(name).exists()]
+    if "baseline" not in built:
+        raise InputError(
+            f"The CPU rasterizer is not built in {_FOLDER}; install the package again with a C++17 compiler at hand."
+        )
+    chosen = widest_instruction_set(built)
+    library(chosen)
+    return chosen
 
 
 @functools.cache
 def library(name: str | None = None) -> Any:
-    """The native library, opened; name: an instruction set, by default the processor's widest."""
-    lib = ctypes.CDLL(str(Path(__file__).parent / f"_rasterizer_{name or instruction_set()}.so"))
+    """The native library, opened; name: an instruction set, by default the processor's widest.
+
+    Raises InputError when it was built from other sources than those that count in keys.
+    """
+    if name is None:
+        return library(instruction_set())
+    lib = ctypes.CDLL(str(_place(name)))
+    if _built_from(lib) != sources_digest():
+        raise InputError(
+            f"The CPU rasterizer {_place(name)} was built from other C++ sources than those in {_FOLDER / 'native'}; "
+            "install the package again."
+        )
     by_reference = ctypes.POINTER
     lib.ss_workspace.argtypes = []
     lib.ss_workspace.restype = _POINTER
@@ -114,6 +125,26 @@ def library(name: str | None = None) -> Any:
     lib.ss_adam.argtypes = [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE]
     lib.ss_adam.restype = None
     return lib
+
+
+def sources_digest() -> str:
+    """The digest of the C++ sources beside this module; setup.py writes the same one into what it builds."""
+    digests = {Path(name).name: hashlib.sha256((_FOLDER / name).read_bytes()).hexdigest() for name in NATIVE_SOURCES}
+    return hashlib.sha256(" ".join(f"{name} {digests[name]}" for name in sorted(digests)).encode()).hexdigest()
+
+
+def _built_from(lib: ctypes.CDLL) -> str:
+    """The digest of the sources that an opened library was built from; "" where it does not tell."""
+    try:
+        tell = lib.ss_sources
+    except AttributeError:  # built before it told
+        return ""
+    tell.restype = ctypes.c_char_p
+    return str(tell().decode())
+
+
+def _place(name: str) -> Path:
+    return _FOLDER / f"_rasterizer_{name}.so"
 
 
 class Workspace:

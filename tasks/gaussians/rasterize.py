@@ -20,6 +20,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Gaussians, Int32
 from ss_flow.tasks.gaussians.library import instruction_set
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.processor import on_this_processor
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -121,7 +122,7 @@ def training_device() -> str:
 
 def backend_identity() -> dict[str, str]:
     """What renderings and trainings depend on besides their inputs: the instruction set, and CUDA's rasterizer."""
-    rendering = {"rasterizer": instruction_set()}
+    rendering = {"rasterizer": on_this_processor(instruction_set())}
     return rendering if training_device() == "cpu" else {**rendering, "training": f"gsplat {version('gsplat')}, CUDA"}
 
 

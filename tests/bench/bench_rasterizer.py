@@ -32,6 +32,7 @@ from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.processor import INSTRUCTION_SETS, features
 
 CASES = ((2_000, 160, 120, 0), (10_000, 320, 240, 0), (10_000, 320, 240, 3), (50_000, 640, 480, 0))
 FLAGS = {
@@ -103,7 +104,7 @@ def passes(n: int, width: int, height: int, degree: int, size: float = 0.05) -> 
 
 def rendering() -> None:
     """The four sizes on each instruction set."""
-    for name in (n for n in FLAGS if native._NEEDS[n] <= native._processor_flags()):
+    for name in (n for n in FLAGS if INSTRUCTION_SETS[n] <= features()):
         chosen = native.library(name)
         native_pass.library = lambda chosen=chosen: chosen  # type: ignore[assignment]
         peak = fma_peak(name)

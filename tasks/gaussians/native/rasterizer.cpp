@@ -54,6 +54,9 @@ void reduce(const Scene& s, const projection::View& view, const Frame& frame, in
 
 extern "C" {
 
+// The digest of the sources that this was built from (setup.py).
+const char* ss_sources() { return SS_SOURCES; }
+
 // Memory for a rendering and its gradient, reused by the next; null when there is none.
 void* ss_workspace() {
     try {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import platform
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,11 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.tasks.gaussians import library, native_pass
-from ss_flow.tasks.gaussians.library import _NEEDS, Workspace, _processor_flags
+from ss_flow.tasks.gaussians.library import BUILDS, Workspace
 from ss_flow.tasks.gaussians.library import library as native_library
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, backend_identity, rasterize, training_device
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.processor import INSTRUCTION_SETS, features
 
 _spec = importlib.util.spec_from_file_location("gaussian_reference", Path(__file__).with_name("reference.py"))
 assert _spec is not None and _spec.loader is not None
@@ -130,9 +132,9 @@ def test_every_device_agrees_with_the_reference(device, degree, antialias):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["avx512", "avx2", "baseline"])
+@pytest.mark.parametrize("name", BUILDS)
 def test_every_instruction_set_agrees_with_the_reference(name, monkeypatch):
-    if not _NEEDS[name] <= _processor_flags():
+    if not INSTRUCTION_SETS[name] <= features():
         pytest.skip(f"this processor has no {name}")
     monkeypatch.setattr(native_pass, "library", lambda: native_library(name))
     monkeypatch.setattr(library, "library", lambda: native_library(name))
@@ -335,4 +337,5 @@ def test_shapes_that_do_not_fit_are_refused():
 
 
 def test_the_backend_names_the_instruction_set():
-    assert backend_identity()["rasterizer"] in ("baseline", "avx2", "avx512")
+    architecture, chosen = backend_identity()["rasterizer"].split()
+    assert architecture == platform.machine() and chosen in BUILDS
