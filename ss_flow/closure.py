@@ -1,4 +1,5 @@
-"""The code that a function's result depends on: its own and that of everything in our packages it names.
+"""The code that a function's result depends on: its own, that of everything in our packages it names, and which
+modules of others that imports.
 
 Read from the source, without importing anything: a definition is digested as its syntax tree, so comments, docstrings
 and formatting count for nothing, while an edited helper or constant counts. Names are resolved statically, local
@@ -11,6 +12,7 @@ from __future__ import annotations
 import ast
 import functools
 import importlib.util
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,8 +23,15 @@ from blake3 import blake3
 FOLLOWED = ("ss_flow.tasks", "ss_flow.flows")
 """Packages whose definitions are followed, besides the package of the function itself."""
 
+ENGINE = "ss_flow"
+
 NATIVE_SOURCES = "NATIVE_SOURCES"
 """A module-level tuple of file names, relative to the module: sources of the native code it loads."""
+
+Origin = tuple[str, str | None]
+"""(module, name in it), or (module, None) for the module itself."""
+Imports = dict[str, list[Origin]]
+"""What each local name may be: more than one thing, where it is imported in one branch and in another."""
 
 
 @dataclass
@@ -31,28 +40,42 @@ class _Module:
     path: Path
     is_package: bool
     definitions: dict[str, list[ast.stmt]] = field(default_factory=dict)
-    imports: dict[str, tuple[str, str | None]] = field(default_factory=dict)
-    """Local name -> (module, name in it), or (module, None) for the module itself."""
+    imports: Imports = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Closure:
+    """All that the code of a function consists of."""
+
+    definitions: dict[str, str]
+    """Digests by qualified name, "package.module.name", the function included; of a native source by its file name."""
+    modules: frozenset[str]
+    """Top-level names of the imported modules that are neither ours nor Python's own."""
+
+
+def closure_of(function: Callable[..., Any]) -> Closure:
+    """What a module-level function depends on."""
+    return _closure(function.__module__, function.__qualname__)
 
 
 def code_closure(function: Callable[..., Any]) -> dict[str, str]:
-    """Digests of all definitions that `function` depends on, by qualified name, itself included.
-
-    function: a module-level function. A definition appears as "package.module.name"; a native source as its file name.
-    """
-    return dict(_closure(function.__module__, function.__qualname__))
+    """Digests of all definitions that `function` depends on, by qualified name, itself included."""
+    return dict(closure_of(function).definitions)
 
 
 def forget() -> None:
     """Read the sources anew the next time; a process reads each of them once."""
-    for remembered in (_closure, _digests, _needed, _module):
+    for remembered in (_closure, _digests, _needed, _read, _module):
         remembered.cache_clear()
 
 
 @functools.cache
-def _closure(module_name: str, function_name: str) -> tuple[tuple[str, str], ...]:
-    followed = (*FOLLOWED, module_name.partition(".")[0]) if not module_name.startswith("ss_flow.") else FOLLOWED
+def _closure(module_name: str, function_name: str) -> Closure:
+    own = module_name.partition(".")[0]
+    followed = (*FOLLOWED, own) if own != ENGINE else FOLLOWED
+    known = sys.stdlib_module_names | {ENGINE, own}
     found: dict[str, str] = {}
+    modules: set[str] = set()
     pending = [(module_name, function_name.partition(".")[0])]
     while pending:
         module_name, name = pending.pop()
@@ -60,11 +83,16 @@ def _closure(module_name: str, function_name: str) -> tuple[tuple[str, str], ...
         if module is None or f"{module_name}.{name}" in found:
             continue
         if name not in module.definitions:
-            pending.extend(_follow(module, name, followed))
+            for origin, attribute in module.imports.get(name, ()):
+                modules.add(origin.partition(".")[0])
+                if attribute is not None and origin.startswith(followed):
+                    pending.append((origin, attribute))
             continue
         found |= _digests(module_name, name)
-        pending.extend(_needed(module_name, name, followed))
-    return tuple(sorted(found.items()))
+        needed, imported = _needed(module_name, name, followed)
+        pending.extend(needed)
+        modules |= imported
+    return Closure(dict(sorted(found.items())), frozenset(modules - known))
 
 
 @functools.cache
@@ -72,47 +100,65 @@ def _digests(module_name: str, name: str) -> dict[str, str]:
     """The digest of one definition, and of the native sources of its module."""
     module = _module(module_name)
     assert module is not None
-    text = "\n".join(map(_canonical, module.definitions[name]))
     native = {
         f"{module_name}:{source}": blake3((module.path.parent / source).read_bytes()).hexdigest()
         for source in _native_sources(module)
     }
-    return {f"{module_name}.{name}": blake3(text.encode()).hexdigest()} | native
+    return {f"{module_name}.{name}": blake3(_read(module_name, name)[0].encode()).hexdigest()} | native
 
 
 @functools.cache
-def _needed(module_name: str, name: str, followed: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-    """What one definition names in the packages that are followed."""
+def _needed(
+    module_name: str, name: str, followed: tuple[str, ...]
+) -> tuple[tuple[tuple[str, str], ...], frozenset[str]]:
+    """What one definition names in the packages that are followed, and which top-level modules it imports or names."""
     module = _module(module_name)
     assert module is not None
-    statements = module.definitions[name]
-    return tuple(dict.fromkeys(d for statement in statements for d in _dependencies(module, statement, followed)))
+    nodes = _read(module_name, name)[1]
+    own = _imports(module, nodes)
+    named = {node.id for node in nodes if isinstance(node, ast.Name)} & module.imports.keys()
+    origins = [*own.values(), *(module.imports[name] for name in named)]
+    imported = {origin.partition(".")[0] for several in origins for origin, _ in several}
+    needed = dict.fromkeys(_dependencies(module, nodes, module.imports | own, followed))
+    return tuple(needed), frozenset(imported.union(_loaded_by_name(nodes)))
 
 
-def _follow(module: _Module, name: str, followed: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    """Where a name that a module imports is defined."""
-    origin, attribute = module.imports.get(name, ("", None))
-    if attribute is not None and origin.startswith(followed):
-        yield origin, attribute
+@functools.cache
+def _read(module_name: str, name: str) -> tuple[str, list[ast.AST]]:
+    """One definition as canonical text, and the nodes that count in it."""
+    module = _module(module_name)
+    assert module is not None
+    nodes: list[ast.AST] = []
+    return "\n".join(_canonical(statement, nodes) for statement in module.definitions[name]), nodes
 
 
-def _dependencies(module: _Module, statement: ast.stmt, followed: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    nodes = list(ast.walk(statement))
-    local = module.imports | _imports(module, nodes)
+def _dependencies(
+    module: _Module, nodes: list[ast.AST], local: Imports, followed: tuple[str, ...]
+) -> Iterator[tuple[str, str]]:
     for node in nodes:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            origin, attribute = local.get(node.value.id, ("", ""))
-            if attribute is not None and origin.startswith(followed) and _module(f"{origin}.{attribute}"):
-                yield f"{origin}.{attribute}", node.attr
-            elif attribute is None and origin.startswith(followed):
-                yield origin, node.attr
+            for origin, attribute in local.get(node.value.id, ()):
+                if attribute is not None and origin.startswith(followed) and _module(f"{origin}.{attribute}"):
+                    yield f"{origin}.{attribute}", node.attr
+                elif attribute is None and origin.startswith(followed):
+                    yield origin, node.attr
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
             if node.id in module.definitions:
                 yield module.name, node.id
-            elif node.id in local:
-                origin, attribute = local[node.id]
+            for origin, attribute in local.get(node.id, ()):
                 if attribute is not None and origin.startswith(followed):
                     yield origin, attribute
+
+
+def _loaded_by_name(nodes: list[ast.AST]) -> Iterator[str]:
+    """The top-level modules of `import_module("...")`."""
+    for node in nodes:
+        match node:
+            case ast.Call(
+                func=ast.Name(id="import_module") | ast.Attribute(attr="import_module"),
+                args=[ast.Constant(value=str(name)), *_],
+            ):
+                yield name.partition(".")[0]
 
 
 @functools.cache
@@ -157,19 +203,19 @@ def _bound_names(statement: ast.stmt) -> list[str]:
     return []
 
 
-def _imports(module: _Module, nodes: Any) -> dict[str, tuple[str, str | None]]:
-    found: dict[str, tuple[str, str | None]] = {}
+def _imports(module: _Module, nodes: Any) -> Imports:
+    found: Imports = {}
     for node in nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
-                found[alias.asname or alias.name.partition(".")[0]] = (alias.name, None)
+                found.setdefault(alias.asname or alias.name.partition(".")[0], []).append((alias.name, None))
         elif isinstance(node, ast.ImportFrom):
             package = module.name if module.is_package else module.name.rpartition(".")[0]
             for _ in range(node.level - 1):
                 package = package.rpartition(".")[0]
             origin = f"{package}.{node.module}" if node.level and node.module else node.module or package
             for alias in node.names:
-                found[alias.asname or alias.name] = (origin, alias.name)
+                found.setdefault(alias.asname or alias.name, []).append((origin, alias.name))
     return found
 
 
@@ -180,23 +226,32 @@ def _native_sources(module: _Module) -> tuple[str, ...]:
     return ()
 
 
-def _canonical(node: Any) -> str:
-    """A definition as text in which only what is executed counts.
+def _canonical(node: Any, counted: list[ast.AST]) -> str:
+    """A definition as text in which only what is executed counts; the nodes of that are added to `counted`.
 
     Left out are docstrings (under fields too), and the `@task(...)` decorator: how a task runs (cores, memory) is not
     what it returns.
     """
     if isinstance(node, list):
-        return f"[{','.join(map(_canonical, node))}]"
+        return f"[{','.join([_canonical(item, counted) for item in node])}]"
     if not isinstance(node, ast.AST):
         return repr(node)
-    parts = {name: getattr(node, name, None) for name in node._fields}
-    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-        parts["body"] = [statement for statement in node.body if not _is_docstring(statement)]
-        if not isinstance(node, ast.ClassDef):
-            parts["decorator_list"] = [d for d in node.decorator_list if "task" not in _called_names(d)]
-    fields = ",".join(f"{name}={_canonical(part)}" for name, part in parts.items() if part is not None)
-    return f"{type(node).__name__}({fields})"
+    counted.append(node)
+    fields = []
+    for name in node._fields:
+        part = getattr(node, name, None)
+        if part is None or name == "ctx":  # whether a name is read or written follows from where it stands
+            continue
+        if isinstance(node, _DEFINITIONS):
+            if name == "body":
+                part = [statement for statement in part if not _is_docstring(statement)]
+            elif name == "decorator_list" and not isinstance(node, ast.ClassDef):
+                part = [decorator for decorator in part if "task" not in _called_names(decorator)]
+        fields.append(f"{name}={_canonical(part, counted)}")
+    return f"{type(node).__name__}({','.join(fields)})"
+
+
+_DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 
 
 def _is_docstring(statement: ast.stmt) -> bool:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import importlib.metadata
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ss_flow.cache.canonical import digest
-from ss_flow.closure import code_closure
+from ss_flow.closure import closure_of
+from ss_flow.distributions import version, versions_of
 from ss_flow.task import FileRef, Task
 
-SCHEMA = 2
+SCHEMA = 3
 """Raised when the meaning of keys or of stored objects changes: everything is then computed anew."""
 
 _SIMPLE = (str, int, float, bool, type(None))
@@ -28,22 +27,25 @@ class Recipe:
     """What all calls of a task have in common."""
 
     components: Components
-    """task (schema, name), code (the digest of `closure`), packages (version by name), environment (what the task
-    declares of this machine)."""
+    """task (schema, name), code (the digest of `closure`), packages (version by name, of all that the code imports),
+    environment (what the task declares of this machine)."""
     closure: dict[str, str]
     """Digests of the definitions that the task depends on, by qualified name."""
     digest: str
 
     @classmethod
     def of(cls, task: Task[..., Any]) -> Recipe:
-        closure = code_closure(task.function)
+        closure = closure_of(task.function)
+        packages = {name: version(name) for name in task.uses}
+        for module in sorted(closure.modules):
+            packages |= versions_of(module)
         parts = {
             "task": {"schema": SCHEMA, "name": task.name},
-            "code": digest(closure),
-            "packages": {"python": ".".join(platform.python_version_tuple()[:2])} | {n: _version(n) for n in task.uses},
+            "code": digest(closure.definitions),
+            "packages": {"python": ".".join(platform.python_version_tuple()[:2])} | packages,
             "environment": dict(task.environment()) if task.environment else {},
         }
-        return cls(parts, closure, digest(parts))
+        return cls(parts, closure.definitions, digest(parts))
 
 
 class Keys:
@@ -114,11 +116,3 @@ def _plain(value: Any) -> Any:
 
 def _is_nested(value: Any) -> bool:
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
-
-
-@functools.cache
-def _version(distribution: str) -> str:
-    try:
-        return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return "absent"

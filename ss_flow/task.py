@@ -161,7 +161,7 @@ def task(
     """Declare a function as a task.
 
     name: the step's name; by default the module below `ss_flow.tasks`, and the function where the two differ.
-    uses: distributions whose versions count in the key, besides those of the code itself.
+    uses: distributions whose versions count in the key, besides those that the code imports.
     isolate: run in a process of its own (the library aborts on errors, or is not deterministic beside others).
     environment: what else of this machine the result depends on (say, the instruction set); its items enter the key.
     """

@@ -24,7 +24,6 @@ _SCORES = ("predicted_iou", "score")
 @task(
     name="capture.coco_masks",
     resources=Resources(cores=1, memory_mb=1500),
-    uses=("opencv-contrib-python-headless",),
 )
 def coco_masks(
     frames: tuple[Frame, ...],

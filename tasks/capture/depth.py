@@ -25,7 +25,6 @@ from ss_flow.tasks.geometry.plane_sweep import (
 )
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive, Range
 
-_USES = ("opencv-contrib-python-headless",)
 _COARSE_SIDE = 120
 _COARSE_PLANES = 96
 _CLEAR_COST = 0.25
@@ -69,7 +68,7 @@ class AgreementParams:
     """How far the depths may be apart, as a share of the depth."""
 
 
-@task(name="capture.sweep", uses=_USES)
+@task(name="capture.sweep")
 def sweep(
     frames: tuple[Frame, ...],
     cameras: Cameras,
@@ -101,7 +100,7 @@ def sweep(
     return DepthMap(frames[view].name, np.where(keep, depth, 0).astype(np.float32), "mvs")
 
 
-@task(name="capture.agree", uses=_USES)
+@task(name="capture.agree")
 def agree(
     maps: tuple[DepthMap, ...],
     cameras: Cameras,

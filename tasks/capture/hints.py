@@ -56,7 +56,7 @@ def _points(given: Any, where: str) -> tuple[Point, ...]:
     return tuple((float(x), float(y)) for x, y in given)
 
 
-@task(name="capture.hints", uses=("opencv-contrib-python-headless",))
+@task(name="capture.hints")
 def clicks(
     frames: tuple[Frame, ...],
     cameras: Cameras,

@@ -13,10 +13,8 @@ from ss_flow.tasks.capture.photo_files import read_gray
 from ss_flow.tasks.capture.sensor_depth import resampled
 from ss_flow.tasks.masks.pool import masks_by_id
 
-_USES = ("opencv-contrib-python-headless",)
 
-
-@task(name="capture.ready_masks", uses=_USES)
+@task(name="capture.ready_masks")
 def ready_masks(
     frames: tuple[Frame, ...],
     cameras: Cameras,
@@ -32,7 +30,7 @@ def ready_masks(
     return tuple(masks_by_id(ids, frame.name) for frame, ids in _id_images(frames, cameras, names, files, lenses))
 
 
-@task(name="capture.ground_truth", uses=_USES)
+@task(name="capture.ground_truth")
 def ground_truth(
     frames: tuple[Frame, ...],
     cameras: Cameras,

@@ -21,7 +21,6 @@ from ss_flow.tasks.capture.scene_files import Pose
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.ranges import Count, JpegQuality
 
-_USES = ("opencv-contrib-python-headless",)
 _UPRIGHT = {2: "flip", 3: "180", 4: "flip 180", 5: "flip 270", 6: "90", 7: "flip 90", 8: "270"}
 
 
@@ -35,7 +34,7 @@ class IngestParams:
     """Quality at which photos are encoded again when they must be; 0 keeps them lossless as PNG."""
 
 
-@task(name="capture.ingest", uses=_USES)
+@task(name="capture.ingest")
 def frames(
     *,
     names: tuple[str, ...],

@@ -13,6 +13,7 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.geometry.alignment import fit_scale_shift
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.ranges import Count, Fraction, Positive
 
 _MEAN = np.array((0.485, 0.456, 0.406), np.float32)
@@ -41,7 +42,7 @@ class MonoParams:
     """Depths beyond so many times the farthest known depth are unknown."""
 
 
-@task(name="capture.mono", uses=("onnxruntime", "opencv-contrib-python-headless"))
+@task(name="capture.mono", environment=network_identity)
 def mono(
     frame: Frame,
     cameras: Cameras,

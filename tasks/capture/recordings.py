@@ -17,8 +17,6 @@ from ss_flow.tasks.capture.photo_files import inspect
 from ss_flow.tasks.capture.sensor_depth import registered_depth
 from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
-_USES = ("opencv-contrib-python-headless",)
-
 
 @dataclass(frozen=True)
 class VideoParams:
@@ -38,7 +36,7 @@ class VideoParams:
     """Quality at which frames are encoded."""
 
 
-@task(name="capture.video_frames", uses=_USES)
+@task(name="capture.video_frames")
 def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tuple[Frame, ...]:
     """Sharp frames spread over a video, named `frame-000000` and on by their place in it.
 
@@ -111,7 +109,7 @@ def _encode(image: UInt8, index: int, params: VideoParams) -> Frame:
     return Frame(f"frame-{index:06d}", w, h, encoded, np.zeros(0, np.uint8), width, height)
 
 
-@task(name="capture.sens_frames", uses=_USES)
+@task(name="capture.sens_frames")
 def sens_frames(
     *,
     recording: FileRef,
@@ -136,7 +134,7 @@ def sens_frames(
     return tuple(result)
 
 
-@task(name="capture.sens_depth", uses=_USES)
+@task(name="capture.sens_depth")
 def sens_depth(
     frames: tuple[Frame, ...], *, recording: FileRef, names: tuple[str, ...], entries: tuple[int, ...]
 ) -> tuple[DepthMap, ...]:

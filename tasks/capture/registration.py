@@ -60,7 +60,7 @@ class _View:
     """[2] the principal point."""
 
 
-@task(name="capture.registration", uses=("opencv-contrib-python-headless", "scipy"))
+@task(name="capture.registration")
 def registration(
     frames: Sequence[Frame],
     cameras: Cameras,
@@ -102,7 +102,7 @@ def registration(
     return result
 
 
-@task(name="capture.calibrated", uses=("opencv-contrib-python-headless",))
+@task(name="capture.calibrated")
 def calibrated(
     frames: Sequence[Frame], cameras: Cameras, depths: Sequence[DepthMap], registration: Registration
 ) -> tuple[DepthMap, ...]:

@@ -15,7 +15,7 @@ from ss_flow.tasks.capture.photo_files import read_gray
 from ss_flow.tasks.geometry.images import decode_valid
 
 
-@task(name="capture.sensor_depth", uses=("opencv-contrib-python-headless",))
+@task(name="capture.sensor_depth")
 def depth(
     frames: tuple[Frame, ...],
     *,

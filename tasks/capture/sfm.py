@@ -56,7 +56,7 @@ class SfmParams:
     """Sparse points seen in fewer photos are dropped."""
 
 
-@task(resources=Resources(cores=_MATCHING_THREADS), uses=("pycolmap", "opencv-contrib-python-headless"), isolate=True)
+@task(resources=Resources(cores=_MATCHING_THREADS), isolate=True)
 def sfm(frames: tuple[Frame, ...], *, params: SfmParams = SfmParams(), seed: int = 0) -> Cameras:
     """Cameras of those frames that COLMAP's largest model registers, in the frames' order (spec S2).
 
@@ -92,7 +92,7 @@ def sfm(frames: tuple[Frame, ...], *, params: SfmParams = SfmParams(), seed: int
     return result
 
 
-@task(name="capture.registered", uses=("opencv-contrib-python-headless",))
+@task(name="capture.registered")
 def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]:
     """The frames that have a camera, in the cameras' order, as a pinhole would have taken them.
 

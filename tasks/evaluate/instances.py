@@ -70,7 +70,7 @@ def transfer_nearest(
     return result
 
 
-@task(uses=("scipy",))
+@task()
 def evaluate_points(
     points: PointCloud,
     labels: PointLabels,
@@ -89,7 +89,7 @@ def evaluate_points(
     return Metrics(ig_metrics(truth.label - 1, predicted, compat_gap_bug=compat_gap_bug))
 
 
-@task(uses=("scipy",))
+@task()
 def evaluate_gaussians(
     scene: Gaussians,
     truth_points: PointCloud,
@@ -103,7 +103,7 @@ def evaluate_gaussians(
     return Metrics(ig_metrics(truth.label - 1, predicted, compat_gap_bug=compat_gap_bug))
 
 
-@task(uses=("scipy",))
+@task()
 def evaluate_masks(
     predicted: tuple[LabelMap, ...],
     truth: tuple[LabelMap, ...],

@@ -21,7 +21,6 @@ _PSNR_OF_EQUALS = 100.0
 
 @task(
     resources=Resources(cores=1),
-    uses=("opencv-contrib-python-headless", "scipy", "torch"),
     environment=backend_identity,
 )
 def novel_view(

@@ -11,10 +11,19 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
+from ss_flow.tasks.processor import on_this_processor, widest_instruction_set
 
 if TYPE_CHECKING:
     import onnx
     import onnxruntime
+
+
+def network_identity() -> dict[str, str]:
+    """What the outputs of a network depend on besides the network, its inputs and ONNX Runtime: the instruction set.
+
+    ONNX Runtime picks its kernels by the widest one, and sums in another order in each. For the `environment` of tasks.
+    """
+    return {"instruction set": on_this_processor(widest_instruction_set())}
 
 
 def open_session(

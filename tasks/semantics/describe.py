@@ -14,6 +14,7 @@ from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, UIn
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.masks.erosion import ErosionParams, erode
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.ranges import Count, Fraction, Natural, Positive
 from ss_flow.tasks.semantics.encoders import encoder_of
 
@@ -40,7 +41,7 @@ class DescribeParams:
     """How much of the mask's border is left out."""
 
 
-@task(resources=Resources(cores=1, memory_mb=1200), uses=("opencv-contrib-python-headless", "onnxruntime"))
+@task(resources=Resources(cores=1, memory_mb=1200), environment=network_identity)
 def describe(
     frames: tuple[Frame, ...],
     instance: InstanceMasks,

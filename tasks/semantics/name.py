@@ -10,6 +10,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Descriptors, Float32, Int32, PointLabels
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.colour_words import TERMS, ColourWords
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.semantics.encoders import encoder_of
 
 # fmt: off
@@ -43,7 +44,7 @@ class InstanceNames:
     """[G] ids of the instances whose name is the user's own."""
 
 
-@task(uses=("onnxruntime",))
+@task(environment=network_identity)
 def name(
     descriptors: tuple[Descriptors, ...], *, encoder: Model | None = None, vocabulary: tuple[str, ...] = HOUSEHOLD
 ) -> InstanceNames:

@@ -10,6 +10,7 @@ from ss_flow.errors import InputError
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Descriptors, Float32, Int32, UInt8
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.ranges import Positive
 from ss_flow.tasks.semantics.encoders import encoder_of
 
@@ -52,7 +53,7 @@ class QueryResult:
         return [int(i) for i in self.instance_id[self.matched > 0]]
 
 
-@task(uses=("onnxruntime",))
+@task(environment=network_identity)
 def query(
     descriptors: tuple[Descriptors, ...],
     *,

@@ -97,7 +97,6 @@ class Quality:
 @task(
     name="splat.merge_pair",
     resources=Resources(cores=1, most_cores=8, memory_mb=2000, gpus=0.25),
-    uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=backend_identity,
 )
 def merge_pair(
@@ -201,7 +200,6 @@ def assemble(groups: tuple[Gaussians, ...]) -> Gaussians:
 @task(
     name="splat.global_pass",
     resources=Resources(cores=1, most_cores=8, memory_mb=4000, gpus=0.5),
-    uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=backend_identity,
 )
 def global_pass(

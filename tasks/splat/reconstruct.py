@@ -79,7 +79,6 @@ class ReconstructParams:
 @task(
     name="splat.reconstruct",
     resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.25),
-    uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=backend_identity,
 )
 def reconstruct(
@@ -109,7 +108,6 @@ def reconstruct(
 @task(
     name="splat.retrain",
     resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.25),
-    uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=backend_identity,
 )
 def retrain(

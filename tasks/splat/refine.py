@@ -23,6 +23,7 @@ from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.masks.packing import grown
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Positive
 
@@ -79,8 +80,7 @@ class RenderedMask:
 @task(
     name="splat.refine",
     resources=Resources(cores=1, memory_mb=1800),
-    uses=("onnxruntime", "opencv-contrib-python-headless", "scipy"),
-    environment=backend_identity,
+    environment=lambda: backend_identity() | network_identity(),
 )
 def refine(
     views: Views,

@@ -44,7 +44,6 @@ class RenderMasksParams:
 @task(
     name="splat.render_masks",
     resources=Resources(cores=1, memory_mb=1000),
-    uses=("opencv-contrib-python-headless",),
     environment=backend_identity,
 )
 def render_masks(

@@ -50,7 +50,7 @@ def resolve(cameras: Cameras, instances: tuple[InstanceMasks, ...]) -> tuple[Lab
     return _painted(sizes, instances, kept_on_top=False)
 
 
-@task(uses=("opencv-contrib-python-headless",))
+@task()
 def resolve_refined(
     views: Views,
     instances: tuple[InstanceMasks, ...],

@@ -35,7 +35,7 @@ class DenseParams:
     """How many views must confirm a point, where as many see it."""
 
 
-@task(uses=("opencv-contrib-python-headless", "scipy"))
+@task()
 def dense(
     frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...], unit: SceneUnit, *, params: DenseParams
 ) -> PointCloud:

@@ -56,7 +56,6 @@ class DenseSplattingParams:
 
 @task(
     resources=Resources(cores=1, most_cores=8, memory_mb=4000, gpus=0.5),
-    uses=("torch", "opencv-contrib-python-headless", "scipy"),
     environment=backend_identity,
 )
 def dense_splatting(

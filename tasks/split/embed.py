@@ -6,10 +6,11 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Frame
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, Sam
 
 
-@task(resources=Resources(cores=1, memory_mb=1500), uses=("onnxruntime", "onnx", "opencv-contrib-python-headless"))
+@task(resources=Resources(cores=1, memory_mb=1500), environment=network_identity)
 def embed(frame: Frame, *, model: Model) -> Embedding:
     """The embedding of one photo (4 MB); it takes as long as some twenty prompts.
 

@@ -57,7 +57,7 @@ class HierarchyParams:
     """What is a wall or a floor rather than a thing."""
 
 
-@task(name="split.hierarchy", uses=("scipy",))
+@task(name="split.hierarchy")
 def hierarchy(
     points: PointCloud,
     cameras: Cameras,

@@ -24,6 +24,7 @@ from ss_flow.tasks.masks.erosion import ErosionParams
 from ss_flow.tasks.masks.painting import PaintedView, paint_labels
 from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import EmbeddedPhoto
 from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.reprompt import Prompt, RepromptParams, prompt, spread_prompts
@@ -33,10 +34,7 @@ _MOST = 0.5
 """Share of the labelled pixels that counts as most of them."""
 
 
-@task(
-    resources=Resources(cores=1, memory_mb=1500),
-    uses=("onnxruntime", "onnx", "opencv-contrib-python-headless"),
-)
+@task(resources=Resources(cores=1, memory_mb=1500), environment=network_identity)
 def clicked(photo: EmbeddedPhoto, clicks: Clicks, *, model: Model) -> PromptedMasks:
     """One mask for each object that was clicked in a view, none in a view without clicks.
 
@@ -49,7 +47,7 @@ def clicked(photo: EmbeddedPhoto, clicks: Clicks, *, model: Model) -> PromptedMa
     return prompt(photo, prompts, model)
 
 
-@task(uses=("opencv-contrib-python-headless",))
+@task()
 def label(
     points: PointCloud,
     visibility: tuple[Visibility, ...],
@@ -84,10 +82,7 @@ def label(
     )
 
 
-@task(
-    resources=Resources(cores=1, memory_mb=1500),
-    uses=("onnxruntime", "onnx", "opencv-contrib-python-headless", "scipy"),
-)
+@task(resources=Resources(cores=1, memory_mb=1500), environment=network_identity)
 def spread(
     photo: EmbeddedPhoto,
     visibility: Visibility,

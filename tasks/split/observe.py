@@ -51,7 +51,7 @@ class ObserveParams:
     """Which points inside a mask are kept."""
 
 
-@task(uses=("opencv-contrib-python-headless", "scipy"))
+@task()
 def observe(
     points: PointCloud, visibility: Visibility, masks: MaskSet | PromptedMasks, *, params: ObserveParams
 ) -> Observation:

@@ -42,7 +42,7 @@ class _PartMask:
     """[M] the object's points under it, ascending."""
 
 
-@task(name="split.parts", uses=("scipy",))
+@task(name="split.parts")
 def find_parts(
     observations: Sequence[Observation], masks: Sequence[MaskSet], labels: PointLabels, *, params: PartsParams
 ) -> PointParts:

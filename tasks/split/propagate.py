@@ -52,7 +52,7 @@ class PropagateParams:
     1 keeps all."""
 
 
-@task(uses=("scipy", "opencv-contrib-python-headless"))
+@task()
 def propagate(
     points: PointCloud,
     visibility: Sequence[Visibility],

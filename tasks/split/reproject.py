@@ -55,7 +55,7 @@ class ReprojectParams:
     """Views with a mask below which an instance is weak: kept as points, not reconstructed."""
 
 
-@task(uses=("opencv-contrib-python-headless",))
+@task()
 def reproject(
     points: PointCloud,
     visibility: Sequence[Visibility],

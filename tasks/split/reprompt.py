@@ -14,6 +14,7 @@ from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView, agreement, labels_in_front, paint_labels
 from ss_flow.tasks.masks.selection import SelectionParams, select_masks
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Sam
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 
@@ -35,10 +36,7 @@ class RepromptParams:
     """Whether the outermost points are no prompts."""
 
 
-@task(
-    resources=Resources(cores=1, memory_mb=1500),
-    uses=("onnxruntime", "onnx", "opencv-contrib-python-headless", "scipy"),
-)
+@task(resources=Resources(cores=1, memory_mb=1500), environment=network_identity)
 def reprompt(
     photo: EmbeddedPhoto,
     visibility: Visibility,

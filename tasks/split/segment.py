@@ -18,6 +18,7 @@ from ss_flow.tasks.masks.overlap import drop_duplicates, mask_iou, suppress
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree, merge_union, whole_pictures, without_speckles
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
 
@@ -108,7 +109,7 @@ class _Candidates:
 @task(
     name="split.segment",
     resources=Resources(cores=1, memory_mb=1500),
-    uses=("onnxruntime", "onnx", "opencv-contrib-python-headless"),
+    environment=network_identity,
 )
 def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model: Model) -> MaskSet:
     """The masks that Segment Anything finds in one view (Split&Splat, M_k; spec S1).

@@ -60,7 +60,6 @@ class SegmentRgbdParams:
 @task(
     name="split.segment_rgbd",
     resources=Resources(cores=1, memory_mb=500),
-    uses=("opencv-contrib-python-headless",),
 )
 def segment_rgbd(frame: Frame, depth: DepthMap, cameras: Cameras, *, params: SegmentRgbdParams) -> MaskSet:
     """The masks of one view from its colours and its depth alone (the place of Split&Splat's M_k; spec S1).

@@ -13,7 +13,7 @@ _REACH = 5.0
 """How far a label's area reaches round its points, in pixels of an image with a diagonal of 800."""
 
 
-@task(name="split.tally", uses=("opencv-contrib-python-headless",))
+@task(name="split.tally")
 def tally(visibility: Visibility, masks: MaskSet, labels: PointLabels) -> Tally:
     """How many of each label's points lie under each mask of a view.
 

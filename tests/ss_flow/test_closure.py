@@ -125,3 +125,60 @@ def test_native_sources_of_a_module_count(package, tmp_path):
 def test_functions_that_call_each_other_end(package):
     step = "def run(x):\n    return other(x)\n\ndef other(x):\n    return run(x)\n"
     assert set(package(step=step)) == {"probe.step.run", "probe.step.other"}
+
+
+def modules_of(package, **modules: str) -> frozenset[str]:
+    package(**modules)
+    return closure.closure_of(importlib.import_module("probe.step").run).modules
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "import scipy.ndimage\n\ndef run(x):\n    return scipy.ndimage.label(x)\n",
+        "def run(x):\n    import scipy.ndimage as nd\n    return nd.label(x)\n",
+        "def run(x):\n    from scipy.ndimage import label\n    return label(x)\n",
+        "def run(x):\n    import scipy  # for what it does when it is imported\n    return x\n",
+        "def run(x):\n    def inner():\n        import scipy\n    return inner\n",
+        "from probe.maths import label\n\ndef run(x):\n    return label(x)\n",
+        "from probe import maths\n\ndef run(x):\n    return maths.label(x)\n",
+        "from probe.maths import outer\n\ndef run(x):\n    return outer(x)\n",
+        "import importlib\n\ndef run(x):\n    return importlib.import_module('scipy.ndimage')\n",
+        "try:\n    import scipy as lib\nexcept ImportError:\n    import math as lib\n\ndef run(x):\n    return lib\n",
+    ],
+    ids=[
+        "top", "local alias", "local name", "never named", "nested", "through another module",
+        "attribute of another module", "of a helper", "by name", "one of two",
+    ],
+)  # fmt: skip
+def test_every_form_of_import_of_a_library_is_seen(package, step):
+    maths = "from scipy.ndimage import label\n\ndef outer(x):\n    return label(x)\n"
+    assert modules_of(package, step=step, maths=maths) == {"scipy"}
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "import scipy\n\ndef run(x):\n    return x\n",
+        "import math\nfrom collections import abc\n\ndef run(x):\n    import os.path\n    return math, abc, os\n",
+        "from probe.maths import twice\nfrom ss_flow.running import warn\n\ndef run(x):\n    return warn(twice(x))\n",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import scipy\n\ndef run(x: 'scipy'):\n    return x\n",
+        "import scipy\nfrom ss_flow.task import task\n\n"
+        "@task(environment=lambda: {'x': scipy})\ndef run(x: int) -> int:\n    return x\n",
+    ],
+    ids=["not used", "of Python", "ours", "for type checkers", "of the task's declaration"],
+)
+def test_what_no_result_depends_on_is_not_among_the_libraries(package, step):
+    assert modules_of(package, step=step, maths=MATHS) == frozenset()
+
+
+def test_of_two_things_imported_under_one_name_both_are_followed(package):
+    step = """
+        def run(x):
+            if x:
+                from probe.maths import twice as chosen
+            else:
+                from probe.maths import unrelated as chosen
+            return chosen(x)
+    """
+    assert {"probe.maths.twice", "probe.maths.unrelated"} <= set(package(step=step, maths=MATHS))
