@@ -89,12 +89,12 @@ def collect(
 
     others: dict[str, Tally] = defaultdict(Tally)
     results = _sweep_results(store, plan, others, dry=dry)
-    if not living:  # a run that starts a job counts on the closure that it found
-        codes = {plan.survey.actions[key].code for key in plan.staying}
-        for closure in store.closures():
-            unwanted = closure.name not in codes and closure.used < before
-            if unwanted and (dry or store.drop_closure(closure.name, unused_since=before)):
-                others["closures"].add(closure.bytes)
+    if not living:  # a run that starts a job counts on the parts that it found
+        named = frozenset[str]().union(*(plan.survey.actions[key].parts for key in plan.staying))
+        for part in store.parts():
+            unwanted = part.name not in named and part.used < before
+            if unwanted and (dry or store.drop_part(part.name, unused_since=before)):
+                others["parts of keys"].add(part.bytes)
     with writing(store.root):
         for file, size in _old_files(store.root, ("checkpoints/*",), before):
             if file.stem not in living:

@@ -1,6 +1,6 @@
 """A store in a bucket, with a folder of this machine before it.
 
-The bucket holds objects, actions, closures and claims, under the names that they have in a folder. The folder is a
+The bucket holds objects, actions, parts and claims, under the names that they have in a folder. The folder is a
 store of its own: everything is written there first, and what was read once is there the next time. Runs, pins,
 checkpoints and the digests of input files are in the folder alone.
 
@@ -189,8 +189,8 @@ class RemoteStore(Store):
         self._bucket.each(lambda key: self._fetch(self.action_path(key)), found.keys() - here.keys())
         yield from found.values()
 
-    def closures(self) -> Iterator[Entry]:
-        yield from self._merged({entry.name: entry for entry in super().closures()}, "closures").values()
+    def parts(self) -> Iterator[Entry]:
+        yield from self._merged({entry.name: entry for entry in super().parts()}, "parts").values()
 
     def _merged(self, here: dict[str, Entry], folder: str) -> dict[str, Entry]:
         found = dict(here)
@@ -207,10 +207,10 @@ class RemoteStore(Store):
             found = super().action(key, whole=whole)
         return found
 
-    def closure(self, code: str) -> dict[str, str]:
-        found = super().closure(code)
-        if not found and self._fetch(self._closure_path(code)):
-            found = super().closure(code)
+    def part(self, name: str) -> Any:
+        found = super().part(name)
+        if found is None and self._fetch(self._part_path(name)):
+            found = super().part(name)
         return found
 
     def _fetch(self, path: Path) -> bool:

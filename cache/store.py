@@ -2,7 +2,7 @@
 
     objects/aa/<digest>/    Zarr groups
     actions/aa/<key>.json   key -> output digests, the key's components, seconds, memory, host, warnings
-    closures/<digest>.json  which definitions a digest of code stands for
+    parts/<digest>.json     what a digest in an action's components stands for: definitions of code, members of a list
     claims/<key>            who is computing what, now
     roots/runs/, roots/pins/    what must be kept: a manifest and an event log for every run; what the user pinned
     checkpoints/            what long tasks keep of half-done work, by key
@@ -76,8 +76,8 @@ class Action:
     is_list: bool
     """Whether the task returned a list (of any length) rather than one artifact."""
     components: dict[str, Any]
-    """What the key is the digest of: task, code (of which only the digest), parameters, inputs, packages, environment.
-    """
+    """What the key is the digest of: task, code, parameters, inputs, packages, environment. Of the code and of each
+    input only a digest: that of an object, or else of one of the store's parts."""
     seconds: float
     peak_rss_mb: float
     host: str = field(default_factory=socket.gethostname)
@@ -98,7 +98,7 @@ class Store:
         self._lock = threading.Lock()
         self._actions = f"{root}/actions"
         self._objects = f"{root}/objects"
-        for name in ("objects", "actions", "closures", "claims", "roots/runs", "roots/pins", "tmp"):
+        for name in ("objects", "actions", "parts", "claims", "roots/runs", "roots/pins", "tmp"):
             (root / name).mkdir(parents=True, exist_ok=True)
 
     def object_path(self, object_digest: str) -> Path:
@@ -256,21 +256,20 @@ class Store:
         """Publish an action; its outputs must be stored already."""
         self._write(self.action_path(action.key), json.dumps(vars(action), separators=(",", ":")))
 
-    def put_closure(self, code: str, closure: dict[str, str]) -> None:
-        """Keep which definitions a digest of code stands for."""
-        if not self._closure_path(code).exists():
-            self._write(self._closure_path(code), json.dumps(closure, separators=(",", ":")))
+    def put_part(self, name: str, part: Any) -> None:
+        """Keep what a digest in the components of actions stands for, once for all of them; plain data."""
+        if not self._part_path(name).exists():
+            self._write(self._part_path(name), json.dumps(part, separators=(",", ":")))
 
-    def closure(self, code: str) -> dict[str, str]:
-        """The digests of definitions, by qualified name, that a digest of code stands for; {} when not known."""
+    def part(self, name: str) -> Any:
+        """What a digest in the components of an action stands for; None when not known."""
         try:
-            found: dict[str, str] = json.loads(self._closure_path(code).read_text())
+            return json.loads(self._part_path(name).read_text())
         except (OSError, ValueError):
-            return {}
-        return found
+            return None
 
-    def _closure_path(self, code: str) -> Path:
-        return self.root / "closures" / f"{code}.json"
+    def _part_path(self, name: str) -> Path:
+        return self.root / "parts" / f"{name}.json"
 
     def find(self, prefix: str) -> list[str]:
         """Digests of the stored objects that begin with `prefix` (at least two characters)."""
@@ -314,13 +313,13 @@ class Store:
                     stale += 1
         return stale
 
-    def closures(self) -> Iterator[Entry]:
-        """Every closure, by the digest of code."""
-        return _records(f"{self.root}/closures")
+    def parts(self) -> Iterator[Entry]:
+        """Every part, by its digest."""
+        return _records(f"{self.root}/parts")
 
-    def drop_closure(self, code: str, *, unused_since: float = math.inf) -> bool:
-        """Take a closure out; False when it is not there, or was written since."""
-        return self._take_out(self._closure_path(code), unused_since)
+    def drop_part(self, name: str, *, unused_since: float = math.inf) -> bool:
+        """Take a part out; False when it is not there, or was written since."""
+        return self._take_out(self._part_path(name), unused_since)
 
 
 def _records(folder: str) -> Iterator[Entry]:

@@ -27,7 +27,8 @@ class Record:
     step: str
     """Empty when the record cannot be read."""
     outputs: frozenset[str]
-    code: str
+    parts: frozenset[str]
+    """Digests in its components that may stand for parts."""
     used: float
     bytes: int
 
@@ -91,6 +92,8 @@ class Survey:
 def _record(store: Store, entry: Entry) -> Record:
     action = store.action(entry.name, whole=False)
     if action is None:
-        return Record("", frozenset(), "", entry.used, entry.bytes)
-    code = str(action.components.get("code", ""))
-    return Record(action.step, frozenset(action.outputs), code, entry.used, entry.bytes)
+        return Record("", frozenset(), frozenset(), entry.used, entry.bytes)
+    inputs = action.components.get("inputs")
+    named = [action.components.get("code"), *(inputs.values() if isinstance(inputs, dict) else ())]
+    parts = frozenset(digest for digest in named if isinstance(digest, str))
+    return Record(action.step, frozenset(action.outputs), parts, entry.used, entry.bytes)

@@ -19,7 +19,7 @@ class Damage:
     """Something that was taken out."""
 
     kind: str
-    """object, action or closure."""
+    """object, action or part."""
     name: str
     reason: str
 
@@ -30,7 +30,7 @@ class Verified:
 
     objects: Tally
     actions: Tally
-    closures: Tally
+    parts: Tally
     incomplete: int
     """Actions with an output that is not there; they count for nothing, and the next run makes them again."""
     damaged: tuple[Damage, ...]
@@ -38,20 +38,20 @@ class Verified:
 
 
 def verify(store: Store, progress: Callable[[int, int], None] = lambda done, total: None) -> Verified:
-    """Check every object, action and closure of a store against its name; take out what is damaged.
+    """Check every object, action and part of a store against its name; take out what is damaged.
 
     An object is damaged when its content is not what its name says, or when this version cannot read it; an action when
-    its record cannot be read or is that of another key; a closure when its content is not what its name says.
+    its record cannot be read or is that of another key; a part when its content is not what its name says.
 
     progress: hears how many objects are done, of how many.
     Raises StoreFailure when the store cannot be used.
     """
     damaged: list[Damage] = []
-    closures, actions, objects = Tally(), Tally(), Tally()
-    for entry in store.closures():
-        closures.add(entry.bytes)
-        if digest(store.closure(entry.name)) != entry.name and store.drop_closure(entry.name):
-            damaged.append(Damage("closure", entry.name, "its content is not what its name says"))
+    parts, actions, objects = Tally(), Tally(), Tally()
+    for entry in store.parts():
+        parts.add(entry.bytes)
+        if digest(store.part(entry.name)) != entry.name and store.drop_part(entry.name):
+            damaged.append(Damage("part", entry.name, "its content is not what its name says"))
     needed: dict[str, tuple[str, ...]] = {}
     for entry in store.actions():
         actions.add(entry.bytes)
@@ -69,7 +69,7 @@ def verify(store: Store, progress: Callable[[int, int], None] = lambda done, tot
                 damaged.append(Damage("object", entry.name, fault))
             progress(objects.count, len(entries))
     incomplete = sum(not all(output in store for output in outputs) for outputs in needed.values())
-    return Verified(objects, actions, closures, incomplete, tuple(damaged))
+    return Verified(objects, actions, parts, incomplete, tuple(damaged))
 
 
 def _fault(store: Store, object_digest: str) -> str:

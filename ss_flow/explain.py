@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ss_flow.keys import Components
 
 SHOWN_CHARACTERS = 60
+SHOWN_ITEMS = 3
 
 
-def first_difference(before: Components, now: Components) -> str:
+def first_difference(before: Components, now: Components, items: Callable[[str], str] = lambda name: "") -> str:
     """One phrase that names the first part of a key that changed; code as a closure, digests by qualified name.
 
-    Ordered from cause to effect: the task's own parameters, its code, packages and machine come before its inputs,
-    which may have changed only because of another step. Returns "" when nothing differs.
+    items: says which items of an input changed (see `changed_items`), "" where it is no list. Ordered from cause to
+    effect: the task's own parameters, its code, packages and machine come before its inputs, which may have changed
+    only because of another step. Returns "" when nothing differs.
     """
     if before["task"] != now["task"]:
         return "the format of keys changed"
@@ -30,7 +33,7 @@ def first_difference(before: Components, now: Components) -> str:
         old, new = (_shown(side["environment"], name) for side in (before, now))
         return f"{name} of this machine {old} -> {new}"
     for name in changed_inputs(before, now):
-        return f"input {name} changed{_which(before['inputs'].get(name), now['inputs'].get(name))}"
+        return f"input {name} changed{items(name)}"
     return ""
 
 
@@ -49,10 +52,15 @@ def _shown(values: dict[str, Any], name: str) -> str:
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
 
 
-def _which(before: Any, now: Any) -> str:
-    """For a list, how many of its items differ."""
-    if not isinstance(before, list) or not isinstance(now, list):
-        return ""
+def changed_items(before: Sequence[str], now: Sequence[str], names: Sequence[str]) -> str:
+    """How many items of a list differ and, where not all do, what the first of them are called.
+
+    names: of the items as they are now.
+    """
     if len(before) != len(now):
         return f" ({len(before)} -> {len(now)} items)"
-    return f" ({sum(a != b for a, b in zip(before, now, strict=True))} of {len(now)} items)"
+    changed = [name for name, old, new in zip(names, before, now, strict=True) if old != new]
+    said = f"{len(changed)} of {len(now)} items"
+    if len(changed) < len(now):
+        said += f": {', '.join(changed[:SHOWN_ITEMS])}{', ...' if len(changed) > SHOWN_ITEMS else ''}"
+    return f" ({said})"

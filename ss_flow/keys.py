@@ -54,6 +54,7 @@ class Keys:
     def __init__(self) -> None:
         self._recipes: dict[int, tuple[object, Recipe]] = {}
         self._parameters: dict[int, tuple[object, str]] = {}
+        self._lists: dict[tuple[str, ...], str] = {}
 
     def recipe(self, task: Task[..., Any]) -> Recipe:
         """What all calls of the task have in common."""
@@ -69,18 +70,30 @@ class Keys:
         given = [
             (name, value if type(value) in _SIMPLE else self._digest(name, value)) for name, value in parameters.items()
         ]
-        return digest((self.recipe(task).digest, given, list(inputs.items())))
+        counted = [(name, self.input(value)) for name, value in inputs.items()]
+        return digest((self.recipe(task).digest, given, counted))
+
+    def input(self, value: Value) -> str:
+        """What an input counts as: the digest of an artifact, or that of a list of such digests."""
+        if isinstance(value, str):
+            return value
+        if value not in self._lists:
+            self._lists[value] = digest(value)
+        return self._lists[value]
 
     def components(
         self, task: Task[..., Any], inputs: Mapping[str, Value], parameters: Mapping[str, Any]
     ) -> Components:
         """All that the key of one call is made from, as plain data: those of the recipe, parameters (by dotted name)
-        and inputs (digests by name)."""
+        and inputs (a digest by name, also for a list, so that its length does not count in every record)."""
         flat: dict[str, Any] = {}
         for name, value in parameters.items():
             flat |= _flat("" if name == "params" else name, value)
-        plain = {name: value if isinstance(value, str) else list(value) for name, value in inputs.items()}
-        return {**self.recipe(task).components, "parameters": flat, "inputs": plain}
+        return {
+            **self.recipe(task).components,
+            "parameters": flat,
+            "inputs": {name: self.input(value) for name, value in inputs.items()},
+        }
 
     def _digest(self, name: str, value: Any) -> str:
         if not dataclasses.is_dataclass(value):

@@ -104,6 +104,20 @@ class Resolution:
                 return node.step
         return node.step
 
+    def item_names(self, node: Node) -> list[str]:
+        """What the items of a node's list are called: as the nodes that they come from, or else by their numbers."""
+        while node in self._expanded:
+            node = self._expanded[node]
+        value = self.values[node]
+        assert isinstance(value, tuple)
+        names: list[str] = []
+        if isinstance(node, Gather):
+            names = [row[node.position].item for row in self._whole_rows(node)]
+        elif isinstance(node, Pick):
+            among = self.item_names(node.source)
+            names = [among[position] for position in node.positions]
+        return names if len(names) == len(value) and all(names) else [str(index) for index in range(len(value))]
+
     def _await(self, node: Node, sources: Sequence[Node]) -> None:
         missing = [source for source in sources if source not in self.values]
         for source in missing:
@@ -158,16 +172,19 @@ class Resolution:
         return None
 
     def _gathered(self, node: Gather) -> Value | Failure:
-        whole = node.rows
-        failures = [value for row in whole for n in row if isinstance(value := self.values[n], Failure)]
-        if failures:
-            whole = [row for row in whole if not any(isinstance(self.values[n], Failure) for n in row)]
+        whole = self._whole_rows(node)
+        if len(whole) < len(node.rows):
+            failures = [value for row in node.rows for n in row if isinstance(value := self.values[n], Failure)]
             if node.on_error == "fail" or not whole:
                 return failures[0]
             for failure in failures:
                 if isinstance(failure.error, NotRun):
                     return failure
         return _flattened(self.values[row[node.position]] for row in whole)
+
+    def _whole_rows(self, node: Gather) -> list[tuple[Node, ...]]:
+        """Those in which nothing failed."""
+        return [row for row in node.rows if not any(isinstance(self.values[n], Failure) for n in row)]
 
     def _expand(self, node: Expand) -> None:
         values: list[Any] = [self.values[source] for source in node.sources]

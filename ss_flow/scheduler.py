@@ -23,7 +23,7 @@ from ss_flow.events import Reporter
 from ss_flow.execute import Invocation
 from ss_flow.executors import Executor, ExecutorLost
 from ss_flow.executors.worker import WorkerDied
-from ss_flow.explain import first_difference
+from ss_flow.explain import changed_items, first_difference
 from ss_flow.graph import Call, Flow, Node
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.keys import Components, Keys, Value
@@ -153,7 +153,10 @@ class Scheduler:
             self._graph.settle(node, Failure(node.label, NotRun("not run")))
             return
         recipe = self._keys.recipe(node.task)
-        self._store.put_closure(recipe.components["code"], recipe.closure)
+        self._store.put_part(recipe.components["code"], recipe.closure)
+        for name, value in inputs.items():
+            if not isinstance(value, str):
+                self._store.put_part(parts["inputs"][name], value)
         function = node.task.function
         invocation = Invocation(
             key=key,
@@ -181,8 +184,20 @@ class Scheduler:
         before = self._store.action(known, whole=False)
         if before is None or known == key:
             return "its result is no longer in the store"
-        old = {**before.components, "code": self._store.closure(before.components["code"])}
-        return first_difference(old, {**parts, "code": self._keys.recipe(node.task).closure})
+        closure = self._keys.recipe(node.task).closure
+        code = before.components["code"]
+        known_code = closure if code == parts["code"] else self._store.part(code) or {}
+        items = functools.partial(self._changed_items, node, before.components["inputs"])
+        return first_difference({**before.components, "code": known_code}, {**parts, "code": closure}, items)
+
+    def _changed_items(self, node: Call, before: Mapping[str, str], name: str) -> str:
+        now = self._graph.values[node.inputs[name]]
+        if not isinstance(now, tuple) or name not in before:
+            return ""
+        then = self._store.part(before[name])
+        if not isinstance(then, list):  # it was one artifact; or what its digest stood for is no longer known
+            return ""
+        return changed_items(then, now, self._graph.item_names(node.inputs[name]))
 
     def _submit(self) -> None:
         """Hand out what fits into the tokens that are left."""

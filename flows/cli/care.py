@@ -208,7 +208,8 @@ class CacheVerify:
             print(json.dumps(asdict(seen), indent=1))
         else:
             out = console(json=False)
-            out.print(_table("read", {"objects": seen.objects, "results": seen.actions, "closures": seen.closures}, {}))
+            rows = {"objects": seen.objects, "results": seen.actions, "parts of keys": seen.parts}
+            out.print(_table("read", rows, {}))
             for damage in seen.damaged[:SHOWN]:
                 out.print(escape(f"taken out: {damage.kind} {damage.name[:12]} {damage.reason}"))
             if len(seen.damaged) > SHOWN:

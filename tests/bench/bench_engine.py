@@ -1,6 +1,6 @@
 """What the engine costs: seconds a node beside a minimal loop and other tools, growth to 100,000 nodes, bytes a second.
 
-    python tests/bench/bench_engine.py [--nodes 1000] [--scale 1000 10000 50000]
+    python tests/bench/bench_engine.py [--nodes 1000] [--scale 1000 10000 50000] [--views 2000] [--instances 100]
 
 A flow of trivial tasks fans out over N numbers and in again. The yardstick is the least that can be done: a loop with
 blake3 keys, an SQLite table and NPY files. joblib, Hamilton, redun and doit are measured where they are installed
@@ -160,6 +160,33 @@ def once(folder: Path, count: int) -> None:
     print(warm, int(status["VmHWM"].split()[0]) / 1024)
 
 
+def long_lists(views: int, instances: int) -> None:
+    """Instances that each take three lists of all views: processor seconds of a run, and the size of its records."""
+    import ss_flow_bench_tasks as tasks
+
+    from ss_flow.cache.store import Store
+    from ss_flow.engine import run_flow
+
+    def seconds(folder: Path) -> float:
+        begun = time.process_time()
+        report = run_flow(lambda: tasks.views_by_instances(views, instances), Store(folder), scene="bench")
+        assert not report.failures
+        return time.process_time() - begun
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        first, again = seconds(folder), statistics.median(seconds(folder) for _ in range(ROUNDS))
+        records = [r for r in folder.glob("actions/*/*.json") if b'"step":"bench.instance"' in r.read_bytes()]
+        sizes = [record.stat().st_size for record in records]
+        everything = sum(r.stat().st_size for kind in ("actions", "parts") for r in folder.glob(f"{kind}/**/*.json"))
+        for record in records:
+            record.unlink()
+        alone = seconds(folder)
+    print(f"{views} views, {len(records)} instances that take three lists of them; load {os.getloadavg()[0]:.1f}")
+    print(f"first run {first:.2f} s of processor time, the instances alone {alone:.2f}, all there {again:.2f}")
+    print(f"record of an instance {statistics.mean(sizes) / 1e3:.1f} kB, all records {everything / 1e6:.2f} MB")
+
+
 def throughput() -> None:
     import zarr
     from zarr.codecs import BloscCodec
@@ -234,12 +261,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--nodes", type=int, default=1000)
     parser.add_argument("--scale", type=int, nargs="*", default=[1000, 10_000, 50_000])
+    parser.add_argument("--views", type=int, default=2000)
+    parser.add_argument("--instances", type=int, default=100)
     parser.add_argument("--once", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.once:
         once(Path(options.once[0]), int(options.once[1]))
         return
     overhead(options.nodes)
+    long_lists(options.views, options.instances)
     throughput()
     scale(options.scale)
 

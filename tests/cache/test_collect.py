@@ -174,7 +174,7 @@ def test_actions_that_can_never_be_hits_go_although_a_run_names_them(store):
 def test_leftovers_are_swept_by_age(store):
     used, unused = act(store, "used", 1, code="aa" * 32), "bb" * 32
     for code in ("aa" * 32, unused):
-        store.put_closure(code, {"f": code})
+        store.put_part(code, {"f": code})
     place = store.checkpoint("gone").parent
     place.mkdir()
     names = [place / "gone.npz", place / "gone.partial", place / "claimed.npz", store.root / ".files.json.1"]
@@ -187,14 +187,28 @@ def test_leftovers_are_swept_by_age(store):
     claims = store.open_claims()
     claims.take("claimed")
     done = collect(store, held(used))
-    assert "closures" not in done.others, "a run that is alive may be about to use one"
+    assert "parts of keys" not in done.others, "a run that is alive may be about to use one"
     assert {name for name in names if name.exists()} == {place / "claimed.npz"}
     assert done.others["checkpoints"].count == 2 and done.others["temporary files"].count == 3
     claims.release_all()
     done = collect(store, held(used))
-    assert [p.stem for p in (store.root / "closures").iterdir()] == ["aa" * 32]
-    assert done.others["closures"].count == 1
+    assert [p.stem for p in (store.root / "parts").iterdir()] == ["aa" * 32]
+    assert done.others["parts of keys"].count == 1
     assert [p.name for p in place.iterdir()] == ["fresh.npz"]
+
+
+def test_a_list_of_inputs_stays_as_long_as_a_record_names_it(store):
+    wanted, other = digest(["a", "b"]), digest(["b", "a"])
+    for name, members in ((wanted, ["a", "b"]), (other, ["b", "a"])):
+        store.put_part(name, members)
+    components = {"code": "aa" * 32, "inputs": {"frames": wanted, "cameras": "cc" * 32}}
+    key = digest("uses the list")
+    store.record(Action(key, "step", (put(store, 1),), False, components, 1.0, 10.0))
+    age_all(store.root)
+    collect(store, held(key))
+    assert [entry.name for entry in store.parts()] == [wanted]
+    collect(store, held())
+    assert list(store.parts()) == []
 
 
 ages = st.floats(1.5, 100)

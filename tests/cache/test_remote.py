@@ -297,7 +297,7 @@ def test_an_object_that_the_bucket_lost_is_restored_from_here_when_it_is_whole(h
     assert damaged not in there and damaged not in here
 
 
-# Actions and closures
+# Actions and parts of keys
 
 
 def test_an_action_is_found_elsewhere_while_its_outputs_are_there(here, there, bucket):
@@ -348,10 +348,11 @@ def test_an_action_is_recorded_in_the_bucket_before_here(here, monkeypatch):
     assert not here.action_path(action.key).exists()
 
 
-def test_what_a_digest_of_code_stands_for_is_known_elsewhere(here, there):
-    here.put_closure("code", {"a.b": "1"})
-    assert there.closure("code") == {"a.b": "1"}
-    assert there.closure("other") == {}
+def test_what_a_digest_of_code_or_of_a_list_stands_for_is_known_elsewhere(here, there):
+    here.put_part("code", {"a.b": "1"})
+    here.put_part("list", ("12", "34"))
+    assert (there.part("code"), there.part("list")) == ({"a.b": "1"}, ["12", "34"])
+    assert there.part("other") is None
 
 
 # A whole flow
@@ -391,7 +392,7 @@ def test_a_flow_heals_what_is_damaged_in_the_bucket(here, there, bucket):
 
 def test_nothing_in_the_bucket_is_a_credential(here, bucket, monkeypatch):
     run(here)
-    kept = [bucket.get(name)[0] for folder in ("actions", "closures", "claims") for name in names(bucket, folder)]
+    kept = [bucket.get(name)[0] for folder in ("actions", "parts", "claims") for name in names(bucket, folder)]
     kept += [path.read_bytes() for path in (here.root / "roots").rglob("*") if path.is_file()]
     assert kept
     assert not [content for content in kept if b"SECRET" in content or b'"test"' in content]
@@ -404,14 +405,14 @@ def test_listings_tell_what_the_bucket_and_this_machine_hold(here, there, bucket
     value = here.put(label_map())
     action = action_of(value)
     here.record(action)
-    here.put_closure("ab" * 32, {"a.b": "1"})
+    here.put_part("ab" * 32, {"a.b": "1"})
     size = sum(meta.bytes for meta in bucket.files("objects"))
     for store in (here, there):
         (entry,) = store.objects()
         assert (entry.name, entry.bytes) == (value, size)
         assert abs(entry.used - time.time()) < 10
         assert [entry.name for entry in store.actions()] == [action.key]
-        assert [entry.name for entry in store.closures()] == ["ab" * 32]
+        assert [entry.name for entry in store.parts()] == ["ab" * 32]
         assert store.find(value[:7]) == [value]
         assert store.find(value[:1]) == store.find("zz") == []
         assert store.size(value) == size
@@ -421,18 +422,18 @@ def test_listings_tell_what_the_bucket_and_this_machine_hold(here, there, bucket
 
 
 def test_files_of_other_hands_in_the_bucket_are_not_listed(here, bucket):
-    for name in ("objects/x", "objects/aa/b/c", "objects/README/a", "actions/aa/notes.txt", "closures/x"):
+    for name in ("objects/x", "objects/aa/b/c", "objects/README/a", "actions/aa/notes.txt", "parts/x"):
         bucket.put(name, b"x")
-    assert [*here.objects(), *here.actions(), *here.closures()] == []
+    assert [*here.objects(), *here.actions(), *here.parts()] == []
 
 
 def test_what_is_discarded_or_forgotten_is_gone_everywhere(here, there, bucket):
     action = action_of(here.put(label_map()))
     here.record(action)
-    here.put_closure("code", {"a": "1"})
+    here.put_part("code", {"a": "1"})
     there.get(action.outputs[0])
-    assert there.discard(action.outputs[0]) and there.forget(action.key) and there.drop_closure("code")
-    assert [names(bucket, folder) for folder in ("objects", "actions", "closures")] == [[], [], []]
+    assert there.discard(action.outputs[0]) and there.forget(action.key) and there.drop_part("code")
+    assert [names(bucket, folder) for folder in ("objects", "actions", "parts")] == [[], [], []]
     assert action.outputs[0] not in there
     assert there.action(action.key, whole=False) is None
     assert not there.discard(action.outputs[0]) and not there.forget(action.key)

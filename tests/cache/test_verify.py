@@ -13,8 +13,8 @@ CLOSURE = {"tasks.step": "00" * 32}
 
 @pytest.fixture
 def filled(store):
-    """Twenty actions with an output each, and a closure."""
-    store.put_closure(digest(CLOSURE), CLOSURE)
+    """Twenty actions with an output each, and the closure that they name."""
+    store.put_part(digest(CLOSURE), CLOSURE)
     for number in range(20):
         output = store.put(LabelMap(str(number), np.full((9, 9), number, np.uint16)))
         store.record(Action(digest(number), "step", (output,), False, {"code": digest(CLOSURE)}, 1.0, 10.0))
@@ -29,7 +29,7 @@ def test_a_whole_store_is_read_to_the_end_and_stays_as_it_is(filled):
     heard = []
     seen = verify(filled, lambda done, total: heard.append((done, total)))
     assert (seen.damaged, seen.incomplete) == ((), 0)
-    assert (seen.objects.count, seen.actions.count, seen.closures.count) == (20, 20, 1)
+    assert (seen.objects.count, seen.actions.count, seen.parts.count) == (20, 20, 1)
     assert heard == [(done, 20) for done in range(1, 21)]
     assert all(filled.action(digest(number)) is not None for number in range(20))
 
@@ -46,13 +46,13 @@ def test_each_damaged_thing_is_named_and_taken_out_and_only_that(filled):
     filled.action_path(digest(5)).write_text("{")
     misplaced = filled.action_path(digest(7))
     misplaced.write_text(filled.action_path(digest(8)).read_text())
-    (filled.root / "closures" / f"{digest(CLOSURE)}.json").write_text('{"tasks.step": "changed"}')
+    (filled.root / "parts" / f"{digest(CLOSURE)}.json").write_text('{"tasks.step": "changed"}')
     seen = verify(filled)
     assert {(damage.kind, damage.name) for damage in seen.damaged} == {
         ("object", broken),
         ("action", digest(5)),
         ("action", digest(7)),
-        ("closure", digest(CLOSURE)),
+        ("part", digest(CLOSURE)),
     }
     assert seen.incomplete == 1, "the action whose output was taken out"
     lost = {number for number in range(20) if Store(filled.root).action(digest(number)) is None}

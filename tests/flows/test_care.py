@@ -92,7 +92,7 @@ def test_without_runs_and_pins_nothing_is_left(warm):
     age_all(warm.store)
     assert gc(warm.store, "--keep-runs", "0").code == 0
     assert entries(warm.store) == (set(), set())
-    assert list((warm.store / "roots/runs").iterdir()) == list((warm.store / "closures").iterdir()) == []
+    assert list((warm.store / "roots/runs").iterdir()) == list((warm.store / "parts").iterdir()) == []
 
 
 def test_what_is_pinned_stays_whatever_is_asked(warm):

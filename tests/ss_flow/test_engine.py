@@ -10,7 +10,8 @@ import ss_flow_toy as toy
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
-from ss_flow.graph import INDEX, Flow, each, gather, otherwise, pick
+from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick
+from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
 
@@ -316,9 +317,84 @@ def test_why_names_the_first_changed_part_and_runs_are_kept_in_order(store):
     report = run(store, lambda: toy.flow(limit=5.0))
     why = {n["label"]: n["why"] for n in report.nodes if n["event"] == "finished"}
     assert why["ss_flow_toy.clip[n2]"] == "parameter limit 100.0 -> 5.0"
-    assert why["ss_flow_toy.total"] == "input xs changed (1 of 3 items)"
+    assert why["ss_flow_toy.total"] == "input xs changed (1 of 3 items: n2)"
     latest = next(latest_runs(store.root / "roots" / "runs", "toy"))
     assert next(latest.events())["event"] == "run started"
+
+
+def why_total(report) -> str:
+    return next(n["why"] for n in report.nodes if n["label"] == "ss_flow_toy.total")
+
+
+def squares_of(*values):
+    names = [f"n{i}" for i in range(len(values))]
+    return {"total": toy.total(each(toy.source(values=values), build=toy.square, names=names))}
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ((1.0, 2.0, 3.0, 5.0), "(1 of 4 items: n3)"),
+        ((0.0, 2.0, 0.0, 4.0), "(2 of 4 items: n0, n2)"),
+        ((9.0, 8.0, 7.0, 6.0), "(4 of 4 items)"),
+        ((1.0, 2.0), "(4 -> 2 items)"),
+    ],
+)
+def test_why_names_the_items_of_a_list_that_changed(store, values, said):
+    run(store, lambda: squares_of(1.0, 2.0, 3.0, 4.0))
+    assert why_total(run(store, lambda: squares_of(*values))) == f"input xs changed {said}"
+
+
+def test_why_numbers_the_items_of_a_list_that_have_no_names(store):
+    run(store, lambda: {"total": toy.total(toy.source(values=(1.0, 2.0, 3.0)))})
+    report = run(store, lambda: {"total": toy.total(toy.source(values=(1.0, 2.0, 4.0)))})
+    assert why_total(report) == "input xs changed (1 of 3 items: 2)"
+
+
+def test_why_names_the_items_of_a_part_of_a_list_as_the_whole_does(store):
+    def flow(*values):
+        names = [f"n{i}" for i in range(len(values))]
+        squares = each(toy.source(values=values), build=toy.square, names=names)
+        return {"total": toy.total(pick(squares, [1, 3]))}
+
+    run(store, lambda: flow(1.0, 2.0, 3.0, 4.0))
+    report = run(store, lambda: flow(1.0, 2.0, 3.0, 5.0))
+    assert why_total(report) == "input xs changed (1 of 2 items: n3)"
+
+
+def test_why_knows_no_items_when_the_store_has_lost_the_list(store):
+    run(store, lambda: squares_of(1.0, 2.0))
+    for part in store.parts():
+        store.drop_part(part.name)
+    assert why_total(run(store, lambda: squares_of(1.0, 3.0))) == "input xs changed"
+
+
+def test_a_record_does_not_grow_with_the_lists_that_go_in_and_a_list_is_kept_once(store):
+    def totals(count):
+        numbers = toy.source(values=tuple(float(i) for i in range(count)))
+        with labelled("plain"):
+            plain = toy.total(numbers)
+        with labelled("streamed"):
+            return {"plain": plain, "streamed": toy.streamed_total(numbers)}
+
+    sizes = []
+    for count in (3, 300):
+        report = run(store, lambda count=count: totals(count))
+        keys = [n["key"] for n in report.nodes if n["step"] != "ss_flow_toy.source"]
+        sizes.append([store.action_path(key).stat().st_size for key in keys])
+        inputs = {store.action(key).components["inputs"]["xs"] for key in keys}
+        (digest_of_list,) = inputs
+        source = next(n for n in report.nodes if n["step"] == "ss_flow_toy.source")
+        assert store.part(digest_of_list) == source["outputs"] and len(source["outputs"]) == count
+        sizes[-1].sort()
+    assert all(abs(few - many) < 20 for few, many in zip(*sizes, strict=True)), sizes
+
+
+def test_lists_that_differ_only_in_order_or_length_have_other_keys():
+    task, keys = toy.total, Keys()
+    lists = [("aa", "bb"), ("bb", "aa"), ("aa",), ("aa", "bb", "bb"), ("aabb",), ()]
+    assert len({keys.key(task, {"xs": each_list}, {}) for each_list in lists}) == len(lists)
+    assert keys.key(task, {"xs": ("aa",)}, {}) != keys.key(task, {"xs": "aa"}, {})
 
 
 def test_a_cut_last_line_of_the_event_log_is_left_out(store):
