@@ -13,12 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
+from typing import Any, Literal, TypeVar, cast, overload
 
 from ss_flow.task import Task
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 OnError = Literal["fail", "skip"]
 A = TypeVar("A")
@@ -159,15 +156,6 @@ class Flow:
             n: value if isinstance(value, Node) else gather(value) for n, value in given[0].items()
         }
         return self.attach(Call(self, task.name, _item.get(), task, inputs, given[1]))
-
-    def graph(self) -> nx.DiGraph:
-        """What feeds what, over all the nodes known so far."""
-        import networkx as nx
-
-        graph: nx.DiGraph = nx.DiGraph()
-        graph.add_nodes_from(self.nodes)
-        graph.add_edges_from((source, node) for node in self.nodes for source in sources_of(node))
-        return graph
 
 
 def sources_of(node: Node) -> list[Node]:

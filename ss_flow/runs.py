@@ -14,9 +14,12 @@ import uuid
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ss_flow.cache.files import write_atomically
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 DONE = ("hit", "finished")
 RUNS_BACK = 5
@@ -57,6 +60,23 @@ class Run:
     def nodes(self) -> list[dict[str, Any]]:
         """The events of the nodes that have a result."""
         return [event for event in settled(self.events()) if event["event"] in DONE]
+
+    def graph(self) -> nx.MultiDiGraph[str]:
+        """The steps that have results: `count` of each, and an edge for each input, by its name, from what makes it.
+
+        Merging goes round by round, so steps can feed each other though their nodes form a DAG.
+        """
+        import networkx as nx
+
+        graph: nx.MultiDiGraph[str] = nx.MultiDiGraph()
+        nodes = self.nodes()
+        for node in nodes:
+            graph.add_node(node["step"], count=graph.nodes.get(node["step"], {}).get("count", 0) + 1)
+        for node in nodes:
+            for name, producer in node["inputs"].items():
+                if producer in graph and producer != node["step"]:
+                    graph.add_edge(producer, node["step"], key=name)
+        return graph
 
 
 def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -158,19 +158,12 @@ class Graph:
     """Where results are kept."""
 
     def run(self) -> int:
-        run = latest_run(self.store.existing_store(), self.scene)
-        counts: dict[str, int] = defaultdict(int)
-        edges: dict[tuple[str, str, str], None] = {}
-        for node in run.nodes():
-            counts[node["step"]] += 1
-            for name, producer in node["inputs"].items():
-                edges[producer, name, node["step"]] = None
+        graph = latest_run(self.store.existing_store(), self.scene).graph()
         print("flowchart TD")
-        for step, count in counts.items():
+        for step, count in graph.nodes(data="count"):
             print(f'  {step}["{step}{f" x {count}" if count > 1 else ""}"]')
-        for producer, name, step in edges:
-            if producer in counts and producer != step:
-                print(f"  {producer} -->|{name}| {step}")
+        for producer, step, name in graph.edges(keys=True):
+            print(f"  {producer} -->|{name}| {step}")
         return 0
 
 
