@@ -97,12 +97,12 @@ class Bucket:
             return [path.rpartition("/")[2] for path in self._store.list_with_delimiter(folder)["common_prefixes"]]
 
     def put(self, name: str, content: bytes | Path) -> None:
-        """Write a file, over what is there."""
+        """Write a file; one of that name is replaced."""
         with self._reaching():
             self._store.put(name, content)
 
     def create(self, name: str, content: bytes | Path) -> bool:
-        """Write a file; False when there is one already."""
+        """Write a file; False when one of that name is there already."""
         from obstore.exceptions import AlreadyExistsError
 
         with self._reaching():
@@ -113,7 +113,7 @@ class Bucket:
         return True
 
     def replace(self, seen: Meta, content: bytes) -> bool:
-        """Write a file, over the very version that was seen; False when that is no longer there."""
+        """Replace a file that is still the version that was seen; False when it is not."""
         from obstore.exceptions import PreconditionError
 
         with self._reaching():

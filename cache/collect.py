@@ -99,7 +99,7 @@ def collect(
         for file, size in _old_files(store.root, ("checkpoints/*",), before):
             if file.stem not in living:
                 _take(file, size, others["checkpoints"], dry=dry)
-        # Who writes a file now needs it whatever the grace period.
+        # These files may be being written now, so they are kept for a while whatever the grace period is.
         for file, size in _old_files(store.root, HIDDEN, now - GRACE_SECONDS):
             _take(file, size, others["temporary files"], dry=dry)
     if not dry:

@@ -2,9 +2,9 @@
 
 Notes
 -----
-*Concurrent writers.* Each saves the whole table by rename; what the loser had learnt is learnt again.
+*Concurrent writers.* Each saves the whole table by rename; what the table that was replaced knew besides is read again.
 
-*A damaged table* is noticed by its own digest, and learnt again.
+*A damaged table* is noticed by its own digest, and the files are read again.
 
 *A file changed within the clock's resolution, at equal size*, is missed; `verify=True` reads every file again.
 """

@@ -227,7 +227,7 @@ class RemoteStore(Store):
         return True
 
     def _write(self, path: Path, text: str) -> None:
-        self._bucket.put(self._name(path), text.encode())  # first: what is here is not looked for there
+        self._bucket.put(self._name(path), text.encode())  # first, since what is here is never looked for in the bucket
         super()._write(path, text)
 
     def _beginning(self, two: str) -> set[str]:
@@ -246,7 +246,7 @@ class RemoteStore(Store):
 
 
 class _BucketClaims:
-    """Claims as files of a bucket. A file is who holds it, and a line that is another with every touch."""
+    """Claims as files of a bucket. A file says who holds the claim, and has a line that changes with every touch."""
 
     poll_seconds = 2.0
 
@@ -286,6 +286,6 @@ def default_folder(location: str) -> Path:
 
 
 def _stamp(path: Path, used: float) -> None:
-    """A copy is not used by being made."""
+    """Making a copy does not count as using it."""
     with contextlib.suppress(OSError):
         os.utime(path, (used, used))

@@ -177,7 +177,7 @@ class Store:
             raise Gone(object_digest, f"was damaged ({error})") from None
 
     def restore(self, object_digest: str) -> None:
-        """Make good what can be, when someone else finds an object missing that this process counts on."""
+        """Restore what can be restored when someone else finds an object missing that this process counts on."""
 
     def size(self, object_digest: str) -> int:
         """How many bytes an object takes; 0 when it is not there."""

@@ -74,21 +74,19 @@ class Pick(Node):
 
 @dataclass(eq=False)
 class Gather(Node):
-    """Several artifacts as a list: the one at `position` of every row."""
+    """Several artifacts as a list."""
 
-    rows: list[tuple[Node, ...]]
-    position: int
+    items: list[Node]
     on_error: OnError
-    """With "skip", a row in which anything failed is left out."""
+    """With "skip", what failed is left out."""
 
     def __getitem__(self, index: int) -> Node:
-        """One artifact of the list: where each row is one call's single result, that call."""
-        return self.rows[index][self.position] if self._is_of_calls else super().__getitem__(index)
+        """One artifact of the list: where each is one call's single result, that call."""
+        return self.items[index] if self._is_of_calls else super().__getitem__(index)
 
     @functools.cached_property
     def _is_of_calls(self) -> bool:
-        column = [row[self.position] for row in self.rows]
-        return self.on_error == "fail" and all(isinstance(n, Call) and not n.task.returns_list for n in column)
+        return self.on_error == "fail" and all(isinstance(n, Call) and not n.task.returns_list for n in self.items)
 
 
 @dataclass(eq=False)
@@ -166,7 +164,7 @@ def sources_of(node: Node) -> list[Node]:
         case Item() | Pick() | Otherwise():
             return [node.source]
         case Gather():
-            return [source for row in node.rows for source in row]
+            return node.items
         case Expand():
             return list(node.sources)
     return []
@@ -180,8 +178,7 @@ def gather(nodes: Sequence[A]) -> tuple[A, ...]:
     for node in nodes:
         if not isinstance(node, Node):
             raise TypeError(f"an input of a task in a flow must be a node, not {type(node).__name__}")
-    rows: list[Any] = [(node,) for node in nodes]
-    return cast(tuple[A, ...], _gathered(rows, 0, "fail"))
+    return cast(tuple[A, ...], _gathered(list(nodes), "fail"))
 
 
 def pick(nodes: Sequence[A], positions: Iterable[int]) -> tuple[A, ...]:
@@ -191,9 +188,9 @@ def pick(nodes: Sequence[A], positions: Iterable[int]) -> tuple[A, ...]:
     return cast(tuple[A, ...], _building().attach(picked))
 
 
-def _gathered(rows: list[tuple[Node, ...]], position: int, on_error: OnError) -> Gather:
+def _gathered(items: list[Any], on_error: OnError) -> Gather:
     flow = _building()
-    return flow.attach(Gather(flow, "gather", _item.get(), rows, position, on_error))
+    return flow.attach(Gather(flow, "gather", _item.get(), items, on_error))
 
 
 @overload
@@ -220,39 +217,27 @@ def each(
     build: Callable[..., Any],
     names: Sequence[str] | None = None,
     on_error: OnError = "fail",
-    outputs: int = 1,
 ) -> Any:
     """Apply `build` to every item of one list, or of several lists of equal length side by side.
 
     lists: nodes that stand for lists, or INDEX. build: takes one node of every list, and the position of the item for
-    INDEX; returns a node, or a tuple of `outputs` nodes. names: what to call the items
-    (say, the frames' names). on_error: with "skip", an item of which anything fails is left out of every list of
-    results, and the run is degraded.
-    Returns a node that stands for the list of the results, or a tuple of such nodes.
+    INDEX; returns a node. names: what to call the items (say, the frames' names). on_error: with "skip", an item that
+    fails is left out, and the run is degraded. Returns a node that stands for the list of the results.
     """
     flow = _building()
-    rows: list[tuple[Node, ...]] = []
     sources = [source for source in lists if source is not INDEX]
 
-    def build_rows(lengths: tuple[int, ...]) -> None:
+    def build_list(*lengths: int) -> Node:
         if len(set(lengths)) != 1:
             raise ValueError(f"lists of different lengths side by side: {lengths}")
+        items = []
         with flow.building():
             for index in range(lengths[0]):
                 _item.set(names[index] if names else str(index))
-                result = build(*(index if source is INDEX else source[index] for source in lists))
-                rows.append(result if isinstance(result, tuple) else (result,))
+                items.append(build(*(index if source is INDEX else source[index] for source in lists)))
+        return _gathered(items, on_error)
 
-    def build_list(position: int, *lengths: int) -> Node:
-        if not rows:
-            build_rows(lengths)
-        return _gathered(rows, position, on_error)
-
-    nodes = tuple(
-        flow.attach(Expand(flow, "each", _item.get(), sources, functools.partial(build_list, position), loads=False))
-        for position in range(outputs)
-    )
-    return nodes if outputs > 1 else nodes[0]
+    return flow.attach(Expand(flow, "each", _item.get(), sources, build_list, loads=False))
 
 
 def expand(plan: A, build: Callable[[A], R]) -> R:

@@ -96,8 +96,8 @@ class Resolution:
     def producer(self, node: Node) -> str:
         """The step whose result a node's value is (seen through lists and expansions)."""
         while not isinstance(node, Call):
-            if isinstance(node, Gather) and node.rows:
-                node = node.rows[0][node.position]
+            if isinstance(node, Gather) and node.items:
+                node = node.items[0]
             elif sources := [self._expanded[node]] if node in self._expanded else sources_of(node):
                 node = sources[0]
             else:
@@ -112,7 +112,7 @@ class Resolution:
         assert isinstance(value, tuple)
         names: list[str] = []
         if isinstance(node, Gather):
-            names = [row[node.position].item for row in self._whole_rows(node)]
+            names = [item.item for item in self._whole(node)]
         elif isinstance(node, Pick):
             among = self.item_names(node.source)
             names = [among[position] for position in node.positions]
@@ -172,19 +172,19 @@ class Resolution:
         return None
 
     def _gathered(self, node: Gather) -> Value | Failure:
-        whole = self._whole_rows(node)
-        if len(whole) < len(node.rows):
-            failures = [value for row in node.rows for n in row if isinstance(value := self.values[n], Failure)]
+        whole = self._whole(node)
+        if len(whole) < len(node.items):
+            failures = [value for item in node.items if isinstance(value := self.values[item], Failure)]
             if node.on_error == "fail" or not whole:
                 return failures[0]
             for failure in failures:
                 if isinstance(failure.error, NotRun):
                     return failure
-        return _flattened(self.values[row[node.position]] for row in whole)
+        return _flattened(self.values[item] for item in whole)
 
-    def _whole_rows(self, node: Gather) -> list[tuple[Node, ...]]:
-        """Those in which nothing failed."""
-        return [row for row in node.rows if not any(isinstance(self.values[n], Failure) for n in row)]
+    def _whole(self, node: Gather) -> list[Node]:
+        """The items that did not fail."""
+        return [item for item in node.items if not isinstance(self.values[item], Failure)]
 
     def _expand(self, node: Expand) -> None:
         values: list[Any] = [self.values[source] for source in node.sources]

@@ -150,18 +150,6 @@ def test_with_on_error_skip_the_run_goes_on_without_the_failed_item(store):
     assert len(report.failures) == 1
 
 
-def test_of_an_item_that_failed_in_part_nothing_is_kept(store):
-    def build():
-        squares, halves = each(
-            toy.source(values=(4.0, -1.0)), build=lambda x: (toy.square(x), toy.half(x)), outputs=2, on_error="skip"
-        )
-        return {"squares": squares, "halves": halves}
-
-    report = run(store, build)
-    assert [value(store, d) for d in report.values["squares"]] == [16.0]
-    assert [value(store, d) for d in report.values["halves"]] == [2.0]
-
-
 def test_when_every_item_failed_the_list_failed(store):
     def build():
         return {"total": toy.total(each(toy.source(values=(-4.0, -1.0)), build=toy.half, on_error="skip"))}
