@@ -63,8 +63,8 @@ def measures(store: Store, document: Mapping[str, Any]) -> dict[str, float]:
         found |= {f"{group}.{name}": value for name, value in document["metrics"].get(group, {}).items()}
     if "query" in results:
         answer = store.get(results["query"])
-        matched = sum(i > 0 for i in answer.matches())
+        matched = len(answer.matches())
         found["query.matched"] = matched
-        found["query.matched_share"] = matched / max(sum(i > 0 for i in answer.instance_id.tolist()), 1)
+        found["query.matched_share"] = matched / max(len(answer.instance_id), 1)
         found["query.best"] = max(answer.score.tolist(), default=-1.0)
     return found

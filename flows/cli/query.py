@@ -30,6 +30,8 @@ class Query:
     """What to look for, such as "red mug"."""
     tau_corr: float | None = None
     """How much further than the best an instance may be and still match; the run's own value when left out."""
+    background: bool = False
+    """Rank the background too, as if it were an object."""
     json: bool = False
     """Print one JSON document."""
     store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
@@ -53,7 +55,13 @@ class Query:
         digests.save()
         report = run_flow(
             lambda: {
-                "query": query(stored("describe", descriptors), text=self.text, tau_corr=tau_corr, encoder=encoder)
+                "query": query(
+                    stored("describe", descriptors),
+                    text=self.text,
+                    tau_corr=tau_corr,
+                    encoder=encoder,
+                    background=self.background,
+                )
             },
             store,
             scene=document["scene"],

@@ -28,7 +28,7 @@ class QueryParams:
 
 @dataclass(frozen=True)
 class QueryResult:
-    """All instances, the best first, and which of them the text means."""
+    """The instances, the best first, and which of them the text means."""
 
     text: str
     encoder: str
@@ -61,6 +61,7 @@ def query(
     tau_corr: float = 0.02,
     encoder: Model | None = None,
     prompt: str = "{text}",
+    background: bool = False,
 ) -> QueryResult:
     """Rank the instances against a text; an instance matches when the text fits it and delta < tau_corr.
 
@@ -69,6 +70,9 @@ def query(
 
     With colour words the negatives are the other colours, so a text fits the objects of which its colour is the most
     common; being red is no matter of degree between objects, and all of these match, whatever their delta.
+
+    background: whether the background (id 0) is ranked too. It is no object: a text that fits it best, "wall" or
+    "grey", would otherwise leave the objects further than tau_corr behind.
 
     Raises InputError for an empty text, a text that the encoder cannot read, descriptors of another encoder, and a
     tau_corr that is not positive.
@@ -84,10 +88,11 @@ def query(
             f"The descriptors were made by {foreign[0]} and the query would be read by {model.name}; both must be one "
             "encoder."
         )
+    ranked = [d for d in descriptors if background or d.instance_id != 0]
     texts = [prompt.replace("{text}", phrase) for phrase in (text, *model.negatives(text))]
     words = model.encode_texts(texts)
-    ids = np.array([d.instance_id for d in descriptors], np.int32)
-    vectors = np.array([d.embedding for d in descriptors], np.float32).reshape(len(ids), model.dimension)
+    ids = np.array([d.instance_id for d in ranked], np.int32)
+    vectors = np.array([d.embedding for d in ranked], np.float32).reshape(len(ids), model.dimension)
     seen = np.linalg.norm(vectors, axis=1) > 0
     cosines = np.einsum("ld,td->lt", vectors, words)
     cosines[~seen] = -1

@@ -21,9 +21,16 @@ def test_a_search_ranks_all_instances_and_the_best_has_the_colour(tiny):
     rows = document["instances"]
     assert document["encoder"] == "colour words"
     ids = [e["id"] for e in json.loads((tiny.out / "instances.json").read_text())["instances"]]
-    assert sorted(row["id"] for row in rows if row["id"]) == ids
+    assert sorted(row["id"] for row in rows) == ids
     assert [row["score"] for row in rows] == sorted((row["score"] for row in rows), reverse=True)
     assert rows[0]["delta"] == 0
+
+
+def test_the_background_is_ranked_only_on_request(tiny):
+    asked = ss_flow("query", tiny.out, "white", "--background", "--json", "--cache", tiny.store).document()["instances"]
+    usual = ss_flow("query", tiny.out, "white", "--json", "--cache", tiny.store).document()["instances"]
+    assert [row["id"] for row in asked if row["id"]] == [row["id"] for row in usual]
+    assert len(asked) == len(usual) + 1
 
 
 def test_the_object_of_a_colour_is_found(tiny):

@@ -96,6 +96,19 @@ def test_delta_must_be_below_tau_corr_and_not_equal(directions):
     assert query(room, text="east", tau_corr=1.0).matches() == [1]
 
 
+def test_a_background_that_fits_best_leaves_the_objects_their_matches_unless_it_is_asked_for(directions):
+    room = (at_degrees(0, 0), at_degrees(1, 10), at_degrees(2, 14), at_degrees(3, 30))
+    found = query(room, text="east", tau_corr=0.005)
+    assert (found.instance_id.tolist(), found.matches(), found.delta[0]) == ([1, 2, 3], [1], 0)
+    asked = query(room, text="east", tau_corr=0.005, background=True)
+    assert (asked.instance_id.tolist(), asked.matches()) == ([0, 1, 2, 3], [0])
+
+
+def test_a_text_that_only_the_background_fits_matches_nothing():
+    found = query((coloured(0, white=1.0), *ROOM[1:]), text="white")
+    assert found.matches() == [] and not found.accepted
+
+
 def test_what_fits_a_negative_better_does_not_match(directions):
     found = query((at_degrees(1, 0, height=1.2), at_degrees(2, 0, height=1.3)), text="east", tau_corr=0.5)
     assert found.matches() == [] and not found.accepted and (found.relevancy < 0.5).all()
