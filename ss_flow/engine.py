@@ -42,7 +42,8 @@ class Request:
     reporter: Reporter | None = None
     """Hears of this flow."""
     done: Callable[[Report], None] = lambda report: None
-    """Called as soon as this flow has ended."""
+    """Called as soon as this flow has ended. A result that it finds damaged (Gone) is made again, and then it is called
+    again."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,6 @@ def _stop(workers: Executor, run: _Run, *, patiently: bool) -> None:
     try:
         with contextlib.suppress(StoreFailure):
             run.stop()
-            run.tell("run ended", interrupted=True)
     except KeyboardInterrupt:
         patiently = False
     finally:
@@ -169,6 +169,7 @@ class _Run:
         self._recorders = [_Recorder() for _ in requests]
         self._folders = ["" for _ in requests]
         self._healed: set[str] = set()
+        self._open = set(range(len(requests)))
         self._flows, self._targets = self._built()
         self.scheduler: Scheduler | None = None
         self._reported: dict[int, Report] = {}
@@ -210,6 +211,8 @@ class _Run:
             self._store, self._claims, workers, capacity, listening, memory_is_strict=memory_is_strict, dry=dry
         )
         self.scheduler = scheduler
+        self._open = set(range(len(flows)))
+        damaged: list[Gone] = []
 
         def ended(flow: Flow) -> None:
             position = flows.index(flow)
@@ -218,31 +221,49 @@ class _Run:
             results = {name: _digests(value) for name, value in values.items() if not isinstance(value, Failure)}
             self._reporters[position].event("run ended", failed=len(failures), results=results)
             report = Report(values, settled(self._recorders[position].events), failures, self._folders[position])
+            self._open.discard(position)
             if position not in self._reported:
-                self._requests[position].done(report)
+                try:
+                    self._requests[position].done(report)
+                except Gone as gone:  # the other flows go on
+                    damaged.append(gone)
+                    return
             self._reported[position] = report
 
         try:
             scheduler.run({f: list(t.values()) for f, t in zip(flows, targets, strict=True)}, ended)
         except Gone as gone:
             scheduler.drain()
-            if gone.digest in self._healed:
-                raise StoreFailure(f"{gone}, and this run does not make it; run its scene again.") from None
-            self._healed.add(gone.digest)
-            self._store.restore(gone.digest)
-            self.tell("restarted", because=str(gone))
-            return False
-        return True
+            damaged.append(gone)
+        for one in {one.digest: one for one in damaged}.values():
+            self._open = set(range(len(flows)))
+            self._heal(one)
+            self.tell("restarted", because=str(one))
+        return not damaged
+
+    def _heal(self, gone: Gone) -> None:
+        """Have something made again. Raises StoreFailure when it was made again before, or nothing here makes it."""
+        # Counted by what made it: results that differ from time to time would otherwise never be the same one.
+        made = (event for recorder in self._recorders for event in recorder.events if "outputs" in event)
+        maker = next((e for e in made if gone.digest in e["outputs"]), None)
+        name = f"{maker['key']}.{maker['outputs'].index(gone.digest)}" if maker else gone.digest
+        if name in self._healed:
+            reason = "though it was made anew; is the disk failing?" if maker else "and this run does not make it"
+            raise StoreFailure(f"{gone}, {reason}; run its scene again.")
+        self._healed.add(name)
+        self._store.restore(gone.digest)
 
     def progressed(self, key: str, done: int, total: int, note: str) -> None:
         if self.scheduler is not None:
             self.scheduler.progressed(key, done, total, note)
 
     def stop(self) -> None:
-        """Wait for what runs to finish or to keep what it has."""
+        """Wait for what runs to finish or to keep what it has; flows that have not ended end here."""
         if self.scheduler is not None:
             self.tell("stopping", running=self.scheduler.running())
             self.scheduler.drain()
+        for position in self._open:
+            self._reporters[position].event("run ended", interrupted=True)
 
     def tell(self, kind: str, **details: Any) -> None:
         for reporter in self._reporters:

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
@@ -106,6 +107,8 @@ class Batch:
                         replace(r, done=partial(finishing.done, position)) for position, r in enumerate(requests)
                     ]
                     run_flows(watched, store, **engine)
+                for position in finishing.damaged:
+                    finishing.again(requests[position], position, engine)
         finally:
             digests.save()
         if options.json:
@@ -167,12 +170,15 @@ class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
 
     scenes: each with its folder to write, if any. Left, it waits for the scenes that have ended; left by an interrupt
     or another fault, only for the one that it is at: the others have no row, and are finished by the next batch.
+    A scene of which a result is damaged has no row either until `again` was called for it.
     """
 
     def __init__(self, store: Store, book: _Book, scenes: Sequence[tuple[tuple[Path, Prepared], Path | None]]) -> None:
         self._store, self._book, self._scenes = store, book, scenes
         self._worker = ThreadPoolExecutor(1)
         self._ended: list[Future[None]] = []
+        self.damaged: list[int] = []
+        """Positions of the scenes of which a result could not be read."""
 
     def done(self, position: int, report: Report) -> None:
         """A scene has ended."""
@@ -184,11 +190,28 @@ class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
             for future in self._ended:
                 future.result()  # raises when batch.json could not be written
 
+    def again(self, request: Request, position: int, options: Mapping[str, Any]) -> None:
+        """Run a scene once more and finish it while the engine is there to make again what is damaged."""
+        try:
+            run_flows([replace(request, done=partial(self._add, position))], self._store, **options)
+        except StoreFailure as error:
+            (path, _), _ = self._scenes[position]
+            self._book.add(_row(path, "failed", error=str(error)))
+
     def _finish(self, position: int, report: Report) -> None:
+        try:
+            self._add(position, report)
+        except Gone:
+            self.damaged.append(position)
+
+    def _add(self, position: int, report: Report) -> None:
+        """Raises Gone when a result is damaged."""
         (path, prepared), out = self._scenes[position]
         try:
             document = finish(prepared, report, self._store, out)
             row = _row(path, document["status"], report, out, first_failure(document), measures(self._store, document))
+        except Gone:
+            raise
         except Exception as error:  # a fault of one scene's result is no matter of the others
             row = _row(path, "failed", report, error=_in_words(error))
         self._book.add(row)

@@ -60,7 +60,8 @@ class Status:
                 row[event["event"]] += 1
                 row["running"] -= event["event"] in ("finished", "failed") and row["running"] > 0
                 row["seconds"] += event["seconds"] if event["event"] == "finished" else 0.0
-        ended = next((e for e in reversed(events) if e["event"] == "run ended"), None)
+        last = next((e for e in reversed(events) if e["event"] in ("run ended", "restarted")), None)
+        ended = last if last and last["event"] == "run ended" else None
         state = _state(ended, events)
         document = {"scene": run.scene, "started": run.header["started"], "state": state, "steps": steps}
         if self.json:

@@ -11,13 +11,14 @@ import tyro
 from rich.table import Table
 
 from ss_flow.cache.store import Store
-from ss_flow.engine import run_flow
+from ss_flow.engine import Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import StoreOptions, choose_model, console, file_digests
 from ss_flow.graph import stored
+from ss_flow.keys import Value
 from ss_flow.resolution import Failure
 from ss_flow.tasks.deliver.output import RUN_FILE
-from ss_flow.tasks.semantics.query import query
+from ss_flow.tasks.semantics.query import QueryResult, query
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ class Query:
         digests = file_digests(store)
         encoder = choose_model("text-image", _encoder_name(store, descriptors), digests)
         digests.save()
-        report = run_flow(
+        answers: list[QueryResult] = []
+        request = Request(
             lambda: {
                 "query": query(
                     stored("describe", descriptors),
@@ -63,19 +65,14 @@ class Query:
                     background=self.background,
                 )
             },
-            store,
-            scene=document["scene"],
-            header={},
-            recorded=False,
+            document["scene"],
+            done=lambda report: answers.append(_answer(store, report.values["query"])),
         )
-        value = report.values["query"]
-        if isinstance(value, Failure):
-            raise value.error
-        assert isinstance(value, str)
-        self._tell(store.get(value), instances)
+        run_flows([request], store, recorded=False)
+        self._tell(answers[-1], instances)
         return 0
 
-    def _tell(self, found: Any, instances: dict[str, Any]) -> None:
+    def _tell(self, found: QueryResult, instances: dict[str, Any]) -> None:
         names = {entry["id"]: entry["name"] for entry in instances["instances"]}
         rows = [
             {
@@ -98,6 +95,14 @@ class Query:
             mark = "[green]match[/]" if row["matched"] else ""
             table.add_row(mark, str(row["id"]), row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}")
         out.print(table)
+
+
+def _answer(store: Store, value: Value | Failure) -> QueryResult:
+    if isinstance(value, Failure):
+        raise value.error
+    assert isinstance(value, str)
+    found: QueryResult = store.get(value)
+    return found
 
 
 def _encoder_name(store: Store, descriptors: tuple[str, ...]) -> str:

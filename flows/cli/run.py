@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ss_flow.engine import Report, run_flow
+from ss_flow.engine import Report, Request, run_flows
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import console, file_digests
 from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare
@@ -89,22 +89,21 @@ def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions)
     digests = file_digests(store, verify=options.verify)
     prepared = prepare(scene, params, options, digests)
     console_out = console(json=options.json)
+    documents: list[dict[str, Any]] = []
+
+    def done(report: Report) -> None:
+        if not options.dry_run:
+            documents.append(finish(prepared, report, store, out if options.delivers else None))
+
     try:
         with display(console_out) as screen:
-            report = run_flow(
-                prepared.build,
-                store,
-                scene=prepared.name,
-                header=header(prepared, options),
-                until=options.target,
-                reporter=screen,
-                **engine,
-            )
+            request = Request(prepared.build, prepared.name, header(prepared, options), options.target, screen, done)
+            (report,) = run_flows([request], store, **engine)
     finally:
         digests.save()
     if options.dry_run:
         return _tell_plan(report, console_out, json_wanted=options.json)
-    document = finish(prepared, report, store, out if options.delivers else None)
+    (document,) = documents
     if options.json:
         print(json.dumps(document))
     else:

@@ -8,6 +8,7 @@ import typing
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +16,7 @@ import tyro
 from rich.markup import escape
 
 from ss_flow.cache.store import Store
-from ss_flow.engine import Request, run_flows
+from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import console, file_digests
@@ -100,6 +101,12 @@ class Sweep:
                 for params, values in settings_of
             ]
             chosen = self._chosen(variants)
+            found: dict[int, _Found | InputError] = {}
+
+            def done(position: int, report: Report) -> None:
+                if not options.dry_run:
+                    found[position] = _found(variants[position].prepared, report, store)
+
             with display(tell) as screen:
                 requests = [
                     Request(
@@ -108,6 +115,7 @@ class Sweep:
                         header(variant.prepared, options) | recorded_as(variant.prepared.name, variant.values),
                         options.target,
                         Prefixed(screen, variant.label(scene=len(scenes) > 1), leading=position == 0),
+                        partial(done, position),
                     )
                     for position, variant in enumerate(variants)
                 ]
@@ -120,7 +128,7 @@ class Sweep:
         if options.dry_run:
             labels = [variant.label(scene=len(scenes) > 1) for variant in variants]
             return tell_plan(labels, rows, tell, scenes=[v.prepared.name for v in variants] if options.json else None)
-        documents = _documents(variants, rows, store, chosen)
+        documents = _documents(variants, rows, [found[position] for position in range(len(rows))], chosen)
         if options.json:
             print(json.dumps(documents))
         else:
@@ -181,19 +189,28 @@ def _is_list(kind: Any) -> bool:
     return typing.get_origin(kind) is tuple
 
 
+_Found = tuple[str, str | None, dict[str, float]]
+"""Status of a variant, what failed first, and its figures."""
+
+
+def _found(prepared: Prepared, report: Report, store: Store) -> _Found | InputError:
+    """What a variant came to; the error, when it failed because of what it was given."""
+    try:
+        document = finish(prepared, report, store, None)
+        return document["status"], first_failure(document), measures(store, document)
+    except InputError as bad:
+        return bad
+
+
 def _documents(
-    variants: Sequence[Variant], rows: Sequence[Row], store: Store, chosen: Sequence[str]
+    variants: Sequence[Variant], rows: Sequence[Row], all_found: Sequence[_Found | InputError], chosen: Sequence[str]
 ) -> list[dict[str, Any]]:
     """The rows of sweep.json. Raises InputError when every variant failed because of what it was given."""
     documents, refused = [], []
-    for variant, row in zip(variants, rows, strict=True):
-        status, error, found = "failed", None, {}
-        try:
-            document = finish(variant.prepared, row.report, store, None)
-            status, error, found = document["status"], first_failure(document), measures(store, document)
-        except InputError as bad:
-            refused.append(bad)
-            error = str(bad)
+    for variant, row, came_to in zip(variants, rows, all_found, strict=True):
+        if isinstance(came_to, InputError):
+            refused.append(came_to)
+        status, error, found = ("failed", str(came_to), {}) if isinstance(came_to, InputError) else came_to
         documents.append(
             {
                 "scene": variant.prepared.name,

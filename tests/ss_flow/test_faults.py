@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -19,7 +20,7 @@ import ss_flow_toy as toy
 from ss_flow.cache import codec
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
-from ss_flow.engine import run_flow
+from ss_flow.engine import Request, run_flow, run_flows
 from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.graph import each
@@ -28,6 +29,11 @@ from ss_flow.runs import latest_runs
 
 def run(store, build=toy.flow, **options):
     return run_flow(build, Store(store.root), scene="toy", **options)
+
+
+def read_by(done, store, build=toy.flow):
+    """Run, and have the results read by `done`."""
+    return run_flows([Request(build, "toy", done=done)], Store(store.root))[0]
 
 
 def computed(report):
@@ -92,6 +98,67 @@ def test_bits_flipped_in_many_objects_change_no_result(store):
         again = run(store, lambda seed=seed: toy.flow(limit=50.0 + seed))
         assert again.values == first.values
         run(store)
+
+
+def test_a_final_result_that_its_reader_finds_damaged_is_made_again_and_read_again(store):
+    first = run(store)
+    flip(store, first.values["squares"][2])
+    flip(store, first.values["total"])
+    read = []
+
+    def done(report):
+        reader = Store(store.root)
+        read.append([reader.get(value) for value in (*report.values["squares"], report.values["total"])])
+
+    again = read_by(done, store)
+    assert again.values == first.values and len(read) == 1 and len(read[0]) == 4
+    assert computed(again) == ["ss_flow_toy.square[n2]", "ss_flow_toy.total"]
+    kinds = [event["event"] for event in next(latest_runs(store.root / "roots" / "runs")).events()]
+    assert kinds.count("restarted") == 2 and kinds[-1] == "run ended"
+
+
+def test_the_other_flows_are_read_once_when_a_result_of_one_is_made_again(store):
+    run(store)
+    flip(store, run(store).values["total"])
+    read = []
+
+    def done(scene, report):
+        read.append((scene, Store(store.root).get(report.values["total"]) is not None))
+
+    builds = {"other": lambda: toy.flow(limit=20.0), "toy": toy.flow}
+    requests = [Request(build, scene, done=partial(done, scene)) for scene, build in builds.items()]
+    reports = run_flows(requests, Store(store.root))
+    assert sorted(read) == [("other", True), ("toy", True)]
+    assert all(isinstance(report.values["total"], str) for report in reports)
+
+
+@pytest.mark.parametrize(
+    ("task", "results"), [(toy.square, 1), (toy.uncertain, 2)], ids=["the same result", "another result each time"]
+)
+def test_a_result_that_is_damaged_again_after_it_was_made_anew_ends_the_run(store, task, results):
+    """As on a failing disk, also where a computation does not give the same bits twice."""
+    tried = []
+
+    def done(report):
+        tried.append(report.values["out"])
+        flip(store, report.values["out"])
+        Store(store.root).get(report.values["out"])
+
+    with pytest.raises(StoreFailure, match=r"was damaged .*, though it was made anew; is the disk failing"):
+        read_by(done, store, one(task))
+    assert len(tried) == 2 and len(set(tried)) == results
+    last = list(next(latest_runs(store.root / "roots" / "runs")).events())[-1]
+    assert (last["event"], last["interrupted"]) == ("run ended", True)
+
+
+def test_a_reader_that_fails_leaves_the_record_of_a_run_that_ended(store):
+    def done(report):
+        raise InputError("no place to write to")
+
+    with pytest.raises(InputError, match="no place"):
+        read_by(done, store)
+    ends = [e for e in next(latest_runs(store.root / "roots" / "runs")).events() if e["event"] == "run ended"]
+    assert [(end["failed"], set(end["results"])) for end in ends] == [(0, {"squares", "total"})]
 
 
 @pytest.mark.parametrize("executor", ["threads", "processes"])

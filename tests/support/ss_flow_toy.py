@@ -35,6 +35,12 @@ def square(x: Number) -> Number:
     return number(helper(float(x.value[0])))
 
 
+@task()
+def uncertain(x: Number) -> Number:
+    """Gives something else each time, as computations on a GPU may."""
+    return number(float(time.time_ns()))
+
+
 def helper(x: float) -> float:
     return x * x
 
