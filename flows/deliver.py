@@ -75,23 +75,30 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
     }
 
 
-def deliver(folder: Path, store: Store, document: dict[str, Any], report: Report) -> None:
-    """Write the output folder; where it already holds these very results, only run.json is renewed."""
-    results = document["results"]
-    document["content"] = digest({"results": results, "code": code_closure(write_all)})
+def deliver(folder: Path, store: Store, document: dict[str, Any], scene: SceneFiles, *, undistorted: bool) -> None:
+    """Write the output folder; where it already holds these very results, only run.json is renewed.
+
+    undistorted: whether to write the frames too, as a capture of their own.
+    """
+    asked = {"results": document["results"], "lenses": scene.lenses, "undistorted": undistorted}
+    document["content"] = digest(asked | {"code": code_closure(write_all)})
     if _content_of(folder) == document["content"]:
         write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
         return
     with replacing(folder) as filling:
-        write_all(filling, store, document)
+        write_all(filling, store, document, scene, undistorted=undistorted)
         document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
 
 
-def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
+def write_all(
+    folder: Path, store: Store, document: dict[str, Any], scene_files: SceneFiles, *, undistorted: bool
+) -> None:
     """Write everything but run.json."""
+    from ss_flow.tasks.capture.lens import photo_lens
     from ss_flow.tasks.deliver.instances_json import instances_document
     from ss_flow.tasks.deliver.report import report_html, report_pictures
+    from ss_flow.tasks.deliver.undistorted import write_undistorted
 
     results = document["results"]
 
@@ -106,8 +113,11 @@ def write_all(folder: Path, store: Store, document: dict[str, Any]) -> None:
     instances = instances_document(several("refine"), scene, one("names"), one("hierarchy"))
     write_scene(folder, scene, instances)
     write_cloud(folder, one("dense"), one("cut"), one("parts"))
-    write_masks(folder / "masks_split", frames, split_maps)
-    write_masks(folder / "masks", frames, maps)
+    stated = dict(zip(scene_files.names, scene_files.lenses, strict=True)) if scene_files.lenses else {}
+    lenses = [photo_lens(frame, stated.get(frame.name), cameras) for frame in frames]
+    write_masks({folder / "masks_split": split_maps, folder / "masks": maps}, frames, lenses)
+    if undistorted:
+        write_undistorted(folder / "undistorted", frames, cameras, maps)
     pictures = report_pictures(frames, cameras, several("depth"), split_maps, maps, scene)
     (folder / "report.html").write_text(report_html(document, pictures=pictures, instances=instances), encoding="utf-8")
 

@@ -61,6 +61,8 @@ class Batch:
     """The folder to write: NAME/ for each scene, and batch.json."""
     retry_failed: bool = False
     """Run only those that the folder's batch.json marks as failed, or does not name."""
+    undistorted: bool = False
+    """Also write the photos and cameras that the run worked with, without distortion, as a COLMAP workspace."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
     """How to run."""
 
@@ -102,7 +104,8 @@ class Batch:
                 for path, words in errors.items():
                     book.add(_row(path, "failed", error=words))
                 places = [self.out / folders[path] if options.delivers else None for path in scenes]
-                with _Finishing(store, book, list(zip(scenes.items(), places, strict=True))) as finishing:
+                ready = list(zip(scenes.items(), places, strict=True))
+                with _Finishing(store, book, ready, undistorted=self.undistorted) as finishing:
                     watched = [
                         replace(r, done=partial(finishing.done, position)) for position, r in enumerate(requests)
                     ]
@@ -173,8 +176,15 @@ class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
     A scene of which a result is damaged has no row either until `again` was called for it.
     """
 
-    def __init__(self, store: Store, book: _Book, scenes: Sequence[tuple[tuple[Path, Prepared], Path | None]]) -> None:
-        self._store, self._book, self._scenes = store, book, scenes
+    def __init__(
+        self,
+        store: Store,
+        book: _Book,
+        scenes: Sequence[tuple[tuple[Path, Prepared], Path | None]],
+        *,
+        undistorted: bool,
+    ) -> None:
+        self._store, self._book, self._scenes, self._undistorted = store, book, scenes, undistorted
         self._worker = ThreadPoolExecutor(1)
         self._ended: list[Future[None]] = []
         self.damaged: list[int] = []
@@ -208,7 +218,7 @@ class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
         """Raises Gone when a result is damaged."""
         (path, prepared), out = self._scenes[position]
         try:
-            document = finish(prepared, report, self._store, out)
+            document = finish(prepared, report, self._store, out, undistorted=self._undistorted)
             row = _row(path, document["status"], report, out, first_failure(document), measures(self._store, document))
         except Gone:
             raise

@@ -155,8 +155,12 @@ def header(prepared: Prepared, options: RunOptions) -> dict[str, Any]:
     return {"preset": options.preset, "params": settings.flat(prepared.params)}
 
 
-def finish(prepared: Prepared, report: Report, store: Store, out: Path | None) -> dict[str, Any]:
+def finish(
+    prepared: Prepared, report: Report, store: Store, out: Path | None, *, undistorted: bool = False
+) -> dict[str, Any]:
     """Write the output folder, unless `out` is None; return the document run.json.
+
+    undistorted: whether with the frames, as a capture of their own.
 
     Raises InputError when the run failed because of what it was given.
     """
@@ -165,7 +169,7 @@ def finish(prepared: Prepared, report: Report, store: Store, out: Path | None) -
         raise failed_input
     document = run_document(store, prepared.scene, prepared.params, prepared.networks, report)
     if out is not None and document["status"] != "failed":
-        deliver(out, store, document, report)
+        deliver(out, store, document, prepared.scene, undistorted=undistorted)
     return document
 
 

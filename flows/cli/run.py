@@ -41,6 +41,8 @@ class Run:
     """A file (.json) of a few points clicked on objects in a few views; the segmenter looks for these objects only."""
     calibrate: Literal["none", "depth"] = "none"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
+    undistorted: bool = False
+    """Also write the photos and cameras that the run worked with, without distortion, as a COLMAP workspace."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
     """How to run."""
 
@@ -49,7 +51,8 @@ class Run:
         if self.calibrate != "none":
             params = settings.apply(params, [f"capture.calibrate={self.calibrate}"])
         out = self.out or Path("ss-flow-out") / self.scene.resolve().stem
-        return run_scene(open_scene(self.scene, self.masks, self.hints), out, params, self.execution)
+        scene = open_scene(self.scene, self.masks, self.hints)
+        return run_scene(scene, out, params, self.execution, undistorted=self.undistorted)
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class Demo:
         return run_scene(open_scene(scene), self.out / "result", params, self.execution)
 
 
-def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions) -> int:
+def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions, *, undistorted: bool = False) -> int:
     """Run the DAG on a scene, write the output folder, print what came out. Returns the exit code."""
     params = settings.apply(params, options.texts)
     engine = options.engine()
@@ -93,7 +96,8 @@ def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions)
 
     def done(report: Report) -> None:
         if not options.dry_run:
-            documents.append(finish(prepared, report, store, out if options.delivers else None))
+            place = out if options.delivers else None
+            documents.append(finish(prepared, report, store, place, undistorted=undistorted))
 
     try:
         with display(console_out) as screen:

@@ -8,6 +8,12 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame
 
+_NEWTON_STEPS = 40
+_NEWTON_CLOSE = 1e-6
+"""Pixels of the photo."""
+_NEWTON_SHORTEST = 1e-3
+"""Share of Newton's step below which nothing nearer is to be found."""
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -72,18 +78,54 @@ def photo_lens(frame: Frame, stated: Lens | None, cameras: Cameras) -> Lens | No
     return lens.scaled(frame.source_width, frame.source_height)
 
 
-def undistorted(points: Float64, lens: Lens) -> Float64:
-    """Where points of the photo lie in the undistorted image: [N, 2] x, y in pixels -> [N, 2]."""
-    import cv2
+def distorted(points: Float64, lens: Lens) -> Float64:
+    """Where points of the undistorted image lie in the photo: [N, 2] x, y in pixels -> [N, 2] (OpenCV's models).
 
-    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]], np.float64)
-    coefficients = np.array(lens.distortion or (0.0,) * 4)
-    closely = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-    if lens.fisheye:
-        moved = cv2.fisheye.undistortPoints(points[:, None], matrix, coefficients, P=matrix, criteria=closely)
-    else:
-        moved = cv2.undistortPoints(points[:, None], matrix, coefficients, P=matrix, criteria=closely)
-    return moved[:, 0]
+    cv2.projectPoints and cv2.fisheye.distortPoints do the same, the former much more slowly.
+    """
+    x, y = (points[:, 0] - lens.cx) / lens.fx, (points[:, 1] - lens.cy) / lens.fy
+    square = x * x + y * y
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if lens.fisheye:
+            radius = np.sqrt(square)
+            angle = np.arctan(radius)
+            radial = np.polyval([*reversed(lens.distortion), 1.0], angle * angle) * angle / np.maximum(radius, 1e-12)
+            bent_x, bent_y = x * radial, y * radial
+        else:
+            k1, k2, p1, p2, k3, k4, k5, k6 = (*lens.distortion, *(0.0,) * (8 - len(lens.distortion)))
+            radial = np.polyval([k3, k2, k1, 1.0], square) / np.polyval([k6, k5, k4, 1.0], square)
+            across = 2 * (p1 * y + p2 * x)
+            bent_x, bent_y = x * (radial + across) + p2 * square, y * (radial + across) + p1 * square
+    return np.column_stack([bent_x * lens.fx + lens.cx, bent_y * lens.fy + lens.cy])
+
+
+def undistorted(points: Float64, lens: Lens) -> Float64:
+    """Where points of the photo lie in the undistorted image: [N, 2] x, y in pixels -> [N, 2], NaN where none is found.
+
+    Newton's method, as OpenCV's fixed-point iteration goes astray in strong distortion without telling. Where the model
+    folds the image over (a polynomial that turns round), it starts from the side of the axis, as is meant.
+    """
+    found = np.full(points.shape, np.nan)
+    rows, aim, place, share = np.arange(len(points)), points, points, np.ones(len(points))
+    off = distorted(place, lens) - aim
+    for _ in range(_NEWTON_STEPS):
+        error = np.linalg.norm(off, axis=1)
+        close = error < _NEWTON_CLOSE
+        found[rows[close]] = place[close]
+        left = ~close & (share > _NEWTON_SHORTEST)
+        if not left.any():
+            break
+        rows, aim, place, share, off, error = (values[left] for values in (rows, aim, place, share, off, error))
+        # The derivatives by x and y, and Newton's step by Cramer's rule.
+        (a, c), (b, d) = ((distorted(place + by, lens) - aim - off).T / 1e-4 for by in ((1e-4, 0), (0, 1e-4)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.column_stack([d * off[:, 0] - b * off[:, 1], a * off[:, 1] - c * off[:, 0]])
+            tried = place - step * (share / (a * d - b * c))[:, None]
+        off_tried = distorted(tried, lens) - aim
+        better = np.linalg.norm(off_tried, axis=1) < error
+        place, off = np.where(better[:, None], tried, place), np.where(better[:, None], off_tried, off)
+        share = np.where(better, np.minimum(1, 2 * share), share / 4)
+    return found
 
 
 def inside_source(source_map: Float32) -> Bool:

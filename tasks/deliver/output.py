@@ -11,8 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap, PointCloud, PointLabels, PointParts
+from ss_flow.tasks.capture.lens import Lens
+from ss_flow.tasks.capture.photo_pixels import photo_pixels
 from ss_flow.tasks.deliver import ply
 from ss_flow.tasks.geometry.images import encode_png
 
@@ -87,12 +91,31 @@ def write_cloud(folder: Path, cloud: PointCloud, labels: PointLabels, parts: Poi
     ply.write_cloud(folder / "cloud_labeled.ply", cloud, labels, parts)
 
 
-def write_masks(folder: Path, frames: Sequence[Frame], maps: Sequence[LabelMap]) -> None:
-    """Write one uint16 PNG of instance ids per frame, at the size of the input photo."""
+def write_masks(
+    stages: Mapping[Path, Sequence[LabelMap]], frames: Sequence[Frame], lenses: Sequence[Lens | None]
+) -> None:
+    """Write one uint16 PNG of instance ids per frame and folder, in the pixels of the input photo.
+
+    stages: the maps of all frames by the folder to write. lenses: what `photo_lens` gives for each frame; where there
+    is one, its distortion is put back, and pixels of the photo that the frame does not show are 0.
+    """
     import cv2
 
-    folder.mkdir()
-    for frame, ids in zip(frames, maps, strict=True):
-        size = (frame.source_width, frame.source_height)
-        full = cv2.resize(ids.ids, size, interpolation=cv2.INTER_NEAREST_EXACT)
-        (folder / f"{frame.name}.png").write_bytes(encode_png(full).tobytes())
+    alike: dict[tuple[Lens | None, int, int], list[int]] = {}
+    for row, (frame, lens) in enumerate(zip(frames, lenses, strict=True)):
+        alike.setdefault((lens, frame.width, frame.height), []).append(row)
+    for folder, maps in stages.items():
+        if len(maps) != len(frames):
+            raise ValueError(f"{len(maps)} maps for {folder.name} of {len(frames)} frames")
+        folder.mkdir()
+    for (lens, *_), rows in alike.items():
+        pixels = None if lens is None else photo_pixels(frames[rows[0]], lens)
+        for folder, maps in stages.items():
+            for row in rows:
+                frame, ids = frames[row], maps[row].ids
+                if pixels is None:
+                    size = (frame.source_width, frame.source_height)
+                    full = cv2.resize(ids, size, interpolation=cv2.INTER_NEAREST_EXACT)
+                else:
+                    full = np.where(pixels >= 0, ids.ravel()[pixels], 0).astype(np.uint16)
+                (folder / f"{frame.name}.png").write_bytes(encode_png(full).tobytes())

@@ -148,10 +148,10 @@ def test_a_scene_that_lost_an_instance_is_degraded(den, tmp_path, monkeypatch):
 def test_a_scene_that_cannot_be_written_fails_and_the_others_are_delivered(warm, den, tmp_path, monkeypatch):
     real = deliver_module.write_all
 
-    def write(folder, store, document):
+    def write(folder, store, document, *more, **options):
         if "den" in document["scene"]:
             raise OSError("the disk is full")
-        real(folder, store, document)
+        real(folder, store, document, *more, **options)
 
     monkeypatch.setattr(deliver_module, "write_all", write)
     called = batch_tiny(warm.store, tmp_path / "batch", warm.scene, den)

@@ -71,10 +71,10 @@ def test_a_disk_that_damages_a_result_again_and_again_ends_the_run_with_one_sent
     scene = warm.called.results()["scene"]
     real, written = deliver_module.write_all, []
 
-    def write_all(folder, *rest):
+    def write_all(folder, *rest, **options):
         written.append(folder)
         damage(warm.store, scene)
-        real(folder, *rest)
+        real(folder, *rest, **options)
 
     monkeypatch.setattr(deliver_module, "write_all", write_all)
     failed = run_tiny(warm.scene, warm.store, out=warm.out)
@@ -98,10 +98,10 @@ def test_a_batch_makes_damaged_results_again_and_gives_up_only_the_scene_whose_d
 
     real = deliver_module.write_all
 
-    def write_all(folder, store, document, *rest):
+    def write_all(folder, store, document, *rest, **options):
         if document["scene"] == str(warm.scene):
             damage(warm.store, document["results"]["scene"])
-        real(folder, store, document, *rest)
+        real(folder, store, document, *rest, **options)
 
     monkeypatch.setattr(deliver_module, "write_all", write_all)
     other = tmp_path / "other"

@@ -90,7 +90,7 @@ def test_a_place_that_is_taken_is_refused(make, says, tmp_path):
 def test_masks_are_written_at_the_size_of_the_photo_without_blending_ids(tmp_path):
     ids = np.array([[1, 500], [0, 65535]], np.uint16)
     frame = Frame("view", 2, 2, EMPTY, EMPTY, 8, 6)
-    write_masks(tmp_path / "masks", [frame], [LabelMap("view", ids)])
+    write_masks({tmp_path / "masks": [LabelMap("view", ids)]}, [frame], [None])
     read = cv2.imread(str(tmp_path / "masks/view.png"), cv2.IMREAD_UNCHANGED)
     assert read.dtype == np.uint16
     np.testing.assert_array_equal(read, np.kron(ids, np.ones((3, 4), np.uint16)))
@@ -99,4 +99,6 @@ def test_masks_are_written_at_the_size_of_the_photo_without_blending_ids(tmp_pat
 def test_frames_and_maps_that_do_not_pair_up_are_a_fault(tmp_path):
     frame = Frame("view", 2, 2, EMPTY, EMPTY, 2, 2)
     with pytest.raises(ValueError, match="shorter"):
-        write_masks(tmp_path / "masks", [frame], [])
+        write_masks({}, [frame], [])
+    with pytest.raises(ValueError, match="0 maps for masks of 1 frames"):
+        write_masks({tmp_path / "masks": []}, [frame], [None])
