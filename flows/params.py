@@ -96,6 +96,9 @@ class SemanticsParams:
 
     encoder: str = "auto"
     """The network that compares texts and pictures: a name of the catalogue, "auto", or "none" for colour words."""
+    masks: Literal["refined", "rendered"] = "refined"
+    """What the encoder is shown of an instance: its "refined" masks, or the masks "rendered" from its Gaussians (M^gs),
+    as in the paper."""
     describe: DescribeParams = field(default_factory=DescribeParams)
     query: QueryParams = field(default_factory=QueryParams)
 

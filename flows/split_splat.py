@@ -37,7 +37,7 @@ from ss_flow.tasks.splat.collisions import MergePlan
 from ss_flow.tasks.splat.merge import assemble, global_pass, merge_pair
 from ss_flow.tasks.splat.plan import plan
 from ss_flow.tasks.splat.reconstruct import reconstruct, retrain
-from ss_flow.tasks.splat.refine import refine
+from ss_flow.tasks.splat.refine import refine, rendered
 from ss_flow.tasks.splat.render_masks import render_masks
 from ss_flow.tasks.splat.resolve import exclusive, resolve, resolve_refined
 from ss_flow.tasks.split import hints
@@ -290,11 +290,21 @@ def splat(capture: Capture, halved: Split, networks: Networks, params: Params) -
             ),
         )
 
+    def pictured(row: int, seen: list[int]) -> InstanceMasks:
+        if params.semantics.masks == "refined":
+            return refined(row)
+        return rendered(
+            some(views, seen), refined(row), reconstructed(row), params=settings.refine, visibility=visibility
+        )
+
     def described(row: int) -> Descriptors:
         return of_instance(
             row,
             lambda seen: describe(
-                pick(capture.frames, seen), refined(row), encoder=networks.encoder, params=params.semantics.describe
+                pick(capture.frames, seen),
+                pictured(row, seen),
+                encoder=networks.encoder,
+                params=params.semantics.describe,
             ),
         )
 

@@ -140,7 +140,7 @@ def prepare(
             results["query"] = query(
                 results["describe"],
                 text=text,
-                tau_corr=params.semantics.query.tau_corr,
+                params=params.semantics.query,
                 encoder=networks.encoder,
             )
         if options.target is not None and options.target not in results:

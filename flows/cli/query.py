@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +18,7 @@ from ss_flow.graph import stored
 from ss_flow.keys import Value
 from ss_flow.resolution import Failure
 from ss_flow.tasks.deliver.output import RUN_FILE
-from ss_flow.tasks.semantics.query import QueryResult, query
+from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,12 @@ class Query:
             raise InputError(
                 f"the store {store.location} no longer holds the descriptors of {self.result}; run it again."
             )
-        tau_corr = document["params"]["semantics.query.tau_corr"] if self.tau_corr is None else self.tau_corr
-        if not 0 < tau_corr <= 2:
-            raise InputError(f"--tau-corr {tau_corr} is out of range; it must be above 0 and at most 2.")
+        own = {f.name: document["params"].get(f"semantics.query.{f.name}", f.default) for f in fields(QueryParams)}
+        params = QueryParams(**own)
+        if self.tau_corr is not None:
+            params = replace(params, tau_corr=self.tau_corr)
+        if not 0 < params.tau_corr <= 2:
+            raise InputError(f"--tau-corr {params.tau_corr} is out of range; it must be above 0 and at most 2.")
         digests = file_digests(store)
         encoder = choose_model("text-image", _encoder_name(store, descriptors), digests)
         digests.save()
@@ -60,7 +63,7 @@ class Query:
                 "query": query(
                     stored("describe", descriptors),
                     text=self.text,
-                    tau_corr=tau_corr,
+                    params=params,
                     encoder=encoder,
                     background=self.background,
                 )

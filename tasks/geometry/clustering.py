@@ -41,15 +41,20 @@ def dbscan(points: Float32 | Float64, eps: float, min_samples: int) -> Int32:
     return cluster
 
 
-def main_clusters(points: Float32 | Float64, eps: float, min_samples: int, keep_share: float) -> Bool:
+def main_clusters(
+    points: Float32 | Float64, eps: float, min_samples: int, keep_share: float, max_clusters: int = 0
+) -> Bool:
     """[N] which points lie in a cluster worth keeping: the largest, and all with at least `keep_share` of the points.
 
-    All points are kept where none is dense enough to form a cluster. Arguments as in `dbscan`.
+    All points are kept where none is dense enough to form a cluster, and where there are more than `max_clusters` of
+    them (0 = however many). Arguments as in `dbscan`.
     """
     cluster = dbscan(points, eps, min_samples)
     if not len(points) or cluster.max() < 0:
         return np.ones(len(points), bool)
     size = np.bincount(cluster[cluster >= 0])
+    if 0 < max_clusters < len(size):
+        return np.ones(len(points), bool)
     keep = size >= keep_share * len(points)
     keep[size.argmax()] = True
     return (cluster >= 0) & keep[cluster]

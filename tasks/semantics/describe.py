@@ -37,6 +37,8 @@ class DescribeParams:
     """How many views go in, those with the largest masks first."""
     min_area: Fraction = 0.002
     """Share of the image that a mask must cover for its view to go in."""
+    weighted: bool = True
+    """Whether views weigh in by their visible area; False takes the plain mean, as in the paper."""
     erosion: ErosionParams = ErosionParams()
     """How much of the mask's border is left out."""
 
@@ -49,7 +51,7 @@ def describe(
     encoder: Model | None = None,
     params: DescribeParams = DescribeParams(),
 ) -> Descriptors:
-    """The mean of an instance's pictures, as unit vectors weighted by visible area, brought back to unit length.
+    """The mean of an instance's pictures, as unit vectors, brought back to unit length.
 
     frames: at least those with a mask of the instance. encoder: None for colour words.
     Returns zeros and no views when no mask covers `min_area` of its image.
@@ -77,7 +79,7 @@ def describe(
         else:
             vectors.append(model.encode_images([crop(image, mask, params)])[0])
         progress(done + 1, len(chosen), frame.name)
-    weights = area[chosen].astype(np.float32)
+    weights = (area[chosen] if params.weighted else np.ones(len(chosen))).astype(np.float32)
     total = np.einsum("v,vd->d", weights, np.array(vectors, np.float32).reshape(len(chosen), model.dimension))
     length = np.linalg.norm(total)
     embedding = (total / length if length > 0 else total).astype(np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from ss_flow.tasks.masks.packing import grown
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, Sam
-from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
 
 Prompt = Callable[[Float32], tuple[Bool, float]]
 """Points [n, 2] in pixels of a photo -> the segmenter's mask and its score."""
@@ -46,9 +47,11 @@ class RefineParams:
     alpha_threshold: Fraction = 0.5
     """Accumulated alpha from which a pixel belongs to the rendered mask."""
     min_opacity: Fraction = 0.05
-    """Fainter Gaussians are not rendered."""
-    max_scale: Positive = 0.5
-    """Gaussians longer than this share of the instance's box diagonal are not rendered."""
+    """Fainter Gaussians are not rendered; 0 in the paper."""
+    max_scale: NonNegative = 0.5
+    """Gaussians longer than this share of the instance's box diagonal are not rendered; 0 = any, as in the paper."""
+    cut_occluded: bool = True
+    """Whether the rendered mask is cut where something is in front; False in the paper."""
     tau_iou: Fraction = 0.5
     """IoU with the rendered mask from which a mask is added to a view that had none; 0.95 in the paper."""
     pred_iou: Fraction = 0.8
@@ -56,6 +59,9 @@ class RefineParams:
     margin: Fraction = 0.1
     """How much better the segmenter's mask must agree with the rendered one to replace a mask that the view's photo
     gave; one drawn from points is replaced by any that agrees better. 0 in the paper."""
+    tie: Literal["old", "new"] = "old"
+    """Which mask is taken where both agree equally well: the "old" one, or the segmenter's "new" one, as in the paper,
+    which prefers the old one where its IoU is higher."""
     max_change: NonNegative = 1.5
     """A mask that the view's photo gave is only replaced by one of at most so many times its area, and of no less than
     the inverse of that; 0 = any, as in the paper."""
@@ -72,7 +78,7 @@ class RenderedMask:
     """The mask that an instance's Gaussians cast on one view (Split&Splat, M^gs)."""
 
     mask: Bool
-    """[H, W] without the pixels where something else is in front."""
+    """[H, W] without the pixels where something else is in front, if it was cut."""
     support: float
     """Share of the mask where the view's depth agrees with the Gaussians'."""
 
@@ -138,8 +144,52 @@ def refine(
     )
 
 
+@task(
+    name="splat.rendered",
+    resources=Resources(cores=1, memory_mb=1800),
+    uses=("opencv-contrib-python-headless", "scipy"),
+    environment=backend_identity,
+)
+def rendered(
+    views: Views,
+    instance: InstanceMasks,
+    gaussians: Gaussians,
+    *,
+    params: RefineParams,
+    visibility: VisibilityParams = VisibilityParams(),
+) -> InstanceMasks:
+    """An instance with M^gs in the place of its masks, which its descriptor then sees (Split&Splat, Sec. 4.2).
+
+    views: at least those that have a mask. gaussians: of the instance. Views without a mask get none, and where the
+    Gaussians show nothing the mask goes. The background (id 0) and an instance without Gaussians come back as they are.
+    """
+    if instance.instance_id == 0 or not len(gaussians):
+        return instance
+    scene = views.compared(visibility)
+    solid = _solid(gaussians, params)
+    view_of = {frame.name: view for view, frame in enumerate(views.frames)}
+    rows, masks = [], []
+    for row, name in enumerate(instance.views):
+        view = view_of[name]
+        shown = render_mask(solid, scene, view, params.alpha_threshold, cut_occluded=params.cut_occluded).mask
+        shown &= decode_valid(views.frames[view])
+        if shown.any():
+            rows.append(row)
+            masks.append(np.packbits(shown))
+    packed = np.array(masks, np.uint8).reshape(len(rows), instance.packed.shape[1])
+    return replace(
+        instance, views=tuple(instance.views[row] for row in rows), packed=packed, origin=instance.origin[rows]
+    )
+
+
 def render_mask(
-    gaussians: Gaussians, scene: SceneViews, view: int, alpha_threshold: float = 0.5, margin_px: int = 16
+    gaussians: Gaussians,
+    scene: SceneViews,
+    view: int,
+    alpha_threshold: float = 0.5,
+    *,
+    margin_px: int = 16,
+    cut_occluded: bool = True,
 ) -> RenderedMask:
     """M^gs of one view: the Gaussians rendered alone with full opacity, cut where something is in front (spec P2).
 
@@ -158,7 +208,7 @@ def render_mask(
     measured = sample_depth(scene.depths[view], full, camera)
     thickness = float(np.median(np.exp(gaussians.log_scales.max(axis=1))))
     tolerance = scene.tolerance(depth) + thickness + depth / camera.fx
-    visible = solid & ((measured == 0) | (measured + tolerance >= depth))
+    visible = solid & ((measured == 0) | (measured + tolerance >= depth) | (not cut_occluded))
     agrees = visible & (measured > 0) & (np.abs(measured - depth) <= tolerance)
     return RenderedMask(_pasted(visible, camera, full), float(agrees.sum() / max(1, visible.sum())))
 
@@ -173,7 +223,9 @@ def _pasted(mask: Bool, camera: Camera, full: Camera) -> Bool:
 def _solid(gaussians: Gaussians, params: RefineParams) -> Gaussians:
     """Without the faint and the oversized Gaussians (spec row 28); all of them where none would remain."""
     longest = np.exp(gaussians.log_scales.max(axis=1))
-    keep = (gaussians.opacities >= params.min_opacity) & (longest <= params.max_scale * box_diagonal(gaussians.means))
+    keep = gaussians.opacities >= params.min_opacity
+    if params.max_scale:
+        keep &= longest <= params.max_scale * box_diagonal(gaussians.means)
     return select(gaussians, keep) if keep.any() else gaussians
 
 
@@ -197,7 +249,7 @@ def _replacement(
     if len(rows) < params.min_visible:
         return None
     valid = decode_valid(scene.frames[view])
-    rendered = render_mask(gaussians, scene, view, params.alpha_threshold)
+    rendered = render_mask(gaussians, scene, view, params.alpha_threshold, cut_occluded=params.cut_occluded)
     shown = rendered.mask & valid
     if not shown.any():
         return None
@@ -212,9 +264,10 @@ def _replacement(
         return None
     if old is None:
         return candidate if agreement > params.tau_iou else None
-    if drawn:
-        return candidate if agreement > iou(old, shown) else None
-    before, after = int(old.sum()), int(candidate.sum())
-    if params.max_change and max(before, after) > params.max_change * min(before, after):
-        return None
-    return candidate if agreement > iou(old, shown) + params.margin else None
+    wanted = iou(old, shown)
+    if not drawn:
+        before, after = int(old.sum()), int(candidate.sum())
+        if params.max_change and max(before, after) > params.max_change * min(before, after):
+            return None
+        wanted += params.margin
+    return candidate if agreement > wanted or (params.tie == "new" and agreement == wanted) else None

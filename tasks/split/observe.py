@@ -12,6 +12,9 @@ from ss_flow.tasks.artifacts import (
     BORDER,
     INSIDE,
     STRAY,
+    Bool,
+    Float32,
+    Float64,
     Int32,
     MaskSet,
     Observation,
@@ -21,7 +24,7 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.geometry.clustering import main_clusters
 from ss_flow.tasks.masks.erosion import ErosionParams, interiors
-from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -37,6 +40,15 @@ class ClusterParams:
     """Neighbours that make a core point."""
     keep_share: Fraction = 0.1
     """Clusters with at least this share of the points are kept, and always the largest; 1 keeps that one alone."""
+    max_clusters: Natural = 0
+    """Where there are more clusters than this, all points are kept; 0 = no such rule. For labels, 3 in the code of the
+    paper's authors."""
+
+    def kept(self, points: Float32 | Float64, spacing: float) -> Bool:
+        """[N] which of the points [N, 3] belong together; spacing: of the cloud that they are from."""
+        if not self.eps:
+            return np.ones(len(points), bool)
+        return main_clusters(points, self.eps * spacing, self.min_samples, self.keep_share, self.max_clusters)
 
 
 @dataclass(frozen=True)
@@ -72,8 +84,7 @@ def observe(
         standing = np.where(inside, INSIDE, BORDER).astype(np.uint8)
         if params.clusters.eps and inside.any():
             places = points.points[visibility.point_index[row[inside]]]
-            clusters = params.clusters
-            kept = main_clusters(places, clusters.eps * points.spacing, clusters.min_samples, clusters.keep_share)
+            kept = params.clusters.kept(places, points.spacing)
             standing[inside] = np.where(kept, INSIDE, STRAY)
         mask.append(interior.mask)
         rows.append(row)

@@ -11,7 +11,7 @@ import numpy as np
 from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, Observation, PointCloud, PointLabels, Visibility
-from ss_flow.tasks.geometry.clustering import main_clusters, rows_by_label
+from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, Natural
 from ss_flow.tasks.split.observe import ClusterParams
 from ss_flow.tasks.split.votes.at_once import (
@@ -116,15 +116,9 @@ def _settle(label: Int32, points: PointCloud, params: PropagateParams) -> Int32:
     if params.touching_merge:
         label = merge_touching(label, points, params.touching)
     label = label.copy()
-    clusters = params.label_clusters
-    if clusters.eps:
-        for name, rows in rows_by_label(label).items():
-            if not name:
-                continue
-            kept = main_clusters(
-                points.points[rows], clusters.eps * points.spacing, clusters.min_samples, clusters.keep_share
-            )
-            label[rows[~kept]] = 0
+    for name, rows in rows_by_label(label).items():
+        if name:
+            label[rows[~params.label_clusters.kept(points.points[rows], points.spacing)]] = 0
     size = np.bincount(label)
     label[size[label] < params.min_label_points] = 0
     return label

@@ -102,6 +102,20 @@ def test_the_search_threshold_changes_nothing_in_a_run_and_only_the_answer_of_a_
     assert len(list((warm.store / "actions").rglob("*.json"))) == actions + 1
 
 
+def test_what_the_encoder_is_shown_changes_the_descriptors_and_nothing_before_them(warm):
+    again = run_tiny(warm.scene, warm.store, "--set", "semantics.masks=rendered", out=warm.out)
+    instances = again.computed()["splat.rendered"]
+    assert instances > 1
+    assert set(again.computed()) <= {"splat.rendered", "semantics.describe", "semantics.name"}
+    assert 0 < again.computed()["semantics.describe"] < instances  # the background keeps its masks
+
+
+def test_a_search_reads_the_prompt_of_the_run(warm):
+    run_tiny(warm.scene, warm.store, "--set", "query.prompt=an image", out=warm.out)
+    refused = ss_flow("query", warm.out, "red")
+    assert refused.code == 2 and "'an image' has no {text} in it" in refused.err
+
+
 def test_a_changed_photo_is_segmented_again_and_no_other(tmp_path):
     scene, store = write_room(tmp_path / "room", masks=None), tmp_path / "store"
     first = run_tiny(scene, store, "--until", "segment")

@@ -11,7 +11,7 @@ import numpy as np
 from ss_flow.running import progress
 from ss_flow.tasks.artifacts import BORDER, Float64, Int32, Observation, Visibility
 from ss_flow.tasks.geometry.zbuffer import paint
-from ss_flow.tasks.ranges import Count, Fraction, Natural, Range
+from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Range
 from ss_flow.tasks.split.votes.votes import Votes
 
 
@@ -25,6 +25,9 @@ class SequentialParams:
     """What the first vote of a point weighs more than later ones, between 0 and 1."""
     contested_vote: Fraction = 0.0
     """Weight of a vote from a mask that touched several labels; 0 = the share of the label it went to."""
+    contested_first_vote: NonNegative = 0.0
+    """The same of a vote that is the point's first; 0 = the product of both weights. 1 in the code of the paper's
+    authors."""
     min_overlap: Natural = 3
     """Painted pixels under a mask below which it is a new object."""
     min_overlap_share: Fraction = 0.1
@@ -123,7 +126,10 @@ def _match(
 
 def _vote(votes: Votes, points: Int32, label: int, purity: float, params: SequentialParams) -> None:
     """Let the points under a mask vote for its label (spec S4.3)."""
-    weight: Float64 = np.where(votes.fresh(points), 1.0 + params.lambda_init, 1.0)
+    fresh = votes.fresh(points)
+    weight: Float64 = np.where(fresh, 1.0 + params.lambda_init, 1.0)
     if purity < 1:
         weight *= params.contested_vote or purity
+        if params.contested_first_vote:
+            weight[fresh] = params.contested_first_vote
     votes.add(points, label, weight)

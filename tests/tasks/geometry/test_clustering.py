@@ -51,6 +51,12 @@ def test_main_clusters_keep_what_has_its_share_and_always_the_largest():
     assert not only_large[300:].any()
 
 
+def test_all_points_are_kept_where_there_are_more_clusters_than_allowed():
+    blobs = two_blobs()
+    assert main_clusters(blobs, 0.2, 5, 1.0, max_clusters=1).all()
+    assert not main_clusters(blobs, 0.2, 5, 1.0, max_clusters=2)[300:].any()
+
+
 def test_points_too_sparse_for_any_cluster_are_all_kept():
     assert main_clusters(np.eye(3) * 5, 0.1, 2, 0.1).all()
     assert main_clusters(np.zeros((0, 3)), 0.1, 2, 0.1).shape == (0,)

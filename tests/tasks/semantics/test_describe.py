@@ -58,6 +58,14 @@ def test_views_weigh_as_much_as_the_object_covers_in_them():
     assert found.weights.tolist() == [3600, 900] and found.views == ("view0", "view1")
 
 
+def test_views_may_weigh_the_same():
+    frames, instance = scene((square(10, 10, 60), RED), (square(10, 10, 30), BLUE))
+    found = describe(frames, instance, params=DescribeParams(weighted=False))
+    red, blue = (describe(*scene((square(10, 10, 40), colour))).embedding for colour in (RED, BLUE))
+    np.testing.assert_allclose(found.embedding, (red + blue) / np.linalg.norm(red + blue), atol=1e-6)
+    assert found.weights.tolist() == [1, 1]
+
+
 def test_only_the_largest_views_go_in():
     frames, instance = scene(*((square(5, 5, side), RED) for side in (20, 50, 30, 60, 40)))
     found = describe(frames, instance, params=DescribeParams(max_views=3))

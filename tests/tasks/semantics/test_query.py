@@ -7,7 +7,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Descriptors
 from ss_flow.tasks.models.colour_words import TERMS
 from ss_flow.tasks.semantics import query as module
-from ss_flow.tasks.semantics.query import query
+from ss_flow.tasks.semantics.query import QueryParams, query
 
 
 def descriptor(instance_id: int, embedding, encoder: str = "colour words") -> Descriptors:
@@ -86,14 +86,14 @@ def test_scores_margins_and_deltas_are_as_worked_out_by_hand(directions):
 
 def test_an_instance_matches_when_its_distance_is_near_the_best(directions):
     room = (at_degrees(1, 10), at_degrees(2, 14), at_degrees(3, 30))
-    assert query(room, text="east", tau_corr=0.02).matches() == [1, 2]
-    assert query(room, text="east", tau_corr=0.005).matches() == [1]
-    assert query(room, text="east", tau_corr=0.2).matches() == [1, 2, 3]
+    assert query(room, text="east", params=QueryParams(tau_corr=0.02)).matches() == [1, 2]
+    assert query(room, text="east", params=QueryParams(tau_corr=0.005)).matches() == [1]
+    assert query(room, text="east", params=QueryParams(tau_corr=0.2)).matches() == [1, 2, 3]
 
 
 def test_delta_must_be_below_tau_corr_and_not_equal(directions):
     room = (at_degrees(1, 0), at_degrees(2, 90))
-    assert query(room, text="east", tau_corr=1.0).matches() == [1]
+    assert query(room, text="east", params=QueryParams(tau_corr=1.0)).matches() == [1]
 
 
 def test_a_background_that_fits_best_leaves_the_objects_their_matches_unless_it_is_asked_for(directions):
@@ -110,8 +110,26 @@ def test_a_text_that_only_the_background_fits_matches_nothing():
 
 
 def test_what_fits_a_negative_better_does_not_match(directions):
-    found = query((at_degrees(1, 0, height=1.2), at_degrees(2, 0, height=1.3)), text="east", tau_corr=0.5)
+    room = (at_degrees(1, 0, height=1.2), at_degrees(2, 0, height=1.3))
+    found = query(room, text="east", params=QueryParams(tau_corr=0.5))
     assert found.matches() == [] and not found.accepted and (found.relevancy < 0.5).all()
+    untested = query(room, text="east", params=QueryParams(tau_corr=0.5, min_relevancy=0.0))
+    assert untested.matches() == [1, 2] and untested.accepted
+
+
+def test_without_the_test_of_relevancy_missing_descriptors_and_other_colours_still_do_not_match(
+    directions, monkeypatch
+):
+    untested = QueryParams(min_relevancy=0.0)
+    room = (at_degrees(1, 0), descriptor(2, np.zeros(3), "directions"))
+    assert query(room, text="east", params=untested).matches() == [1]
+    monkeypatch.undo()
+    assert query(ROOM, text="red", params=untested).matches() == query(ROOM, text="red").matches()
+
+
+def test_a_prompt_without_a_place_for_the_text_is_refused():
+    with pytest.raises(InputError, match=r"has no \{text\} in it"):
+        query(ROOM, text="red", params=QueryParams(prompt="an image"))
 
 
 def test_the_prompt_wraps_the_text(monkeypatch):
@@ -121,7 +139,7 @@ def test_the_prompt_wraps_the_text(monkeypatch):
 
     monkeypatch.setattr(module, "encoder_of", lambda files: Prompted())
     room = (at_degrees(1, 0), at_degrees(2, 90))
-    assert query(room, text="east", prompt="an image of a {text}").matches() == [2]
+    assert query(room, text="east", params=QueryParams(prompt="an image of a {text}")).matches() == [2]
 
 
 def test_an_instance_without_a_descriptor_comes_last_and_never_matches():
@@ -155,7 +173,7 @@ def test_an_empty_text_is_refused(text):
 
 def test_a_tau_that_matches_nothing_is_refused():
     with pytest.raises(InputError, match="tau_corr is 0"):
-        query(ROOM, text="red", tau_corr=0)
+        query(ROOM, text="red", params=QueryParams(tau_corr=0))
 
 
 def test_descriptors_of_another_encoder_are_refused():

@@ -15,7 +15,7 @@ from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.splat import refine as module
-from ss_flow.tasks.splat.refine import RefineParams, refine, render_mask
+from ss_flow.tasks.splat.refine import RefineParams, refine, render_mask, rendered
 
 PARAMS = RefineParams()
 NAMES = tuple(f"v{k}" for k in range(VIEWS))
@@ -75,6 +75,8 @@ def test_the_rendered_mask_leaves_out_what_the_ball_hides(small, box):
     hidden = small.ids[0] == 2
     assert (render_mask(box, blind, 0).mask & hidden).sum() > 5 * (render_mask(box, scene, 0).mask & hidden).sum()
     assert render_mask(box, blind, 0).support == 0
+    whole = render_mask(box, scene, 0, cut_occluded=False).mask
+    np.testing.assert_array_equal(whole, render_mask(box, blind, 0).mask)
 
 
 def test_without_a_segmenter_masks_stay_and_missing_ones_are_drawn_where_depth_confirms_them(small, box):
@@ -121,6 +123,16 @@ def test_a_mask_of_the_photo_gives_way_only_by_a_margin_and_one_drawn_from_point
     ):
         replaced = refined(small, box, instance, monkeypatch, right, **params)
         assert (replaced.origin == REFINED).any()
+
+
+@pytest.mark.parametrize("source", [0, DRAWN])
+def test_of_two_masks_that_agree_equally_well_the_preset_says_which_stays(small, box, monkeypatch, source):
+    held = replace(small.instance(1), origin=np.full(VIEWS, source, np.uint8))
+    same = lambda view, _: small.ids[view] == 1  # noqa: E731
+    old = refined(small, box, held, monkeypatch, same, margin=0.0)
+    assert (old.origin == source).all()
+    new = refined(small, box, held, monkeypatch, same, margin=0.0, tie="new")
+    assert (new.origin == REFINED).all()
 
 
 def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small, box, monkeypatch):
@@ -194,7 +206,24 @@ def test_faint_and_huge_gaussians_do_not_draw(small, box):
     )
     fields = {name: np.concatenate([getattr(box, name), getattr(stray, name)]) for name in vars(box)}
     part = small.instance(1, views=(0, 3))
-    np.testing.assert_array_equal(refined(small, Gaussians(**fields), part).packed, refined(small, box, part).packed)
+    cluttered = Gaussians(**fields)
+    clean = refined(small, box, part)
+    np.testing.assert_array_equal(refined(small, cluttered, part).packed, clean.packed)
+    for allowed in ({"min_opacity": 0.0}, {"max_scale": 0.0}):
+        drawn = refined(small, cluttered, part, min_support=0.0, cut_occluded=False, **allowed)
+        assert drawn.dense()[drawn.origin == REFINED].sum() > 1.02 * clean.dense()[clean.origin == REFINED].sum()
+
+
+def test_a_descriptor_may_be_shown_the_rendered_masks_in_the_views_that_have_one(small, box):
+    wrong = replace(moved(small.instance(1, views=(0, 3)), 20), origin=np.array([0, DRAWN], np.uint8))
+    shown = rendered(small.views, wrong, box, params=PARAMS)
+    assert shown.views == (NAMES[0], NAMES[3]) and shown.origin.tolist() == [0, DRAWN]
+    for view, mask in zip((0, 3), shown.dense(), strict=True):
+        assert_outline(mask, small.ids[view] == 1)
+    away = replace(box, means=box.means + np.float32(100))
+    assert not len(rendered(small.views, wrong, away, params=PARAMS).views)
+    background = small.instance(0)
+    assert rendered(small.views, background, box, params=PARAMS) is background
 
 
 def test_the_background_and_an_instance_without_gaussians_come_back_as_they_are(small, box):

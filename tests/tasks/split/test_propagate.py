@@ -17,7 +17,8 @@ from ss_flow.tasks.split.observe import ClusterParams, ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
 from ss_flow.tasks.split.visibility import visibility
 from ss_flow.tasks.split.votes.at_once import MaskClusteringParams
-from ss_flow.tasks.split.votes.in_turn import SequentialParams
+from ss_flow.tasks.split.votes.in_turn import SequentialParams, _vote
+from ss_flow.tasks.split.votes.votes import Votes
 
 BARE = PropagateParams(
     views="in_turn",
@@ -35,7 +36,7 @@ def in_turn(**values):
 
 PRESETS = {
     "paper": (in_turn(contested_vote=1.0), ObserveParams(nested=True)),
-    "reference": (in_turn(contested_vote=0.75), ObserveParams(nested=True)),
+    "reference": (in_turn(contested_vote=0.75, contested_first_vote=1.0), ObserveParams(nested=True)),
     "default": (BARE, ObserveParams()),
 }
 
@@ -89,6 +90,16 @@ def test_swapping_the_masks_of_the_worked_example_changes_nothing(preset, nested
     a, b = (run(points(8), visible, m, params, ObserveParams(nested=nested)) for m in (masks, swapped))
     assert a.label.tolist() == b.label.tolist()
     assert a.confidence.tolist() == b.confidence.tolist()
+
+
+@pytest.mark.parametrize(("first", "leader", "share"), [(0.0, 3, 1 / 1.9375), (1.0, 2, 0.5)])
+def test_the_first_vote_of_a_point_from_a_contested_mask_has_a_weight_of_its_own(first, leader, share):
+    votes, params = Votes(2), SequentialParams(contested_vote=0.75, contested_first_vote=first)
+    for rows, label, purity in (([0], 1, 1.0), ([0, 1], 2, 0.5), ([1], 3, 1.0)):
+        _vote(votes, np.array(rows, np.int32), label, purity, params)
+    labels, shares = votes.leaders()
+    assert labels.tolist() == [1, leader]
+    np.testing.assert_allclose(shares, [1.25 / 2.0, share])
 
 
 def test_a_mask_without_enough_points_founds_no_object():
