@@ -46,10 +46,10 @@ def table() -> str:
                 "|---|---|---|---|",
             ]
         name = ".".join(path)
-        others = [f"{preset} {_shown(flat[name])}" for preset, flat in presets.items() if flat[name] != value]
+        others = [f"{preset} {shown(flat[name])}" for preset, flat in presets.items() if flat[name] != value]
         owner = type(functools.reduce(getattr, path[:-1], params))
         said = first_sentence(docstrings_of(owner.__module__, owner.__name__)[path[-1]])
-        blocks.append(f"| `{name}` | {_shown(value)} | {'<br>'.join(others)} | {said} |")
+        blocks.append(f"| `{name}` | {shown(value)} | {'<br>'.join(others)} | {said} |")
     return "\n".join(blocks).strip() + "\n"
 
 
@@ -86,7 +86,8 @@ def with_table(page: str) -> str:
     return f"{before}{BEGIN}\n\n{table()}\n{END}{after}"
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A value as the pages write it."""
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
     if isinstance(value, float):

@@ -69,7 +69,7 @@ def find(params: Any, name: str) -> Path:
 
 
 def preset(params: T, name: str) -> T:
-    """Set the parameters that a preset names. Raises InputError for an unknown preset."""
+    """Set the parameters that a preset names, after those of its `base`. Raises InputError for an unknown preset."""
     if name == "default":
         return params
     folder = resources.files("ss_flow.flows") / "presets"
@@ -77,7 +77,8 @@ def preset(params: T, name: str) -> T:
     if not file.is_file():
         known = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
         raise InputError(f"preset {name!r} is unknown; choose one of: {', '.join(['default', *known])}.")
-    return overlaid(params, tomllib.loads(file.read_text(encoding="utf-8")))
+    table = tomllib.loads(file.read_text(encoding="utf-8"))
+    return overlaid(preset(params, table.pop("base", "default")), table)
 
 
 def overlaid(params: T, table: Mapping[str, Any]) -> T:

@@ -75,6 +75,20 @@ def test_functions_in_the_tables_of_a_page_stand_in_the_files_beside_them(page):
             assert re.search(rf"^(?:def|class) {name}\b", source, re.MULTILINE), f"{name} is not in {file}"
 
 
+def test_every_repaired_ambiguity_has_the_values_of_the_presets_or_names_the_test_that_holds_it(maker):
+    page = (ROOT / "docs" / "pipeline.md").read_text(encoding="utf-8")
+    section = page.partition("## Repaired ambiguities")[2].partition("\n## ")[0]
+    _, _, *rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
+    presets = [settings.flat(settings.preset(Params(), name)) for name in ("default", "paper", "reference")]
+    assert len(rows) > 30
+    for number, _, _, held in rows:
+        if re.fullmatch(r"`test_\w+` in `tests/[\w/]+\.py`", held):
+            continue  # that it stands there, the test above holds
+        for entry in held.split("<br>"):
+            name, values = re.fullmatch(r"`([\w.]+)` (.+)", entry).groups()
+            assert values == ", ".join(maker.shown(preset[name]) for preset in presets), f"{number}: {name}"
+
+
 def test_the_readme_has_two_command_lines_to_install_run_and_test():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     block = text.partition("<!-- commands -->")[2].partition("<!-- end -->")[0]

@@ -41,8 +41,8 @@ class RunOptions:
     """How to run, whatever the scene."""
 
     preset: str = "default"
-    """default, paper (the paper's values), reference (those of its authors' code), fast (for a quick look) or thorough
-    (for a machine with time)."""
+    """default, paper (the paper's values), paper_lerf (those for LERF), reference (those of its authors' code), fast
+    (for a quick look) or thorough (for a machine with time)."""
     assignments: Assignments = ()
     """Set a parameter, as in --set split.tau_label=0.8."""
     until: str | None = None

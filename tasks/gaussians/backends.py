@@ -6,8 +6,9 @@ from typing import NamedTuple, Protocol
 
 from ss_flow.tasks.artifacts import Float32, Int32
 from ss_flow.tasks.gaussians.library import Workspace
+from ss_flow.tasks.gaussians.losses import gradients_of
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
-from ss_flow.tasks.gaussians.objective import Target, Weights, gradients_of
+from ss_flow.tasks.gaussians.objective import Target, Weights
 
 Arrays = tuple[Float32, Float32, Float32, Float32, Float32]
 

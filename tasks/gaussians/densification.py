@@ -78,19 +78,20 @@ class Schedule:
 
     start: Natural = 500
     """No clones before this step."""
-    stop: Natural = 15_000
+    stop: Count = 15_000
     """None after this one."""
     every: Count = 100
     """Steps from one time to the next."""
     reset_every: Count = 3_000
     """Steps from one reset of all opacities, to at most 0.01, to the next."""
     shorten: bool = True
-    """Whether a short training begins after a fifth of its steps and stops at the half of them at the latest."""
+    """Whether a short training begins after a fifth of its steps and stops at the half of them at the latest; if not,
+    as in 3DGS, it merely ends before `stop`, and nothing comes with its last step, which no step follows."""
 
     def of(self, iterations: int) -> Schedule:
-        """The same for a training of so many steps: no reset that nothing follows."""
+        """The same for a training of so many steps."""
         if not self.shorten:
-            return replace(self, stop=min(self.stop, iterations))
+            return replace(self, stop=min(self.stop, iterations) - 1)
         return replace(self, start=min(self.start, iterations // 5), stop=min(self.stop, iterations // 2))
 
     def densifies(self, step: int) -> bool:

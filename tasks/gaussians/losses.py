@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Float32, Int32
+from ss_flow.tasks.artifacts import Float32
 from ss_flow.tasks.gaussians.library import Workspace, address, library
+from ss_flow.tasks.gaussians.native_pass import NativePass
+from ss_flow.tasks.gaussians.objective import Target, Weights
 
 
 class Photometric(NamedTuple):
@@ -61,33 +63,39 @@ class Surface(NamedTuple):
     """[H, W]."""
 
 
-def surface(
-    alpha: Float32,
-    depth: Float32,
-    mismatch: Float32 | None,
-    *,
-    inside: Float32,
-    judged: Float32,
-    target_depth: Float32,
-    known: Float32,
-    labelled: Float32 | None,
-    ids: Int32 | None,
-    alpha_weight: float,
-    depth_weight: float,
-) -> Surface:
-    """Three mean absolute errors over the pixels, C-contiguous [H, W] arrays throughout.
+def surface(alpha: Float32, depth: Float32, mismatch: Float32 | None, target: Target, weights: Weights) -> Surface:
+    """Three absolute errors, sums over pixels with weights that the target gives; C-contiguous [H, W] arrays.
 
-    Alpha: sum of judged * |alpha - inside|. Depth: sum of known * |depth / target_depth - alpha|, a relative error,
-    so that the scale of the world does not matter. Labels, without `mismatch` 0: sum of labelled * (mismatch + 1 where
-    ids >= 0); its gradient towards `mismatch` is `labelled`. That is the absolute error of all label masks against
-    their one-hot targets, since no mask falls below 0 or exceeds 1 (spec A25).
+    Alpha: judged * |alpha - inside|. Depth: known * |depth / target depth - alpha|, a relative error, so that the scale
+    of the world does not matter; or, between inverse depths, known * |alpha^2 / depth - 1 / target depth|, where
+    alpha / depth, the inverse of the mean depth, stands for 3DGS's mean of inverse depths. Labels, without `mismatch`
+    0: labelled * (mismatch + 1 where ids >= 0); its gradient towards `mismatch` is `labelled`. That is the absolute
+    error of all label masks against their one-hot targets, since no mask falls below 0 or exceeds 1 (spec A25).
     """
     towards_alpha, towards_depth, out = np.empty_like(alpha), np.empty_like(depth), np.empty(3, np.float64)
-    images = (alpha, depth, mismatch, inside, judged, target_depth, known, labelled, ids)
+    asked = (target.inside, target.judged, target.depth, target.known, target.labelled, target.ids)
+    images = (alpha, depth, mismatch, *asked)
     if any(a is not None and a.shape != alpha.shape for a in images):
         raise ValueError(f"the images must all be {list(alpha.shape)}")
     library().ss_surface_loss(
-        alpha.size, *(address(a) for a in images), alpha_weight, depth_weight, address(towards_alpha),
-        address(towards_depth), out.ctypes.data,
+        alpha.size, *(address(a) for a in images), weights.alpha, weights.depth, weights.inverse_depth,
+        address(towards_alpha), address(towards_depth), out.ctypes.data,
     )  # fmt: skip
     return Surface(float(out[0]), float(out[1]), float(out[2]), towards_alpha, towards_depth)
+
+
+def gradients_of(
+    rendered: NativePass, target: Target, weights: Weights, workspace: Workspace, threads: int
+) -> tuple[float, tuple[Float32, Float32, Float32, Float32 | None]]:
+    """The loss of one view, and its gradients towards rgb, alpha, depth and mismatch (None = zero).
+
+    Split&Splat's l = l_RGB + w_mask l_mask, with the losses of alpha and depth that an `Objective` may add: colour by
+    L1 and SSIM, and each rendered label against its one-hot target, a mean over pixels and labels (spec A25).
+    """
+    color = photometric(
+        rendered.rgb, target.image, target.counted, weights.ssim, workspace=workspace, threads=threads
+    )  # fmt: skip
+    rest = surface(rendered.alpha, rendered.depth, rendered.mismatch, target, weights)
+    total = color.loss + weights.alpha * rest.alpha + weights.depth * rest.depth + weights.mask * rest.labels
+    towards_mismatch = None if target.labelled is None else target.labelled * np.float32(weights.mask)
+    return total, (color.gradient, rest.towards_alpha, rest.towards_depth, towards_mismatch)

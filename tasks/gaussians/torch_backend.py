@@ -28,6 +28,7 @@ class _Target:
     which should stay empty."""
 
     image: Tensor
+    counted: Tensor
     inside: Tensor
     judged: Tensor
     depth: Tensor
@@ -67,7 +68,7 @@ class TorchBackend:
         )
         loss = _color_loss(out.rgb, here, weights.ssim)
         loss = loss + weights.alpha * (here.judged * (out.alpha - here.inside).abs()).sum()
-        loss = loss + weights.depth * (here.known * (out.depth / here.depth - out.alpha).abs()).sum()
+        loss = loss + weights.depth * (here.known * _depth_error(out.alpha, out.depth, here, weights)).sum()
         if here.labelled is not None:
             loss = loss + weights.mask * (here.labelled * (out.label_masks - here.one_hot).abs()).sum()
         loss.backward()
@@ -99,6 +100,7 @@ def _moved(target: Target, num_labels: int, device: str) -> _Target:
         one_hot[: len(present)] = target.ids == present[:, None, None]
     return _Target(
         put(target.image),
+        put(target.counted),
         put(target.inside),
         put(target.judged),
         put(target.depth),
@@ -109,9 +111,16 @@ def _moved(target: Target, num_labels: int, device: str) -> _Target:
     )
 
 
+def _depth_error(alpha: Tensor, depth: Tensor, target: _Target, weights: Weights) -> Tensor:
+    if not weights.inverse_depth:
+        return (depth / target.depth - alpha).abs()
+    shown = depth > 0  # where nothing is, a division would put NaN into the gradient
+    return (torch.where(shown, alpha * alpha / torch.where(shown, depth, 1), 0) - 1 / target.depth).abs()
+
+
 def _color_loss(image: Tensor, target: _Target, ssim_weight: float) -> Tensor:
-    counts = (target.inside > 0)[..., None]
-    share = target.inside[..., None] / (3 * target.inside.sum()).clamp(min=1e-12)
+    counts = (target.counted > 0)[..., None]
+    share = target.counted[..., None] / (3 * target.counted.sum()).clamp(min=1e-12)
     if not bool(counts.any()):
         return image.sum() * 0
     x, y = (torch.where(counts, i, torch.zeros_like(i)).permute(2, 0, 1)[:, None] for i in (image, target.image))

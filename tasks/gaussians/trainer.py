@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,12 +18,12 @@ from ss_flow.tasks.gaussians.backends import backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, Fixed, Schedule, Seen, Strategy
 from ss_flow.tasks.gaussians.mcmc import MarkovChain
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
-from ss_flow.tasks.gaussians.objective import Target, Weights
+from ss_flow.tasks.gaussians.objective import Objective, Target, decayed
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import NEAR_PLANE, training_device
 from ss_flow.tasks.gaussians.render import channels_of
 from ss_flow.tasks.gaussians.views import TrainView
-from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
 
 CHECKPOINT_SECONDS = 60.0
 """How much work a kill may cost."""
@@ -65,18 +66,10 @@ class TrainParams:
     """Highest degree of the colours; 0 is used below 2,000 iterations, otherwise one more every 1,000 steps."""
     rates: LearningRates = LearningRates()
     """How fast each parameter is learnt."""
-    ssim_weight: Fraction = 0.2
-    """Share of 1 - SSIM in the colour loss; the rest is L1."""
-    alpha_weight: NonNegative = 0.5
-    """Weight of the mean absolute error of alpha."""
-    depth_weight_start: NonNegative = 1.0
-    """Weight of the relative depth error at the first step."""
-    depth_weight_final: NonNegative = 0.01
-    """Weight of the relative depth error at the last step; the decay is exponential."""
+    objective: Objective = Objective()
+    """What is made small."""
     mask_weight: NonNegative = 0.0
-    """Weight of the mask loss of merging (spec A25)."""
-    background: Literal["random", "black", "white"] = "random"
-    """What lies behind: "random" (a colour for each step), "black" or "white"."""
+    """Weight of the mask loss of merging, w_mask (spec A25)."""
     densify: Literal["classic", "mcmc", "none"] = "classic"
     """How the number of Gaussians grows: "classic" clones and splits as in 3DGS, "mcmc" moves faint Gaussians to where
     opaque ones are and grows by 5 % at a time, "none" leaves it."""
@@ -84,8 +77,8 @@ class TrainParams:
     """Mean screen gradient from which a Gaussian is cloned or split, in 3DGS's units for images 512 pixels high."""
     schedule: Schedule = Schedule()
     """When "classic" clones and splits."""
-    max_gaussians: Count = 30_000
-    """Densification ends at this number."""
+    max_gaussians: Natural = 30_000
+    """Densification ends at this number; 0 = never."""
     prune_opacity: Fraction = 0.005
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
@@ -93,8 +86,6 @@ class TrainParams:
     max_scale: NonNegative = 0.0
     """No standard deviation exceeds this share of the extent, or the largest it starts with where that is more; 0 = no
     limit."""
-    antialias: bool = False
-    """Whether to lower the opacity of Gaussians smaller than a pixel."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +122,13 @@ def train(
     extents = np.broadcast_to(np.asarray(extent, np.float32), len(initial))
     if not (extents > 0).all():
         raise ValueError(f"the extent must be positive, not {extents.min()}")
-    for name, allowed in (("background", ("random", "black", "white")), ("densify", ("classic", "mcmc", "none"))):
-        if getattr(params, name) not in allowed:
-            raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {getattr(params, name)!r}")
+    for name, value, allowed in (
+        ("densify", params.densify, ("classic", "mcmc", "none")),
+        ("background", params.objective.background, ("random", "black")),
+        ("depth_error", params.objective.depth_error, ("relative", "inverse")),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {value!r}")
     training = _Training(initial, views, params, extents, seed, label_ids)
     training.resume()
     saved = time.monotonic()
@@ -168,7 +163,7 @@ class _Training:
     ) -> None:
         num_labels = len(label_ids) if params.mask_weight else 0
         self._initial, self._params, self._extents, self._num_labels = initial, params, extents, num_labels
-        self._targets = [Target.of(v.camera, v.image, v.inside, v.free, v.depth, v.ids, num_labels) for v in views]
+        self._targets = [Target.of(view, params.objective, num_labels) for view in views]
         self._generator = np.random.default_rng(seed)
         self._given_degree = round(initial.sh.shape[1] ** 0.5) - 1
         last = min(params.sh_degree, params.iterations // 1000) if params.iterations >= 2000 else 0
@@ -195,16 +190,9 @@ class _Training:
         done_share = self.step / max(params.iterations - 1, 1)
         self.step += 1
         degree = max(self._given_degree, min(self._last_degree, self.step // 1000))
-        settings = Settings(
-            _background(params.background, self._generator),
-            self._num_labels, degree, NEAR_PLANE, params.antialias, winners=False,
-        )  # fmt: skip
-        weights = Weights(
-            params.ssim_weight,
-            params.alpha_weight,
-            _decay(params.depth_weight_start, params.depth_weight_final, done_share),
-            params.mask_weight,
-        )
+        behind = params.objective.behind(self._generator)
+        settings = Settings(behind, self._num_labels, degree, NEAR_PLANE, False, winners=False)
+        weights = params.objective.at(done_share, params.mask_weight)
         labels = self._channels[parameters.origin] if target.ids is not None else None
         found = self._backend.descent(parameters.arrays(), labels, target, settings, weights)
         self.losses[self.step - 1] = found.loss
@@ -212,7 +200,7 @@ class _Training:
             raise TrainingDiverged(f"training of {len(parameters)} Gaussians diverged at step {self.step}")
         self._strategy.regularise(parameters, found.gradients)
         extents = self._extents[parameters.origin]
-        means_rate = _decay(params.rates.position, params.rates.position_final, done_share)
+        means_rate = decayed(params.rates.position, params.rates.position_final, done_share)
         parameters.step(found.gradients, _by_name(params.rates), self.step, degree, np.float32(means_rate) * extents)
         if params.max_scale:
             parameters.limit_scale(self._longest[parameters.origin])
@@ -248,7 +236,7 @@ class _Training:
     def finish(self) -> TrainResult:
         """Drop what shows nowhere; the PSNR of what stays."""
         parameters, params = self.parameters, self._params
-        settings = Settings((0.0, 0.0, 0.0), 0, self._last_degree, NEAR_PLANE, params.antialias, winners=True)
+        settings = Settings((0.0, 0.0, 0.0), 0, self._last_degree, NEAR_PLANE, False, winners=True)
         parameters.keep(parameters.opacities() >= params.prune_opacity)
         strongest = np.zeros(len(parameters), np.float32)
         error, count = 0.0, 0
@@ -267,31 +255,19 @@ class _Training:
 
 
 def _strategy(params: TrainParams, count: int, extent: float) -> Strategy:
+    most = params.max_gaussians or sys.maxsize
     if params.densify == "mcmc":
-        return MarkovChain(params.iterations, extent=extent, most=params.max_gaussians)
+        return MarkovChain(params.iterations, extent=extent, most=most)
     if params.densify == "classic":
         return AdaptiveControl(
             count,
             params.schedule.of(params.iterations),
             threshold=params.densify_grad,
             extent=extent,
-            most=params.max_gaussians,
+            most=most,
             prune_opacity=params.prune_opacity,
         )
     return Fixed()
-
-
-def _background(kind: str, generator: np.random.Generator) -> tuple[float, float, float]:
-    if kind == "random":
-        red, green, blue = generator.random(3).tolist()
-        return red, green, blue
-    return (0.0, 0.0, 0.0) if kind == "black" else (1.0, 1.0, 1.0)
-
-
-def _decay(start: float, final: float, share: float) -> float:
-    if start <= 0 or final <= 0:
-        return start + (final - start) * share
-    return float(start * (final / start) ** share)
 
 
 def _by_name(rates: LearningRates) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,6 +51,15 @@ def camera_of(cameras: Cameras, view: int) -> Camera:
 def cameras_by_view(cameras: Cameras) -> tuple[Camera, ...]:
     """The cameras of all views, one by one."""
     return tuple(camera_of(cameras, view) for view in range(len(cameras)))
+
+
+def camera_extent(cameras: Sequence[Camera]) -> float:
+    """What 3DGS measures a scene with: 1.1 times the largest distance of a camera from the mean of all, world units.
+
+    0 where all cameras stand at one place.
+    """
+    centers = np.array([camera.center for camera in cameras])
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
 def project(points: Float32 | Float64, camera: Camera) -> tuple[Float64, Float64]:

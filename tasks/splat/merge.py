@@ -12,6 +12,7 @@ from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, extents, select
+from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
@@ -26,7 +27,7 @@ from ss_flow.tasks.gaussians.views import (
     group_view,
     whole_view,
 )
-from ss_flow.tasks.geometry.cameras import pixels_in_view
+from ss_flow.tasks.geometry.cameras import camera_extent, pixels_in_view
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import group_box
@@ -44,6 +45,10 @@ class MergeParams:
     """Most steps of a pair."""
     global_iterations: Natural = 2000
     """Steps of the last pass over the whole scene; 0 leaves it out."""
+    objective: Objective = Objective()
+    """What the training of a pair makes small, besides w_mask times the mask loss."""
+    global_objective: Objective = Objective()
+    """The same for the last pass."""
     global_mask_weight: NonNegative = 0.25
     """w_mask of the last pass."""
     reset_opacity: bool = False
@@ -54,17 +59,19 @@ class MergeParams:
     """Gaussians that add no more than this to any pixel of any view are dropped in the end."""
     sh_degree: HarmonicsDegree = 3
     """Highest degree of the colour's spherical harmonics."""
-    background: Literal["random", "black"] = "random"
-    """Colour behind the Gaussians: "random" in each step, or "black"."""
     ignore_occluded: bool = True
-    """Whether pixels where something else is in front are left out; False calls them empty."""
+    """Whether pixels where something else is in front of a pair are left out; False calls them empty, as in the
+    paper."""
     local: bool = True
     """Whether only what is inside the box of the smaller group is refined; False refines both groups whole."""
     collision_margin: NonNegative = 0.05
     """By how much that box is widened on every side, as a share of its diagonal."""
+    extent: Literal["instance", "cameras"] = "instance"
+    """What lengths are shares of, the rate of the means above all: "instance", the diagonal of each Gaussian's own
+    instance; or "cameras", the radius of the cameras that see them, as in 3DGS (where that is 0, the diagonal)."""
     max_scale: NonNegative = 0.05
-    """No Gaussian becomes longer (one standard deviation) than this share of its instance's box diagonal, or than it
-    starts where that is more; 0 = any."""
+    """No Gaussian becomes longer (one standard deviation) than this share of the extent, or than it starts where that
+    is more; 0 = any."""
     rates: LearningRates = LearningRates()
     """How fast each parameter is learnt."""
     guard_iou: Fraction = 0.02
@@ -74,8 +81,8 @@ class MergeParams:
     guard_trade: NonNegative = 2.0
     """Such a loss is allowed where the other of the two gains more than so many times as much, both counted in these
     limits: 0.06 of IoU for more than 6 dB. 0 = never."""
-    guard_views: Count = 12
-    """Views that the two are measured on."""
+    guard_views: Natural = 12
+    """Views that the two are measured on; 0 = nothing is measured and no refinement undone, as in the paper."""
     crop: CropParams = CropParams()
     """The part of each view that is rendered."""
 
@@ -111,11 +118,12 @@ def merge_pair(
 ) -> Gaussians:
     """Two groups as one, refined together where they collide (Split&Splat, Eqs. of l and l_mask).
 
-    What collides are the Gaussians inside the box of the smaller group, and the instances they belong to; all else is
-    kept as it is, and with it the time that a merge takes grows with the smaller group, not with the scene. Opacities
-    of what collides start from min(alpha, 0.01), so that what only explained an occluder does not come back (spec A23).
-    The loss is l_RGB + w_mask * l_mask with the masks of those instances composited jointly (spec A25, A26). When
-    refinement makes masks or colours worse than `params` allows, the plain union comes back, with a warning (spec P4).
+    What collides are, with `local`, the Gaussians inside the box of the smaller group, and the instances they belong
+    to; all else is kept as it is, and with it the time that a merge takes grows with the smaller group, not with the
+    scene. With `reset_opacity`, opacities of what collides start from min(alpha, 0.01), so that what only explained an
+    occluder does not come back (spec A23). The loss is w_mask * l_mask, the masks of those instances composited jointly
+    (spec A25, A26), besides `objective`: l_RGB, and the losses of alpha and depth where they have a weight. When
+    refinement makes masks or colours worse than the guard allows, the plain union comes back, with a warning (spec P4).
 
     views: at least those that show an instance of a or b; masks: their exclusive label maps. The order of a and b does
     not matter.
@@ -138,7 +146,7 @@ def merge_pair(
     settings = TrainParams(
         iterations=params.iterations(len(seen)),
         sh_degree=params.sh_degree,
-        background=params.background,
+        objective=params.objective,
         densify="none",
         mask_weight=w_mask,
         prune_opacity=0.0,
@@ -150,13 +158,19 @@ def merge_pair(
         started,
         seen,
         params=settings,
-        extent=extents(colliding),
+        extent=_extent(colliding, seen, params),
         seed=int(ids[0]),
         label_ids=ids.tolist(),
     ).gaussians
     refined = select(trained, ~reach | _shows(trained, seen, params))
     merged = _guarded(colliding, refined, seen, ids, params)
     return concatenate([select(union, ~near), merged]) if not near.all() else merged
+
+
+def _extent(gaussians: Gaussians, seen: Sequence[TrainView], params: MergeParams) -> float | Float32:
+    """World units, of all or for each of them."""
+    own = extents(gaussians)
+    return own if params.extent == "instance" else camera_extent([view.camera for view in seen]) or own
 
 
 def collision_box(group: Gaussians, margin: float) -> Float64:
@@ -212,7 +226,8 @@ def global_pass(
     """A last, short training of the whole scene with its background, on whole photos (spec P4, A22).
 
     scene: as `assemble` gives it. masks: exclusive label maps of all views. Opacities are kept and nothing is split or
-    cloned. The guard of `merge_pair` holds here too.
+    cloned. The loss is `global_objective` and `global_mask_weight` times the mask loss; the guard of `merge_pair` holds
+    here too.
     """
     if not len(scene) or not params.global_iterations:
         return scene
@@ -221,7 +236,7 @@ def global_pass(
     settings = TrainParams(
         iterations=params.global_iterations,
         sh_degree=params.sh_degree,
-        background=params.background,
+        objective=params.global_objective,
         densify="none",
         mask_weight=params.global_mask_weight,
         prune_opacity=params.prune_opacity,
@@ -233,7 +248,7 @@ def global_pass(
         scene,
         seen,
         params=settings,
-        extent=extents(scene),
+        extent=_extent(scene, seen, params),
         seed=0,
         label_ids=ids.tolist(),
     ).gaussians
@@ -303,6 +318,8 @@ def _channels(masks: Sequence[LabelMap], ids: Int32, rest: int, others: Int32) -
 
 
 def _guarded(before: Gaussians, after: Gaussians, views: list[TrainView], ids: Int32, params: MergeParams) -> Gaussians:
+    if not params.guard_views:
+        return after
     step = max(1, -(-len(views) // params.guard_views))
     old, new = quality(before, views[::step], ids), quality(after, views[::step], ids)
     if acceptable(old, new, params):

@@ -12,13 +12,15 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import REFINED, Float32, Gaussians, InstanceMasks, Int32
 from ss_flow.tasks.gaussians.densification import Schedule
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, initialise
+from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
 from ss_flow.tasks.gaussians.views import CropParams, PointSurface, SceneViews, Views, background_view, instance_view
+from ss_flow.tasks.geometry.cameras import camera_extent
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import dilated
-from ss_flow.tasks.ranges import Count, HarmonicsDegree, Natural, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
 
 
 @dataclass(frozen=True)
@@ -37,14 +39,14 @@ class ReconstructParams:
     """Whether training after refinement goes on from the Gaussians of the first, or starts over."""
     sh_degree: HarmonicsDegree = 3
     """Highest degree of the colour's spherical harmonics; they stay at 0 below 2000 steps."""
-    max_points: Count = 10_000
-    """Most points that training starts from; more are thinned out."""
-    max_gaussians: Count = 30_000
-    """Most Gaussians of an instance."""
+    max_points: Natural = 10_000
+    """Most points that training starts from; more are thinned out. 0 = all points, as in the paper."""
+    max_gaussians: Natural = 30_000
+    """Most Gaussians of an instance; 0 = any number, as in the paper."""
     background_scale: Positive = 2.0
     """Factor on steps, points and Gaussians for the background, which is the largest by far."""
-    background: Literal["random", "black"] = "random"
-    """Colour behind the Gaussians: "random" in each step, or "black" as in the paper."""
+    objective: Objective = Objective()
+    """What the training makes small."""
     ignore_occluded: bool = True
     """Whether pixels where something else is in front are left out; False calls them empty, as in the paper."""
     densify: Literal["classic", "mcmc", "none"] = "classic"
@@ -52,13 +54,14 @@ class ReconstructParams:
     Gaussians to where opaque ones are and grows by 5 % at a time (for many views), "none" leaves it."""
     schedule: Schedule = Schedule()
     """When "classic" clones and splits."""
-    depth_weight_start: NonNegative = 1.0
-    """Weight of the depth loss at the first step."""
-    depth_weight_final: NonNegative = 0.01
-    """Weight of the depth loss at the last step."""
+    prune_contribution: Fraction = 1 / 255
+    """Gaussians that add no more than this to any pixel of any view are dropped in the end; 0 keeps them (3DGS)."""
+    extent: Literal["instance", "cameras"] = "instance"
+    """What lengths are shares of, the rate of the means above all: "instance", the diagonal of the instance's box; or
+    "cameras", the radius of the cameras that see it, as in 3DGS (where that is 0, the diagonal)."""
     max_scale: NonNegative = 0.05
-    """No Gaussian becomes longer (one standard deviation) than this share of the instance's box diagonal, or than it
-    starts where that is more; 0 = any."""
+    """No Gaussian becomes longer (one standard deviation) than this share of the extent, or than it starts where that
+    is more; 0 = any."""
     rates: LearningRates = LearningRates()
     """How fast each parameter is learnt."""
     dilation: Natural = 0
@@ -143,8 +146,9 @@ def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussian
 
 
 def thin(points: Float32, limit: int) -> Int32:
-    """Rows of at most `limit` points, evenly spread: the first point in each cell of a grid. points: [N, 3]."""
-    if len(points) <= limit:
+    """Rows of at most `limit` points, evenly spread: the first point in each cell of a grid. points: [N, 3]; limit: 0
+    for all of them."""
+    if not limit or len(points) <= limit:
         return np.arange(len(points), dtype=np.int32)
     low = points.min(axis=0)
     # A surface as large as the box's diagonal squared would fill 64 times too many cells: the loop ends from above.
@@ -169,11 +173,14 @@ def _trained(
     views = [view for view in views if view.inside.any()]
     if not views:
         return initial
+    extent = max(box_diagonal(surface.points), surface.spacing)
+    if params.extent == "cameras":
+        extent = camera_extent([view.camera for view in views]) or extent
     result = train(
         initial,
         views,
         params=_settings(params, iterations, params.scale_of(instance)),
-        extent=max(box_diagonal(surface.points), surface.spacing),
+        extent=extent,
         seed=instance.instance_id,
     )
     if not len(result.gaussians):
@@ -186,12 +193,11 @@ def _settings(params: ReconstructParams, iterations: int, scale: float) -> Train
     return TrainParams(
         iterations=iterations,
         sh_degree=params.sh_degree,
-        background=params.background,
+        objective=params.objective,
         densify=params.densify,
         schedule=params.schedule,
         max_gaussians=round(params.max_gaussians * scale),
-        depth_weight_start=params.depth_weight_start,
-        depth_weight_final=params.depth_weight_final,
+        prune_contribution=params.prune_contribution,
         max_scale=params.max_scale,
         rates=params.rates,
     )

@@ -10,6 +10,7 @@ from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud, SceneUnit
 from ss_flow.tasks.gaussians.initialise import SH_ZERO, initialise
+from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, train
@@ -18,7 +19,7 @@ from ss_flow.tasks.geometry.cameras import cameras_by_view
 from ss_flow.tasks.geometry.fusion import VoxelSums, sum_by_voxel, with_sparse_points
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.split.dense import DenseParams, consistent_cloud, depth_samples, voxel_side
 
 _WIDTH = 0.25
@@ -40,10 +41,8 @@ class DenseSplattingParams:
     """Most points that training starts from; more are thinned out."""
     max_gaussians: Count = 200_000
     """Most Gaussians."""
-    depth_weight_start: NonNegative = 0.1
-    """Weight of the depth loss at the first step."""
-    depth_weight_final: NonNegative = 0.01
-    """Weight of the depth loss at the last step."""
+    objective: Objective = Objective(depth_weight_start=0.1)
+    """What the training makes small."""
     min_opacity: Fraction = 0.5
     """Fainter Gaussians give no point."""
     max_side: Count = 640
@@ -92,8 +91,7 @@ def dense_splatting(
         params=TrainParams(
             iterations=splatting.iterations(len(views)),
             sh_degree=0,
-            depth_weight_start=splatting.depth_weight_start,
-            depth_weight_final=splatting.depth_weight_final,
+            objective=splatting.objective,
             max_gaussians=splatting.max_gaussians,
             rates=SLOW_RATES,
         ),

@@ -1,8 +1,8 @@
 """The presets hold the numbers of the paper, of its authors' code, and our own (spec 3.1, by row of its table).
 
-Not in it, as no parameter holds them: what is a rule and not a number (of rows 10, 27, 28, 30, 38, 40), the
-reference's image crops (2), its point sources (11), its erosion radii of the first view and of one branch (13), its
-keeping of all points where a label has more than three clusters (15), and the dense descriptors (42-44).
+Not in it, as no parameter holds them: what is a rule and not a number (of rows 10, 27, 28, 38), the reference's image
+crops (2), its point sources (11), its erosion radii of the first view and of one branch (13), and the dense
+descriptors (42-44).
 """
 
 from __future__ import annotations
@@ -78,10 +78,13 @@ TABLE = {
     "split.propagate.label_clusters.eps": (2.5, 2.5, 2.5),
     "split.propagate.label_clusters.min_samples": (10, 10, 10),
     "split.propagate.label_clusters.keep_share": (1.0, 1.0, 0.05),
+    "split.propagate.label_clusters.max_clusters": (3, 3, 0),
+    "split.observe.clusters.max_clusters": (0, 0, 0),
     # 16
     "split.propagate.in_turn.lambda_init": (0.25, 0.25, 0.25),
     # 17
     "split.propagate.in_turn.contested_vote": (1.0, 0.75, 0.0),
+    "split.propagate.in_turn.contested_first_vote": (0.0, 1.0, 0.0),
     # 18
     "split.propagate.tau_label": (0.7, 0.7, 0.7),
     # 19, and the end of 15: the parameter counts in the end, where the reference drops labels below 10 points; its 5 is
@@ -107,11 +110,12 @@ TABLE = {
     "splat.reconstruct.max_iterations": (1000, 1000, 400),
     # 23
     "splat.reconstruct.densify": ("classic", "classic", "classic"),
-    "splat.reconstruct.max_gaussians": (30_000, 30_000, 30_000),
+    "splat.reconstruct.max_points": (0, 0, 10_000),
+    "splat.reconstruct.max_gaussians": (0, 0, 30_000),
     "splat.reconstruct.schedule.start": (500, 500, 500),
-    "splat.reconstruct.schedule.stop": (10_000, 10_000, 15_000),
+    "splat.reconstruct.schedule.stop": (15_000, 10_000, 15_000),
     "splat.reconstruct.schedule.every": (100, 100, 100),
-    "splat.reconstruct.schedule.reset_every": (1000, 1000, 3000),
+    "splat.reconstruct.schedule.reset_every": (3000, 1000, 3000),
     "splat.reconstruct.schedule.shorten": (False, False, True),
     "splat.reconstruct.dilation": (0, 1, 0),
     # 3DGS's, ours for shorter trainings.
@@ -122,30 +126,51 @@ TABLE = {
             "position": (1.6e-4, 1.6e-4, 3.2e-4),
             "position_final": (1.372e-4, 1.372e-4, 3.2e-6),
             "color": (2.5e-3, 2.5e-3, 1e-2),
-            "opacity": (0.05, 0.05, 0.05),
+            "opacity": (0.025, 0.025, 0.05),
             "scale": (5e-3, 5e-3, 2e-2),
             "rotation": (1e-3, 1e-3, 3e-3),
         }.items()
     },
     # 24: degree 0 below 2,000 steps is the trainer's rule.
     "splat.reconstruct.sh_degree": (3, 3, 3),
-    # 25
-    "splat.reconstruct.depth_weight_start": (1.0, 1.0, 1.0),
-    "splat.reconstruct.depth_weight_final": (1.0, 1.0, 0.01),
+    # In 3DGS lengths are shares of the radius of the cameras.
+    "splat.reconstruct.extent": ("cameras", "cameras", "instance"),
+    "splat.merge.extent": ("cameras", "cameras", "instance"),
+    # What is made small (P1, P4, A27), and 25: the paper regularises the depth of its first splatting alone. The
+    # reference takes its points elsewhere (11).
+    **{
+        f"{step}.{name}": values
+        for step, depth in {
+            "split.splatting.objective": ((1.0, 1.0, 0.1), (1.0, 1.0, 0.01), ("inverse", "inverse", "relative")),
+            "splat.reconstruct.objective": ((0.0, 1.0, 1.0), (0.0, 1.0, 0.01), ("relative", "inverse", "relative")),
+            "splat.merge.objective": ((0.0, 1.0, 1.0), (0.0, 1.0, 0.01), ("relative", "inverse", "relative")),
+            "splat.merge.global_objective": ((0.0, 1.0, 1.0), (0.0, 1.0, 0.01), ("relative", "inverse", "relative")),
+        }.items()
+        for name, values in {
+            "ssim_weight": (0.2, 0.2, 0.2),
+            "background": ("black", "black", "random"),
+            "alpha_weight": (0.0, 0.0, 0.5),
+            **dict(zip(("depth_weight_start", "depth_weight_final", "depth_error"), depth, strict=True)),
+        }.items()
+    },
+    "splat.reconstruct.ignore_occluded": (False, False, True),
+    "splat.merge.ignore_occluded": (False, False, True),
     # 26
     "splat.refine.prompts": (5, 5, 5),
     "splat.refine.prompt_alpha": (0.0, 0.3, 0.3),
     "splat.refine.drop_hull": (False, True, True),
     # 27
     "splat.refine.alpha_threshold": (0.5, 0.5, 0.5),
-    # 28: the reference's filter drops the most opaque Gaussians, a slip; all presets have ours.
-    "splat.refine.min_opacity": (0.05, 0.05, 0.05),
-    "splat.refine.max_scale": (0.5, 0.5, 0.5),
+    # 28, and the cut of P2. The reference drops black Gaussians and, by a slip, the most opaque ones.
+    "splat.refine.min_opacity": (0.0, 0.0, 0.05),
+    "splat.refine.max_scale": (0.0, 0.0, 0.5),
+    "splat.refine.cut_occluded": (False, False, True),
     "splat.reconstruct.max_scale": (0.0, 0.0, 0.05),
     "splat.merge.max_scale": (0.0, 0.0, 0.05),
     # 29
     "splat.refine.tau_iou": (0.95, 0.05, 0.5),
-    # 30: which of two equal masks stays is a rule. Ours replaces a mask of the photo only by one that is much better.
+    # 30: ours replaces a mask of the photo only by one that is much better.
+    "splat.refine.tie": ("new", "new", "old"),
     "splat.refine.pred_iou": (0.0, 0.0, 0.8),
     "splat.refine.margin": (0.0, 0.0, 0.1),
     "splat.refine.max_change": (0.0, 0.0, 1.5),
@@ -164,18 +189,23 @@ TABLE = {
     # 34
     "splat.merge.min_iterations": (1000, 1000, 60),
     "splat.merge.max_iterations": (1000, 1000, 150),
-    # The guard of P4
-    "splat.merge.guard_iou": (0.02, 0.02, 0.02),
-    "splat.merge.guard_psnr": (1.0, 1.0, 1.0),
-    "splat.merge.guard_trade": (0.0, 0.0, 2.0),
+    # P4: both groups whole, and no guard.
+    "splat.merge.local": (False, False, True),
+    "splat.merge.guard_views": (0, 0, 12),
+    "splat.merge.global_iterations": (2000, 2000, 2000),
+    "splat.merge.global_mask_weight": (0.25, 0.25, 0.25),
     # 35
     "splat.plan.mask_weights": ((0.05, 0.15, 0.25), (0.05, 0.1, 0.25), (0.05, 0.15, 0.25)),
     # 36
     "splat.merge.reset_opacity": (True, False, False),
     # 37
     "splat.merge.prune_opacity": (0.005, 0.0, 0.005),
-    "splat.merge.prune_contribution": (1 / 255, 0.0, 1 / 255),
-    # 39
+    "splat.merge.prune_contribution": (0.0, 0.0, 1 / 255),
+    "splat.reconstruct.prune_contribution": (0.0, 0.0, 1 / 255),
+    # 38: the text says CLIP, the code how it is asked.
+    "semantics.query.prompt": ("an image of a {text}", "an image of a {text}", "{text}"),
+    # 39: the masks are those that the Gaussians cast (Sec. 4.2).
+    "semantics.masks": ("rendered", "rendered", "refined"),
     "semantics.describe.background": ("blur", "blur", "blur"),
     "semantics.describe.margin_px": (10, 10, 10),
     "semantics.describe.box_scale": (1.05, 1.05, 1.05),
@@ -184,8 +214,11 @@ TABLE = {
     "semantics.describe.min_area": (0.01, 0.01, 0.002),
     "semantics.describe.max_views": (ALL, ALL, 10),
     "semantics.describe.erosion.diagonal": (0.0, 0.0, 800.0),
-    # 41
+    # 40
+    "semantics.describe.weighted": (False, False, True),
+    # 41; neither text nor code knows a test of relevancy.
     "semantics.query.tau_corr": (0.02, 0.02, 0.02),
+    "semantics.query.min_relevancy": (0.0, 0.0, 0.5),
 }
 
 FREE = {"split.segment.mask_threshold"}
@@ -216,6 +249,16 @@ def test_a_machine_with_time_gets_the_training_that_the_table_calls_our_default(
     assert (first.iterations_per_view, first.min_iterations, first.max_iterations) == (40, 600, 10_000)
     assert (params.merge.max_iterations, params.merge.global_iterations) == (1000, 7000)
     assert Params().splat.merge.global_iterations == 2000
+
+
+def test_paper_for_lerf_is_paper_with_ten_thousand_steps_an_instance_and_their_share_of_3dgs_decay():
+    paper, lerf = (settings.flat(settings.preset(Params(), name)) for name in ("paper", "paper_lerf"))
+    assert {name: value for name, value in lerf.items() if value != paper[name]} == {
+        "splat.reconstruct.min_iterations": 10_000,
+        "splat.reconstruct.max_iterations": 10_000,
+        "splat.reconstruct.rates.position_final": pytest.approx(1.6e-4 * 0.01 ** (10_000 / 30_000), rel=1e-3),
+    }
+    assert paper["splat.reconstruct.rates.position_final"] == pytest.approx(1.6e-4 * 0.01 ** (1 / 30), rel=1e-3)
 
 
 def test_every_preset_says_where_it_comes_from():

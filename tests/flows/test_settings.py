@@ -75,12 +75,12 @@ def test_a_bad_assignment_is_refused_in_one_sentence(text, sentence):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["default", "paper", "reference", "fast", "thorough"])
+@pytest.mark.parametrize("name", ["default", "paper", "paper_lerf", "reference", "fast", "thorough"])
 def test_every_preset_names_only_parameters_that_exist(name):
     settings.preset(Params(), name)
 
 
-@pytest.mark.parametrize("name", ["default", "paper", "reference", "fast", "thorough"])
+@pytest.mark.parametrize("name", ["default", "paper", "paper_lerf", "reference", "fast", "thorough"])
 def test_every_value_of_a_preset_is_in_its_range(name):
     params = settings.preset(Params(), name)
     assert settings.apply(params, [f"{path}={value}" for path, value in settings.flat(params).items()]) == params
@@ -113,7 +113,7 @@ def parts(kind):
         ("capture.ingest.jpeg_quality=101", "between 0 and 100"),
         ("capture.sweep.planes=2", "at least 3"),
         ("splat.plan.bbox_quantile=0.5", "at least 0 and less than 0.5"),
-        ("splat.reconstruct.background=white", "it takes 'random' or 'black'"),
+        ("splat.reconstruct.objective.background=white", "it takes 'random' or 'black'"),
     ],
 )
 def test_a_value_that_a_step_cannot_take_is_refused_before_any_work(text, sentence):
@@ -122,7 +122,7 @@ def test_a_value_that_a_step_cannot_take_is_refused_before_any_work(text, senten
 
 
 def test_an_unknown_preset_is_refused_with_the_known_ones():
-    with pytest.raises(InputError, match="default, fast, paper, reference, thorough"):
+    with pytest.raises(InputError, match="default, fast, paper, paper_lerf, reference, thorough"):
         settings.preset(Params(), "papre")
 
 

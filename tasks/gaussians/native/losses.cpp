@@ -180,11 +180,12 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
 
 // The losses of alpha, depth and labels over n pixels, and their gradients. out: {sum(judged |alpha - inside|),
 // sum(known |depth / target_depth - alpha|), sum(labelled (mismatch + 1 where the pixel has a label))}; the gradients of
-// the first two, times their weights, are written. mismatch, labelled and ids are null without labels.
+// the first two, times their weights, are written. inverse: the second is sum(known |alpha^2 / depth - 1 /
+// target_depth|), alpha / depth being 0 where nothing is. mismatch, labelled and ids are null without labels.
 void ss_surface_loss(int64_t n, const float* alpha, const float* depth, const float* mismatch, const float* inside,
                      const float* judged, const float* target_depth, const float* known, const float* labelled,
-                     const int32_t* ids, float alpha_weight, float depth_weight, float* towards_alpha,
-                     float* towards_depth, double* out) {
+                     const int32_t* ids, float alpha_weight, float depth_weight, int inverse,
+                     float* towards_alpha, float* towards_depth, double* out) {
     constexpr int kSome = 1024;
     float terms[3][kSome] = {};
     Sum sums[3];
@@ -198,6 +199,16 @@ void ss_surface_loss(int64_t n, const float* alpha, const float* depth, const fl
             towards_alpha[i] = alpha_weight * judged[i] * (float)((a > 0) - (a < 0)) - slope;
             towards_depth[i] = slope / target_depth[i];
         }
+        if (inverse)
+            for (int k = 0; k < count; ++k) {
+                const int64_t i = begin + k;
+                const float a = alpha[i] - inside[i], near = depth[i] > 0 ? alpha[i] / depth[i] : 0.0f;
+                const float r = alpha[i] * near - 1 / target_depth[i];
+                const float slope = depth_weight * known[i] * (float)((r > 0) - (r < 0));
+                terms[1][k] = known[i] * std::fabs(r);
+                towards_alpha[i] = alpha_weight * judged[i] * (float)((a > 0) - (a < 0)) + 2 * slope * near;
+                towards_depth[i] = -slope * near * near;
+            }
         if (labelled)
             for (int k = 0; k < count; ++k) {
                 const int64_t i = begin + k;

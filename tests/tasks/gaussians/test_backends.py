@@ -7,12 +7,13 @@ import pytest
 
 from ss_flow.tasks.gaussians.backends import NativeBackend
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, Settings
-from ss_flow.tasks.gaussians.objective import Target, Weights
+from ss_flow.tasks.gaussians.objective import Objective, Target
 from ss_flow.tasks.gaussians.torch_backend import TorchBackend
+from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
 
 
-def example(seed: int, *, with_labels: bool):
+def example(seed: int, objective: Objective, *, with_labels: bool):
     rng = np.random.default_rng(seed)
     n, h, w = 120, 33, 46
     parameters = (
@@ -23,25 +24,27 @@ def example(seed: int, *, with_labels: bool):
         0.4 * rng.normal(size=(n, 4, 3)),
     )
     inside = rng.random((h, w)) < 0.6
-    target = Target.of(
+    view = TrainView(
         Camera(w, h, 40.0, 40.0, w / 2, h / 2, np.eye(4)),
         rng.random((h, w, 3)).astype(np.float32),
         inside,
         ~inside & (rng.random((h, w)) < 0.5),
         np.where(rng.random((h, w)) < 0.8, 2.0 + rng.random((h, w)), 0).astype(np.float32),
         rng.integers(-2, 5, (h, w)).astype(np.int32) if with_labels else None,
-        7,
     )
     labels = rng.integers(-1, 7, n).astype(np.int32) if with_labels else None
-    return tuple(np.ascontiguousarray(p, np.float32) for p in parameters), labels, target
+    return tuple(np.ascontiguousarray(p, np.float32) for p in parameters), labels, Target.of(view, objective, 7)
 
 
 @pytest.mark.parametrize("with_labels", [False, True])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
-def test_torch_and_the_native_library_find_the_same_descent(with_labels, ssim_weight):
-    parameters, labels, target = example(3, with_labels=with_labels)
+@pytest.mark.parametrize("background", ["random", "black"])
+@pytest.mark.parametrize("depth_error", ["relative", "inverse"])
+def test_torch_and_the_native_library_find_the_same_descent(with_labels, ssim_weight, background, depth_error):
+    objective = Objective(ssim_weight, background, 0.5, depth_error, 0.3, 0.3)
+    parameters, labels, target = example(3, objective, with_labels=with_labels)
     settings = Settings((0.2, 0.4, 0.6), 7, 1, 0.01, False, winners=False)
-    weights = Weights(ssim_weight, 0.5, 0.3, 0.7)
+    weights = objective.at(0.5, 0.7)
     native = NativeBackend(1).descent(parameters, labels, target, settings, weights)
     torch_ = TorchBackend("cpu").descent(parameters, labels, target, settings, weights)
     assert native.loss == pytest.approx(torch_.loss, rel=1e-5)

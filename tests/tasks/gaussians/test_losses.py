@@ -8,6 +8,8 @@ import torch
 
 from ss_flow.tasks.gaussians.library import Workspace, address, library
 from ss_flow.tasks.gaussians.losses import photometric, surface
+from ss_flow.tasks.gaussians.objective import Target, Weights
+from ss_flow.tasks.geometry.cameras import Camera
 
 
 def reference(image, target, weight, ssim_weight):
@@ -65,35 +67,42 @@ def test_equal_images_have_no_loss_and_nothing_to_judge_has_none_either():
     assert nothing.loss == 0 and not nothing.gradient.any()
 
 
-def test_the_surface_loss_agrees_with_autograd():
+def target_of(shape, inside, judged, depth, known, ids=None, labelled=None) -> Target:
+    camera = Camera(shape[1], shape[0], 40.0, 40.0, 20.0, 20.0, np.eye(4))
+    return Target(camera, np.zeros((*shape, 3), np.float32), inside, inside, judged, depth, known, ids, labelled)
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_the_surface_loss_agrees_with_autograd(inverse):
     rng = np.random.default_rng(4)
     shape = (37, 41)
     alpha, depth, mismatch, inside, judged, known = rng.random((6, *shape)).astype(np.float32)
     target_depth = (0.5 + rng.random(shape)).astype(np.float32)
     ids = rng.integers(-2, 3, shape).astype(np.int32)
     labelled = rng.random(shape).astype(np.float32)
-    got = surface(
-        alpha, depth, mismatch, inside=inside, judged=judged, target_depth=target_depth, known=known,
-        labelled=labelled, ids=ids, alpha_weight=0.5, depth_weight=2.0,
-    )  # fmt: skip
+    alpha[:5], depth[:5] = 0, 0  # where no Gaussian is
+    target = target_of(shape, inside, judged, target_depth, known, ids, labelled)
+    got = surface(alpha, depth, mismatch, target, Weights(0.2, 0.5, 2.0, 0.7, inverse))
     a, d = (torch.tensor(x, requires_grad=True) for x in (alpha, depth))
     alpha_loss = (torch.tensor(judged) * (a - torch.tensor(inside)).abs()).sum()
-    depth_loss = (torch.tensor(known) * (d / torch.tensor(target_depth) - a).abs()).sum()
+    if inverse:
+        shown = d > 0
+        error = torch.where(shown, a**2 / torch.where(shown, d, 1), 0) - 1 / torch.tensor(target_depth)
+    else:
+        error = d / torch.tensor(target_depth) - a
+    depth_loss = (torch.tensor(known) * error.abs()).sum()
     (0.5 * alpha_loss + 2 * depth_loss).backward()
     assert got.alpha == pytest.approx(alpha_loss.item(), rel=1e-5)
     assert got.depth == pytest.approx(depth_loss.item(), rel=1e-5)
     assert got.labels == pytest.approx(float((labelled * (mismatch + (ids >= 0))).sum()), rel=1e-5)
-    assert np.allclose(got.towards_alpha, a.grad.numpy(), atol=1e-6)
-    assert np.allclose(got.towards_depth, d.grad.numpy(), atol=1e-6)
+    assert np.allclose(got.towards_alpha, a.grad.numpy(), rtol=1e-5, atol=1e-6)
+    assert np.allclose(got.towards_depth, d.grad.numpy(), rtol=1e-5, atol=1e-6)
 
 
 def test_images_of_two_sizes_are_refused():
     a, b = np.zeros((3, 4), np.float32), np.zeros((4, 3), np.float32)
     with pytest.raises(ValueError, match=r"must all be \[3, 4\]"):
-        surface(
-            a, b, None, inside=a, judged=a, target_depth=a, known=a, labelled=None, ids=None, alpha_weight=1.0,
-            depth_weight=1.0,
-        )  # fmt: skip
+        surface(a, b, None, target_of((3, 4), a, a, a, a), Weights(0.2, 1.0, 1.0, 0.0))
 
 
 def test_threads_and_a_workspace_change_no_byte_of_the_colour_loss():

@@ -13,6 +13,7 @@ from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.mcmc import divide
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
+from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainingDiverged, TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
@@ -112,12 +113,46 @@ def test_the_mask_loss_gives_pixels_back_to_their_instance():
     assert np.array_equal(with_masks.instance_id, wrong)
 
 
-def test_ignored_pixels_do_not_count():
+@pytest.mark.parametrize("background", ["random", "black"])
+def test_ignored_pixels_do_not_count(background):
     noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
     views = [replace(v, free=np.zeros_like(v.free)) for v in VIEWS]
     disturbed = [replace(v, image=np.where(v.inside[..., None], v.image, noise)) for v in views]
-    a, b = (train(ball_points(), x, params=TrainParams(iterations=20), extent=1.6, seed=0) for x in (views, disturbed))
+    params = TrainParams(iterations=20, objective=Objective(background=background))
+    a, b = (train(ball_points(), x, params=params, extent=1.6, seed=0) for x in (views, disturbed))
     assert a.gaussians.means.tobytes() == b.gaussians.means.tobytes()
+
+
+def test_on_black_photos_colour_counts_where_nothing_may_be_seen_and_the_photo_does_not():
+    noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
+    disturbed = [replace(v, image=np.where(v.inside[..., None], v.image, noise)) for v in VIEWS]
+    blind = [replace(v, free=np.zeros_like(v.free)) for v in VIEWS]
+    black = TrainParams(iterations=60, objective=Objective(background="black", alpha_weight=0.0))
+    as_it_is, other, unjudged = (
+        train(ball_points(), views, params=black, extent=1.6, seed=0).gaussians for views in (VIEWS, disturbed, blind)
+    )
+    assert as_it_is.means.tobytes() == other.means.tobytes()
+    outside = ~VIEWS[0].inside
+    shown, spilt = (render(g, VIEWS[0].camera).rgb[outside].mean() for g in (as_it_is, unjudged))
+    assert shown < 0.7 * spilt
+
+
+@pytest.mark.parametrize("objective", [Objective(background="white"), Objective(depth_error="absolute")])
+def test_an_objective_that_does_not_exist_is_refused(objective):
+    with pytest.raises(ValueError, match="must be one of"):
+        train(ball_points(), VIEWS, params=TrainParams(iterations=5, objective=objective), extent=1.6, seed=0)
+
+
+def test_a_depth_loss_of_inverse_depths_brings_the_surface_to_its_place():
+    far = replace(ball_points(), means=ball_points().means * np.float32(1.25))
+    off = []
+    for weight in (0.0, 2.0):
+        objective = Objective(depth_error="inverse", depth_weight_start=weight, depth_weight_final=weight)
+        params = TrainParams(iterations=150, objective=objective, densify="none")
+        out = render(train(far, VIEWS, params=params, extent=1.6, seed=1).gaussians, VIEWS[0].camera)
+        inside = VIEWS[0].inside
+        off.append(np.abs(out.depth / np.maximum(out.alpha, 1e-6) - VIEWS[0].depth)[inside].mean())
+    assert off[1] < 0.8 * off[0]
 
 
 def test_bad_input_is_refused():
@@ -160,6 +195,15 @@ def test_densification_ends_at_the_limit_with_the_largest_gradients_first():
     assert source.tolist() == [0, 1, 2, 3, 4, 5, 1, 3]
 
 
+def test_a_limit_of_none_lets_densification_go_on():
+    few = select(ball_points(), np.arange(60))
+    counts = [
+        len(train(few, VIEWS, params=TrainParams(iterations=240, max_gaussians=most), extent=1.6, seed=1).gaussians)
+        for most in (60, 30_000, 0)
+    ]
+    assert counts[0] <= 60 < counts[1] == counts[2]
+
+
 def test_the_gradient_record_averages_over_the_views_that_saw():
     record = GradientRecord(2)
     record.add(np.array([[3, 4], [0, 0]], np.float32), np.array([1, 0], np.float32), 2 * REFERENCE_ROWS)
@@ -169,6 +213,22 @@ def test_the_gradient_record_averages_over_the_views_that_saw():
 
 def test_a_long_training_densifies_as_3dgs_does():
     assert Schedule().of(30_000) == Schedule(500, 15_000, 100, 3_000)
+
+
+@pytest.mark.parametrize(
+    ("stop", "reset_every", "iterations", "densified", "resets"),
+    [
+        (15_000, 3_000, 1_000, (600, 900), []),  # paper
+        (10_000, 1_000, 1_000, (600, 900), []),  # the code of its authors: the reset of step 1,000 comes too late
+        (15_000, 3_000, 10_000, (600, 9_900), [3_000, 6_000, 9_000]),  # paper, LERF
+        (10_000, 1_000, 10_000, (600, 9_900), list(range(1_000, 10_000, 1_000))),
+    ],
+)
+def test_a_schedule_that_is_not_shortened_ends_before_the_last_step(stop, reset_every, iterations, densified, resets):
+    schedule = Schedule(500, stop, 100, reset_every, shorten=False).of(iterations)
+    steps = [step for step in range(1, iterations + 1) if schedule.densifies(step)]
+    assert (steps[0], steps[-1], len(steps)) == (*densified, 1 + (densified[1] - densified[0]) // 100)
+    assert [step for step in range(1, iterations + 1) if schedule.resets(step)] == resets
 
 
 def test_initial_scales_are_the_root_mean_square_of_three_neighbours():

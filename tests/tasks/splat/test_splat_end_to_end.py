@@ -143,6 +143,9 @@ def test_a_refinement_that_ruins_the_pair_is_undone_with_a_warning(built, monkey
         result = merge_pair(built.views, built.box, built.ball, built.scene.maps, params=MERGE, w_mask=0.05)
     assert len(result) == len(built.box) + len(built.ball)
     np.testing.assert_array_equal(result.means[: len(built.box)], built.box.means)
+    unguarded = replace(MERGE, guard_views=0, prune_opacity=0.0, prune_contribution=0.0)
+    ruined_pair = merge_pair(built.views, built.box, built.ball, built.scene.maps, params=unguarded, w_mask=0.05)
+    assert ruined_pair.opacities.max() < 0.05
 
 
 def test_merging_with_nothing_or_without_views_is_the_plain_union(built):
@@ -162,6 +165,7 @@ def test_thinning_keeps_points_spread_over_the_whole_surface():
     assert 250 < len(rows) <= 500 and (np.diff(rows) > 0).all()
     cells = np.histogram2d(*points[rows, :2].T, bins=5, range=[[0, 1], [0, 1]])[0]
     assert cells.min() > 5
+    assert len(thin(points.astype(np.float32), 0)) == len(points)
 
 
 def drawn(built, scene, maps=None, frames=None, depths=None, **params):

@@ -7,6 +7,7 @@ from tiny_runs import run_tiny, write_room
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.views import unit
+from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.split.dense import DenseParams
@@ -81,7 +82,7 @@ def test_the_number_of_steps_grows_with_the_views_between_two_limits():
 
 
 def test_the_weight_of_the_depth_loss_reaches_the_training(cloud):
-    heavier = splatted(depth_weight_start=2.0, depth_weight_final=2.0)
+    heavier = splatted(objective=Objective(depth_weight_start=2.0, depth_weight_final=2.0))
     assert heavier.points.tobytes() != cloud.points.tobytes()
 
 
