@@ -29,7 +29,6 @@ def novel_view(
     scene: Gaussians,
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    antialias: bool = False,
 ) -> Metrics:
     """Render the scene from the held-out cameras and compare with the photos, as 8-bit images.
 
@@ -50,7 +49,7 @@ def novel_view(
         if not valid.any():
             raise InputError(f"The mask of held-out view {frame.name} leaves no pixel to compare; drop the view.")
         camera = camera_of(cameras_held_out, view).scaled(frame.width, frame.height)
-        image = to_8bit(render(scene, camera, background=background, antialias=antialias).rgb)
+        image = to_8bit(render(scene, camera, background=background).rgb)
         photo = decode_rgb(frame)
         values.append((psnr(image, photo, valid), ssim(image, photo, valid)))
         progress(view + 1, len(names), frame.name)

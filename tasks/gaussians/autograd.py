@@ -18,16 +18,10 @@ def rasterize_cpu(
     camera: Camera,
     background: Tensor,
     labels: Tensor | None,
-    num_labels: int,
-    sh_degree: int,
-    near_plane: float,
-    antialias: bool,
-    winners: bool,
+    settings: Settings,
     center_gradient: Tensor,
 ) -> Rendered:
     """`rasterize` of one view on the CPU, its arguments checked. center_gradient: [N, 2] zeros, to be filled."""
-    red, green, blue = background.detach().tolist()
-    settings = Settings((red, green, blue), num_labels, sh_degree, near_plane, antialias, winners)
     channels = None if labels is None else np.ascontiguousarray(labels.numpy())
     rgb, alpha, depth, masks, top, radii, strongest = _Rasterize.apply(
         *gaussians.tensors(), background, channels, camera, settings, center_gradient

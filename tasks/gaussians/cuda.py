@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE, Settings
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered
 from ss_flow.tasks.geometry.cameras import Camera
 
@@ -16,11 +17,7 @@ def rasterize_cuda(
     camera: Camera,
     background: Tensor,
     labels: Tensor | None,
-    num_labels: int,
-    sh_degree: int,
-    near_plane: float,
-    antialias: bool,
-    winners: bool,
+    settings: Settings,
     center_gradient: Tensor,
 ) -> Rendered:
     """`rasterize` of one view on CUDA, its arguments checked. center_gradient: [N, 2] zeros, to be filled.
@@ -28,7 +25,7 @@ def rasterize_cuda(
     gsplat ends a pixel and cuts small contributions by its own thresholds, so results agree with the CPU's to about a
     grey level. It gives no winners: with `winners` this raises NotImplementedError.
     """
-    if winners:
+    if settings.winners:
         raise NotImplementedError("top contributors are found on the CPU only: render with CPU tensors")
     from gsplat import rasterization, spherical_harmonics
 
@@ -38,15 +35,15 @@ def rasterize_cuda(
         [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=device
     )
     center = -pose[:3, :3].T @ pose[:3, 3]
-    used = (sh_degree + 1) ** 2
-    colors = spherical_harmonics(sh_degree, gaussians.means - center, gaussians.sh[:, :used].contiguous())
+    used = (settings.sh_degree + 1) ** 2
+    colors = spherical_harmonics(settings.sh_degree, gaussians.means - center, gaussians.sh[:, :used].contiguous())
     channels = [torch.clamp(colors + 0.5, min=0)]
     if labels is not None:
-        one_hot = torch.zeros(len(gaussians), num_labels, device=device)
+        one_hot = torch.zeros(len(gaussians), settings.num_labels, device=device)
         rows = torch.nonzero(labels >= 0)[:, 0]
         one_hot[rows, labels[rows].long()] = 1
         channels.append(one_hot)
-    images, alphas, info = _render(rasterization, gaussians, channels, pose, intrinsics, camera, near_plane, antialias)
+    images, alphas, info = _render(rasterization, gaussians, channels, pose, intrinsics, camera)
     means2d = info["means2d"]
     if means2d.requires_grad:
         means2d.register_hook(lambda towards: center_gradient.add_(towards.reshape(center_gradient.shape)))
@@ -72,8 +69,6 @@ def _render(
     pose: Tensor,
     intrinsics: Tensor,
     camera: Camera,
-    near_plane: float,
-    antialias: bool,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     images, alphas, info = rasterization(
         means=gaussians.means,
@@ -85,9 +80,8 @@ def _render(
         Ks=intrinsics[None],
         width=camera.width,
         height=camera.height,
-        near_plane=near_plane,
+        near_plane=NEAR_PLANE,
         render_mode="RGB+D",
-        rasterize_mode="antialiased" if antialias else "classic",
         packed=False,
     )
     return images, alphas, info

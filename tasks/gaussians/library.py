@@ -41,7 +41,7 @@ class Scene(ctypes.Structure):
     _fields_ = (
         ("count", _INT64),
         *((name, _POINTER) for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "labels", "ids")),
-        *((name, _INT32) for name in ("sh_coefficients", "sh_degree", "num_labels", "width", "height", "antialias")),
+        *((name, _INT32) for name in ("sh_coefficients", "sh_degree", "num_labels", "width", "height")),
         *((name, _DOUBLE) for name in ("fx", "fy", "cx", "cy")),
         ("world_to_camera", _DOUBLE * 12),
         ("near_plane", _DOUBLE),

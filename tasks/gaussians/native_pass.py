@@ -11,6 +11,9 @@ from ss_flow.tasks.artifacts import Float32, Int32
 from ss_flow.tasks.gaussians.library import Gradients, Images, Scene, Workspace, address, library
 from ss_flow.tasks.geometry.cameras import Camera
 
+NEAR_PLANE = 0.01
+"""Nearest depth that is drawn, in world units."""
+
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
@@ -21,8 +24,6 @@ class Settings:
     background: tuple[float, float, float]
     num_labels: int
     sh_degree: int
-    near_plane: float
-    antialias: bool
     winners: bool
     """Whether to find each pixel's top contributor and each Gaussian's largest weight."""
 
@@ -60,13 +61,12 @@ class NativePass:
             settings.num_labels,
             w,
             h,
-            settings.antialias,
             camera.fx,
             camera.fy,
             camera.cx,
             camera.cy,
             (ctypes.c_double * 12)(*np.asarray(camera.world_to_camera, np.float64)[:3].ravel()),
-            settings.near_plane,
+            NEAR_PLANE,
             (ctypes.c_float * 3)(*settings.background),
         )
         self.rgb = np.empty((h, w, 3), np.float32)

@@ -19,14 +19,12 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Gaussians, Int32
 from ss_flow.tasks.gaussians.library import instruction_set
+from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.processor import on_this_processor
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-NEAR_PLANE = 0.01
-"""Nearest depth that is drawn, in world units."""
 
 NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
@@ -134,8 +132,6 @@ def rasterize(
     labels: Tensor | None = None,
     num_labels: int = 0,
     sh_degree: int | None = None,
-    near_plane: float = NEAR_PLANE,
-    antialias: bool = False,
     winners: bool = False,
 ) -> Rendered:
     """Render 3D Gaussians, on the device where they are.
@@ -143,8 +139,7 @@ def rasterize(
     camera: its principal point may lie anywhere. Several cameras of one image size render a batch: everything in the
     result then has one axis more in front. background: [3] RGB, differentiable when a tensor. labels: [N] int32, the
     mask channel (0 <= label < num_labels) of each Gaussian, negative = none. sh_degree: the degree in use, by default
-    all that is stored. antialias: lower the opacity by what the 0.3 pixels^2 add to the area (Mip-Splatting, Yu et al.
-    2024). winners: also find `top_contributor` and `max_contribution`.
+    all that is stored. winners: also find `top_contributor` and `max_contribution`.
 
     Raises ValueError when shapes or types do not fit, a parameter is not finite, or the image is empty.
     """
@@ -164,8 +159,11 @@ def rasterize(
     else:
         from ss_flow.tasks.gaussians.autograd import rasterize_cpu as on_device
     center_gradient = torch.zeros(len(cameras), len(gaussians), 2, device=gaussians.means.device)
-    options = (background, labels, num_labels, degree, near_plane, antialias, winners)
-    views = [on_device(gaussians, c, *options, g) for c, g in zip(cameras, center_gradient, strict=True)]
+    red, green, blue = background.detach().tolist()
+    settings = Settings((red, green, blue), num_labels, degree, winners)
+    views = [
+        on_device(gaussians, c, background, labels, settings, g) for c, g in zip(cameras, center_gradient, strict=True)
+    ]
     if isinstance(camera, Camera):
         return views[0]
     images = {f.name: torch.stack([getattr(v, f.name) for v in views]) for f in fields(Rendered)}

@@ -10,7 +10,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
-from ss_flow.tasks.gaussians.rasterize import NAMES, NEAR_PLANE
+from ss_flow.tasks.gaussians.rasterize import NAMES
 from ss_flow.tasks.geometry.cameras import Camera
 
 OPAQUE_LOGIT = 20.0
@@ -51,7 +51,6 @@ def render(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     opaque: bool = False,
     label_ids: Sequence[int] = (),
-    antialias: bool = False,
 ) -> Rendering:
     """Render Gaussians on the CPU.
 
@@ -67,7 +66,7 @@ def render(
     labels = channels_of(gaussians.instance_id, label_ids) if len(label_ids) else None
     degree = round(gaussians.sh.shape[1] ** 0.5) - 1
     red, green, blue = background
-    settings = Settings((red, green, blue), len(label_ids), degree, NEAR_PLANE, antialias, winners=True)
+    settings = Settings((red, green, blue), len(label_ids), degree, winners=True)
     done = NativePass(parameters, labels, camera, settings)  # type: ignore[arg-type]
     assert done.top is not None and done.strongest is not None
     return Rendering(done.rgb, done.alpha, done.depth, done.masks, done.top, done.radii > 0, done.strongest)

@@ -63,8 +63,6 @@ class TorchBackend:
             labels=channels,
             num_labels=0 if channels is None else len(here.one_hot),
             sh_degree=settings.sh_degree,
-            near_plane=settings.near_plane,
-            antialias=settings.antialias,
         )
         loss = _color_loss(out.rgb, here, weights.ssim)
         loss = loss + weights.alpha * (here.judged * (out.alpha - here.inside).abs()).sum()

@@ -20,7 +20,7 @@ from ss_flow.tasks.gaussians.mcmc import MarkovChain
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target, decayed
 from ss_flow.tasks.gaussians.optimizer import Parameters
-from ss_flow.tasks.gaussians.rasterize import NEAR_PLANE, training_device
+from ss_flow.tasks.gaussians.rasterize import training_device
 from ss_flow.tasks.gaussians.render import channels_of
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
@@ -191,7 +191,7 @@ class _Training:
         self.step += 1
         degree = max(self._given_degree, min(self._last_degree, self.step // 1000))
         behind = params.objective.behind(self._generator)
-        settings = Settings(behind, self._num_labels, degree, NEAR_PLANE, False, winners=False)
+        settings = Settings(behind, self._num_labels, degree, winners=False)
         weights = params.objective.at(done_share, params.mask_weight)
         labels = self._channels[parameters.origin] if target.ids is not None else None
         found = self._backend.descent(parameters.arrays(), labels, target, settings, weights)
@@ -236,7 +236,7 @@ class _Training:
     def finish(self) -> TrainResult:
         """Drop what shows nowhere; the PSNR of what stays."""
         parameters, params = self.parameters, self._params
-        settings = Settings((0.0, 0.0, 0.0), 0, self._last_degree, NEAR_PLANE, False, winners=True)
+        settings = Settings((0.0, 0.0, 0.0), 0, self._last_degree, winners=True)
         parameters.keep(parameters.opacities() >= params.prune_opacity)
         strongest = np.zeros(len(parameters), np.float32)
         error, count = 0.0, 0

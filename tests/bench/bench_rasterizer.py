@@ -90,7 +90,7 @@ def fma_peak(name: str) -> float:
 def passes(n: int, width: int, height: int, degree: int, size: float = 0.05) -> tuple[float, float, int]:
     """Milliseconds forward and backward, and the entries of one scene."""
     parameters, camera = scene(n, degree, size), camera_of(width, height)
-    settings = Settings((0.1, 0.2, 0.3), 0, degree, 0.01, False, winners=False)
+    settings = Settings((0.1, 0.2, 0.3), 0, degree, winners=False)
     workspace = Workspace()
     done = NativePass(parameters, None, camera, settings, workspace=workspace)
     towards = np.full_like(done.rgb, 1e-3)

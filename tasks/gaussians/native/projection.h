@@ -17,7 +17,6 @@ constexpr float kLog2E = 1.4426950408889634f;
 constexpr float kDilation = 0.3f;         // pixels^2 added to the screen covariance
 constexpr float kMinAlpha = 1.0f / 255;   // contributions below are skipped
 constexpr float kLog2MinAlpha = -7.994353436858858f;
-constexpr float kMinCompensation = 2.5e-5f;
 
 struct View {
     float R[3][3], t[3], center[3];
@@ -53,9 +52,8 @@ struct Footprint {
     V16 j00, j02, j11, j12;             // the Jacobian J; j01 = j10 = 0
     V16 u, v, c00, c01, c11;            // screen mean and covariance
     V16 k00, k01, k11;                  // its inverse
-    V16 sharp;                          // determinant of the covariance before the dilation
     V16 chord;                          // sqrt(1 - correlation^2)
-    V16 compensation, transparency;     // transparency = 1 - opacity
+    V16 transparency;                   // 1 - opacity
     V16 log2_opacity;
     V16 visible;                        // 0 = behind the near plane, too faint, or not finite on the screen
 };
@@ -107,16 +105,13 @@ inline Footprint project(const Scene& s, const View& view, const Rows& rows) {
     // The determinant as a sum of squares (Cauchy-Binet): no cancellation, so thin needles keep their inverse.
     const V16 m01 = T[0][0] * T[1][1] - T[0][1] * T[1][0], m02 = T[0][0] * T[1][2] - T[0][2] * T[1][0];
     const V16 m12 = T[0][1] * T[1][2] - T[0][2] * T[1][1];
-    f.sharp = m01 * m01 + m02 * m02 + m12 * m12;
-    const V16 det = f.sharp + kDilation * (c00 + c11) + kDilation * kDilation;
+    const V16 det = (m01 * m01 + m02 * m02 + m12 * m12) + kDilation * (c00 + c11) + kDilation * kDilation;
     f.c00 = c00 + kDilation, f.c11 = c11 + kDilation;
     f.k00 = f.c11 / det, f.k01 = -f.c01 / det, f.k11 = f.c00 / det;
     f.chord = square_root(det / (f.c00 * f.c11));
-    f.compensation = splat(1);
-    if (s.antialias) f.compensation = square_root(lanes::maximum(f.sharp / det, splat(kMinCompensation)));
     const V16 odds = exponential(-rows.column(s.opacity_logits, 1, 0));
     f.transparency = odds / (1.0f + odds);
-    const V16 opacity = f.compensation / (1.0f + odds);
+    const V16 opacity = 1.0f / (1.0f + odds);
     f.log2_opacity = lanes::log2_lanes(lanes::maximum(opacity, splat(1e-30f)));
     // Comparisons that a NaN fails.
     f.visible = less(splat(view.near_plane), f.z) * less(det, splat(1e30f)) * less(splat(kMinAlpha), opacity) *
@@ -139,16 +134,8 @@ inline void backproject(const Scene& s, const View& view, const Rows& rows, cons
     // dL/dC = -K (dL/dK) K with dL/dK = -moments / 2.
     const V16 a0 = f.k00 * in.gxx + f.k01 * in.gxy, a1 = f.k00 * in.gxy + f.k01 * in.gyy;
     const V16 b0 = f.k01 * in.gxx + f.k11 * in.gxy, b1 = f.k01 * in.gxy + f.k11 * in.gyy;
-    V16 g00 = 0.5f * (a0 * f.k00 + a1 * f.k01), g01 = 0.5f * (a0 * f.k01 + a1 * f.k11);
-    V16 g11 = 0.5f * (b0 * f.k01 + b1 * f.k11);
-    if (s.antialias) {
-        // d log compensation / dC = (C0^-1 - C^-1) / 2, C0 the covariance before the dilation; nothing where it is cut.
-        const V16 cut = splat(kMinCompensation), squared = f.compensation * f.compensation;
-        const V16 w = where_less(cut, squared, 0.5f * in.g, splat(0));
-        const V16 inverse = 1.0f / where_less(cut, squared, f.sharp, splat(1));
-        g00 = g00 + w * ((f.c11 - kDilation) * inverse - f.k00), g11 = g11 + w * ((f.c00 - kDilation) * inverse - f.k11);
-        g01 = g01 + w * (-f.c01 * inverse - f.k01);
-    }
+    const V16 g00 = 0.5f * (a0 * f.k00 + a1 * f.k01), g01 = 0.5f * (a0 * f.k01 + a1 * f.k11);
+    const V16 g11 = 0.5f * (b0 * f.k01 + b1 * f.k11);
     V16 dV[3][3], dj00 = splat(0), dj02 = splat(0), dj11 = splat(0), dj12 = splat(0);
     for (int k = 0; k < 3; ++k) {
         const V16 dT0 = 2.0f * (g00 * f.T[0][k] + g01 * f.T[1][k]), dT1 = 2.0f * (g01 * f.T[0][k] + g11 * f.T[1][k]);

@@ -18,7 +18,6 @@ struct Scene {
     int32_t sh_degree;            // used, 0..3
     int32_t num_labels;
     int32_t width, height;
-    int32_t antialias;
     double fx, fy, cx, cy;
     double world_to_camera[12];   // rows of [R | t]
     double near_plane;

@@ -45,9 +45,7 @@ def sh_basis(degree: int, d: Tensor) -> Tensor:
     return torch.stack(out, dim=1)
 
 
-def render(
-    parameters, camera, background, labels=None, num_labels=0, sh_degree=0, antialias=False, near=0.01
-) -> dict[str, Tensor]:
+def render(parameters, camera, background, labels=None, num_labels=0, sh_degree=0, near=0.01) -> dict[str, Tensor]:
     means, quaternions, log_scales, opacity_logits, sh = parameters
     to_camera = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)
     rotation, translation = to_camera[:3, :3], to_camera[:3, 3]
@@ -68,12 +66,9 @@ def render(
     )
     factor = rotations(quaternions) * log_scales.exp()[:, None, :]
     screen = jacobian @ rotation @ factor
-    sharp = screen @ screen.transpose(1, 2)
-    covariance = sharp + 0.3 * torch.eye(2, dtype=torch.float64)
+    covariance = screen @ screen.transpose(1, 2) + 0.3 * torch.eye(2, dtype=torch.float64)
     inverse = torch.linalg.inv(covariance)
     opacity = torch.sigmoid(opacity_logits)
-    if antialias:
-        opacity = opacity * (torch.det(sharp) / torch.det(covariance)).clamp(min=2.5e-5).sqrt()
     center = -rotation.T @ translation
     direction = torch.nn.functional.normalize(means - center, dim=1)
     used = (sh_degree + 1) ** 2

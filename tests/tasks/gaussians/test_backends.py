@@ -43,7 +43,7 @@ def example(seed: int, objective: Objective, *, with_labels: bool):
 def test_torch_and_the_native_library_find_the_same_descent(with_labels, ssim_weight, background, depth_error):
     objective = Objective(ssim_weight, background, 0.5, depth_error, 0.3, 0.3)
     parameters, labels, target = example(3, objective, with_labels=with_labels)
-    settings = Settings((0.2, 0.4, 0.6), 7, 1, 0.01, False, winners=False)
+    settings = Settings((0.2, 0.4, 0.6), 7, 1, winners=False)
     weights = objective.at(0.5, 0.7)
     native = NativeBackend(1).descent(parameters, labels, target, settings, weights)
     torch_ = TorchBackend("cpu").descent(parameters, labels, target, settings, weights)

@@ -141,7 +141,7 @@ def test_the_objective_of_paper_is_the_papers(task, w_mask, small, monkeypatch):
         expected.backward()
         target = Target.of(view, asked.params.objective, num_labels)
         behind = asked.params.objective.behind(np.random.default_rng(0))
-        options = Settings(behind, num_labels, 0, 0.01, False, winners=False)
+        options = Settings(behind, num_labels, 0, winners=False)
         for share in (0.0, 1.0):
             weights = asked.params.objective.at(share, asked.params.mask_weight)
             for backend in (NativeBackend(1), TorchBackend("cpu")):

@@ -61,9 +61,7 @@ def relative(a: torch.Tensor, b: torch.Tensor) -> float:
     return float((a.double() - b.double()).norm() / b.double().norm().clamp(min=1e-12))
 
 
-def compare(
-    gaussians, camera, *, device="cpu", labels=None, num_labels=0, degree=0, antialias=False, seed=0, tolerance=1e-4
-):
+def compare(gaussians, camera, *, device="cpu", labels=None, num_labels=0, degree=0, seed=0, tolerance=1e-4):
     """Images and gradients of one scene from both sides. Smooth random weights make the loss.
 
     gsplat's kernels have thresholds of their own, so CUDA is held to 2e-3.
@@ -73,10 +71,10 @@ def compare(
     background = torch.tensor([0.2, 0.5, 0.7], device=device, requires_grad=True)
     ours = rasterize(
         there, camera, background=background, labels=None if labels is None else labels.to(device),
-        num_labels=num_labels, sh_degree=degree, antialias=antialias, winners=device == "cpu",
+        num_labels=num_labels, sh_degree=degree, winners=device == "cpu",
     )  # fmt: skip
     exact, exact_background = doubles(gaussians), background.detach().cpu().double().requires_grad_()
-    theirs = reference.render(exact, camera, exact_background, labels, num_labels, degree, antialias)
+    theirs = reference.render(exact, camera, exact_background, labels, num_labels, degree)
     generator = torch.Generator().manual_seed(seed)
     loss, exact_loss = torch.zeros(()), torch.zeros((), dtype=torch.float64)
     for name in IMAGES:
@@ -106,29 +104,26 @@ def compare(
     n=st.integers(1, 40),
     degree=st.integers(0, 3),
     num_labels=st.integers(0, 4),
-    antialias=st.booleans(),
     width=st.integers(1, 23),
     height=st.integers(1, 19),
 )
-def test_images_and_gradients_agree_with_the_reference(seed, n, degree, num_labels, antialias, width, height):
+def test_images_and_gradients_agree_with_the_reference(seed, n, degree, num_labels, width, height):
     rng = np.random.default_rng(seed)
     labels = torch.tensor(rng.integers(-1, num_labels, n), dtype=torch.int32) if num_labels else None
     compare(
         scene(rng, n, 16 if degree == 3 else (degree + 1) ** 2),
         camera_at(rng, width, height),
-        labels=labels, num_labels=num_labels, degree=degree, antialias=antialias, seed=seed,
+        labels=labels, num_labels=num_labels, degree=degree, seed=seed,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("degree", [0, 3])
-@pytest.mark.parametrize("antialias", [False, True])
-def test_every_device_agrees_with_the_reference(device, degree, antialias):
+def test_every_device_agrees_with_the_reference(device, degree):
     rng = np.random.default_rng(21)
     labels = torch.tensor(rng.integers(-1, 3, 60), dtype=torch.int32)
     compare(
         scene(rng, 60, 16), camera_at(rng, 61, 50), device=device, labels=labels, num_labels=3, degree=degree,
-        antialias=antialias,
     )  # fmt: skip
 
 
@@ -256,7 +251,7 @@ def test_threads_and_a_used_workspace_change_no_byte():
         found = set()
         for threads in (1, 2, 7):
             done = NativePass(
-                arrays, labels, camera, Settings((0.1, 0.2, 0.3), 3, 1, 0.01, False, winners=True),
+                arrays, labels, camera, Settings((0.1, 0.2, 0.3), 3, 1, winners=True),
                 workspace=workspace, threads=threads,
             )  # fmt: skip
             gradients = done.backward(color, towards, towards, masks)
@@ -267,7 +262,7 @@ def test_threads_and_a_used_workspace_change_no_byte():
 
 def test_a_pass_whose_workspace_was_used_again_does_not_go_back():
     arrays = tuple(t.detach().numpy() for t in one().tensors())
-    workspace, setting = Workspace(), Settings((0.0, 0.0, 0.0), 0, 0, 0.01, False, winners=False)
+    workspace, setting = Workspace(), Settings((0.0, 0.0, 0.0), 0, 0, winners=False)
     first = NativePass(arrays, None, CAMERA, setting, workspace=workspace)
     NativePass(arrays, None, CAMERA, setting, workspace=workspace)
     with pytest.raises(RuntimeError, match="another one by now"):

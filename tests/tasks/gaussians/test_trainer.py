@@ -264,7 +264,7 @@ def test_the_mismatch_is_the_absolute_error_of_all_label_masks():
     channels = rng.integers(-1, 4, len(ball)).astype(np.int32)
     ids = rng.integers(-2, 4, (SIZE, SIZE)).astype(np.int32)
     parameters = tuple(getattr(ball, name) for name in PARAMETERS)
-    settings = Settings((0.0, 0.0, 0.0), 4, 0, 0.01, False, winners=False)
+    settings = Settings((0.0, 0.0, 0.0), 4, 0, winners=False)
     masks = NativePass(parameters, channels, camera_round(0), settings).masks
     single = NativePass(parameters, channels, camera_round(0), settings, ids=ids)
     one_hot = ids == np.arange(4)[:, None, None]
