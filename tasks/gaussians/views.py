@@ -34,7 +34,7 @@ class TrainView:
     inside: Bool
     """[h, w] pixels of what is trained: colour loss, alpha towards 1."""
     free: Bool
-    """[h, w] pixels where nothing is: alpha towards 0. Pixels of neither kind are ignored."""
+    """[h, w] pixels where nothing is: alpha towards 0, or colour towards black. Pixels of neither kind are ignored."""
     depth: Float32
     """[h, w] z-depth in world units, 0 = unknown; counts inside only."""
     ids: Int32 | None = None
