@@ -112,13 +112,18 @@ def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> t
     if scene.kind == "sens":
         assert scene.recording is not None
         return recordings.sens_frames(
-            recording=reference(scene.recording), names=scene.names, entries=scene.entries, params=params.ingest
+            recording=reference(scene.recording),
+            names=scene.names,
+            entries=scene.entries,
+            skipped=scene.skipped,
+            params=params.ingest,
         )
     return ingest.frames(
         names=scene.names,
         photos=_all(reference, scene.photos),
         valid=_all(reference, scene.valid),
         lenses=scene.lenses,
+        skipped=scene.skipped,
         params=params.ingest,
     )
 

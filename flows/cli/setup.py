@@ -98,6 +98,7 @@ class Doctor:
             ("rasterizer", _rasterizer),
             ("CUDA", _cuda),
             ("Open3D", lambda: str(_open3d())),
+            ("onnxruntime", _onnxruntime),
             *((name, lambda n=name, m=module: _library(n, m)) for name, module in _LIBRARIES),
             *((f"{kind} network", lambda k=kind: _model(k)) for kind in ("segmenter", "text-image", "monodepth")),
         ]
@@ -123,7 +124,6 @@ _LIBRARIES = (
     ("torch", "torch"),
     ("pycolmap", "pycolmap"),
     ("opencv-contrib-python-headless", "cv2"),
-    ("onnxruntime", "onnxruntime"),
     ("zarr", "zarr"),
 )
 
@@ -139,6 +139,12 @@ def _open3d() -> str:
     from ss_flow.tasks.geometry.open3d import load_open3d
 
     return str(load_open3d().__version__)
+
+
+def _onnxruntime() -> str:
+    from ss_flow.tasks.models.onnx import load_onnxruntime
+
+    return str(load_onnxruntime().__version__)
 
 
 def _rasterizer() -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.running import progress
+from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Frame
 from ss_flow.tasks.capture.layout_colmap import read_points
@@ -21,6 +21,8 @@ from ss_flow.tasks.capture.scene_files import Pose
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.ranges import Count, JpegQuality
 
+_NAMED = 10
+"""Views that a warning names; more are counted."""
 _UPRIGHT = {2: "flip", 3: "180", 4: "flip 180", 5: "flip 270", 6: "90", 7: "flip 90", 8: "270"}
 
 
@@ -41,14 +43,17 @@ def frames(
     photos: tuple[FileRef, ...],
     valid: tuple[FileRef | None, ...] = (),
     lenses: tuple[Lens, ...] | None = None,
+    skipped: tuple[str, ...] = (),
     params: IngestParams = IngestParams(),
 ) -> tuple[Frame, ...]:
     """The photos as frames: upright, without distortion, not above `params.max_side`.
 
     A photo that is all this already keeps its bytes. Where intrinsics are known, a photo is turned upright (EXIF) only
     if they refer to the turned one. Pixels that the lens does not reach after undistortion become invalid.
+    skipped: views of the capture that are not among these, of which the run is to warn.
     Raises InputError when a photo is damaged, or its size or that of its valid mask is not the stated one.
     """
+    warn_of_skipped(skipped, "without a photo, a pose or a depth map")
     result = []
     sizes: dict[Lens, tuple[int, int, str]] = {}
     for i, (name, ref) in enumerate(zip(names, photos, strict=True)):
@@ -66,6 +71,14 @@ def frames(
         result.append(frame)
         progress(i + 1, len(photos), name)
     return tuple(result)
+
+
+def warn_of_skipped(names: tuple[str, ...], why: str) -> None:
+    """Say which views are left out of a run, the first of them by name."""
+    if names:
+        shown = f"{', '.join(names[:_NAMED])}{f' and {len(names) - _NAMED} more' if len(names) > _NAMED else ''}"
+        views = "1 view is" if len(names) == 1 else f"{len(names)} views are"
+        warn(f"{views} left out, {why}: {shown}.")
 
 
 def frame_of(

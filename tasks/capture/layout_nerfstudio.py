@@ -24,12 +24,17 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     Its poses are camera-to-world with OpenGL's axes (y up, looking along -z). A unit of its depth files is
     `depth_unit_scale_factor` world units (0.001 unless said). The scene counts as metric exactly when it has depth
     maps: those of a sensor come in metres, while poses alone are mostly structure from motion's.
-    Raises InputError when the file or a file that it lists is missing or makes no sense.
+    Frames whose photo is not there are left out: such a file is often passed on with a part of its photos.
+    Raises InputError when the file or another file that it lists is missing or makes no sense, or no photo is there.
     """
     root = path.parent
     document = _document(path)
-    frames = sorted(document["frames"], key=lambda f: (natural_key(f["file_path"]), f["file_path"]))
-    photos = tuple(_photo(root, frame["file_path"], path) for frame in frames)
+    listed = sorted(document["frames"], key=lambda f: (natural_key(f["file_path"]), f["file_path"]))
+    found = [(frame, photo) for frame in listed if (photo := _photo(root, frame["file_path"])) is not None]
+    if not found:
+        raise InputError(f"{path} lists {len(listed)} photos, and none of them exists; put them into {root}.")
+    frames, photos = [frame for frame, _ in found], tuple(photo for _, photo in found)
+    missing = tuple(Path(frame["file_path"]).stem for frame in listed if _photo(root, frame["file_path"]) is None)
     with_depth = [f for f in frames if f.get("depth_file_path")]
     if with_depth and len(with_depth) < len(frames):
         lacking = next(f["file_path"] for f in frames if not f.get("depth_file_path"))
@@ -56,6 +61,7 @@ def open_nerfstudio(path: Path) -> SceneFiles:
         lenses=tuple(_lens({**document, **f}, p, path) for f, p in zip(frames, photos, strict=True)),
         poses=tuple(poses),
         metric=bool(with_depth),
+        skipped=missing,
     )
 
 
@@ -74,13 +80,13 @@ def _document(path: Path) -> dict[str, Any]:
     return document
 
 
-def _photo(root: Path, name: str, path: Path) -> Path:
+def _photo(root: Path, name: str) -> Path | None:
     photo = root / name
     if photo.is_file():
         return photo
     if not photo.suffix and photo.with_suffix(".png").is_file():
         return photo.with_suffix(".png")
-    raise InputError(f"{photo}, which {path.name} lists, does not exist; put the photo there or drop the frame.")
+    return None
 
 
 def _listed(root: Path, name: str | None, path: Path) -> Path | None:

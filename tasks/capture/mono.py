@@ -13,7 +13,7 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.geometry.alignment import fit_scale_shift
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
-from ss_flow.tasks.models.onnx import network_identity
+from ss_flow.tasks.models.onnx import load_onnxruntime, network_identity
 from ss_flow.tasks.ranges import Count, Fraction, Positive
 
 _MEAN = np.array((0.485, 0.456, 0.406), np.float32)
@@ -84,8 +84,8 @@ def mono(
 
 def _predict(frame: Frame, model: FileRef, params: MonoParams) -> Float32:
     import cv2
-    import onnxruntime
 
+    onnxruntime = load_onnxruntime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1

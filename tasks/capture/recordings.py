@@ -11,7 +11,7 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame, UInt8
-from ss_flow.tasks.capture.ingest import IngestParams, frame_of
+from ss_flow.tasks.capture.ingest import IngestParams, frame_of, warn_of_skipped
 from ss_flow.tasks.capture.layout_scannet import read_sens_index
 from ss_flow.tasks.capture.photo_files import inspect
 from ss_flow.tasks.capture.sensor_depth import registered_depth
@@ -115,13 +115,15 @@ def sens_frames(
     recording: FileRef,
     names: tuple[str, ...],
     entries: tuple[int, ...],
+    skipped: tuple[str, ...] = (),
     params: IngestParams = IngestParams(),
 ) -> tuple[Frame, ...]:
     """The colour photos of some views of a ScanNet `.sens` file.
 
-    entries: places in the file, from 0.
+    entries: places in the file, from 0. skipped: views that are not among these, of which the run is to warn.
     Raises InputError when the file is damaged.
     """
+    warn_of_skipped(skipped, "without a pose")
     index = read_sens_index(recording.path)
     result = []
     with recording.path.open("rb") as file:

@@ -87,7 +87,7 @@ class SceneFiles:
     ground_truth: tuple[Path | None, ...] | None = None
     """Annotated instances: uint16 images of ids, 0 = not annotated or background."""
     skipped: tuple[str, ...] = ()
-    """Views of the capture that are left out, for lack of a pose or a depth map."""
+    """Views of the capture that are left out, for lack of a photo, a pose or a depth map."""
 
     @property
     def has_masks(self) -> bool:

@@ -16,6 +16,7 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, Frame
+from ss_flow.tasks.capture.ingest import warn_of_skipped
 from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, Positive
@@ -38,8 +39,9 @@ class SfmParams:
     """The most SIFT features a photo."""
     peak_threshold: Positive = 0.003
     """Contrast that a SIFT feature needs; COLMAP's own default, 0.0067, finds too few in dim or blurred rooms."""
-    guided_matching: bool = True
-    """Whether photos are matched a second time along the epipolar lines that the first match gave."""
+    guided_matching: Literal["never", "missing", "always"] = "missing"
+    """Whether photos are matched a second time along the epipolar lines that the first match gave, which takes eight
+    times as long: "missing" - only where photos find no pose without, and then all over again."""
     min_pose_matches: Count = 15
     """So many points must confirm a photo's pose (COLMAP's own default is 30)."""
     min_start_angle: Angle = 8.0
@@ -75,17 +77,19 @@ def sfm(frames: tuple[Frame, ...], *, params: SfmParams = SfmParams(), seed: int
         files = _write_photos(frames, root)
         progress(0, 3, "features")
         _extract(pycolmap, root, files, params)
-        progress(1, 3, "matches")
-        _match(pycolmap, root, len(frames), params, seed)
-        progress(2, 3, "mapping")
-        models = pycolmap.incremental_mapping(
-            root / "database.db", root / "photos", root / "sparse", _mapping_options(pycolmap, params, seed)
-        )
-        plausible = {number: model for number, model in models.items() if _plausible(model)}
-        if not plausible:
+        best = None
+        for guided in {"never": (False,), "always": (True,), "missing": (False, True)}[params.guided_matching]:
+            if best is not None and best.num_reg_images() == len(frames):
+                break
+            progress(1, 3, "guided matches" if guided else "matches")
+            _match(pycolmap, root, len(frames), params, guided, seed)
+            progress(2, 3, "mapping")
+            found = _largest(pycolmap, root, f"guided-{guided}", params, seed)
+            if best is None or (found is not None and found.num_reg_images() > best.num_reg_images()):
+                best = found
+        if best is None:
             raise InputError(_too_few(0, len(frames)))
-        largest = max(plausible.items(), key=lambda m: (m[1].num_reg_images(), m[1].num_points3D(), -m[0]))[1]
-        result = _cameras(largest, frames, files, params)
+        result = _cameras(best, frames, files, params)
     progress(3, 3, f"{len(result)} of {len(frames)} photos have a pose")
     if len(result) < max(3, params.min_registered * len(frames)):
         raise InputError(_too_few(len(result), len(frames)))
@@ -101,7 +105,8 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
     import cv2
 
     frame_of = {frame.name: frame for frame in frames}
-    dropped = [frame.name for frame in frames if frame.name not in set(cameras.names)]
+    placed = set(cameras.names)
+    warn_of_skipped(tuple(frame.name for frame in frames if frame.name not in placed), "as no pose was found for them")
     result = []
     for i, name in enumerate(cameras.names):
         frame = frame_of[name]
@@ -115,7 +120,7 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
             valid = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
             frame = replace(frame, encoded=encode_png(image), valid=valid)
         result.append(frame)
-        progress(i + 1, len(cameras), f"without a pose: {', '.join(dropped)}" if dropped else name)
+        progress(i + 1, len(cameras), name)
     return tuple(result)
 
 
@@ -183,11 +188,24 @@ def _extract(pycolmap: ModuleType, root: Path, files: list[str], params: SfmPara
     )
 
 
-def _match(pycolmap: ModuleType, root: Path, count: int, params: SfmParams, seed: int) -> None:
+def _largest(pycolmap: ModuleType, root: Path, name: str, params: SfmParams, seed: int) -> Any | None:
+    """The model with the most photos that mapping gives, if one is possible."""
+    models = pycolmap.incremental_mapping(
+        root / "database.db", root / "photos", root / name, _mapping_options(pycolmap, params, seed)
+    )
+    plausible = [(model.num_reg_images(), model.num_points3D(), -number, model) for number, model in models.items()]
+    return max((row for row in plausible if _plausible(row[-1])), key=lambda row: row[:3], default=(None,))[-1]
+
+
+def _match(pycolmap: ModuleType, root: Path, count: int, params: SfmParams, guided: bool, seed: int) -> None:
+    """Match all pairs of photos anew."""
+    with pycolmap.Database.open(root / "database.db") as database:
+        database.clear_matches()
+        database.clear_two_view_geometries()
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = _MATCHING_THREADS
-    options.guided_matching = params.guided_matching
+    options.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     common = {

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -24,6 +26,14 @@ def network_identity() -> dict[str, str]:
     ONNX Runtime picks its kernels by the widest one, and sums in another order in each. For the `environment` of tasks.
     """
     return {"instruction set": on_this_processor(widest_instruction_set())}
+
+
+def load_onnxruntime() -> ModuleType:
+    """The `onnxruntime` module, which from version 1.31 on reports its use unless told not to before its import."""
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+    import onnxruntime
+
+    return cast(ModuleType, onnxruntime)
 
 
 def open_session(
@@ -62,8 +72,7 @@ def _open(
     batched: tuple[str, ...],
     wires: tuple[tuple[str, str, str], ...],
 ) -> onnxruntime.InferenceSession:
-    import onnxruntime
-
+    onnxruntime = load_onnxruntime()
     if not Path(path).is_file():
         raise InputError(f"{path} does not exist; it should be an ONNX network.")
     options = onnxruntime.SessionOptions()

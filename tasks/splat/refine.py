@@ -147,7 +147,6 @@ def refine(
 @task(
     name="splat.rendered",
     resources=Resources(cores=1, memory_mb=1800),
-    uses=("opencv-contrib-python-headless", "scipy"),
     environment=backend_identity,
 )
 def rendered(

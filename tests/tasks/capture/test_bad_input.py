@@ -220,9 +220,9 @@ def transforms_of_a_panorama(root):
     return made.nerfstudio(root, camera_model="EQUIRECTANGULAR")
 
 
-@case("10.png", "does not exist")
-def listed_photo_missing(root):
-    (made.nerfstudio(root) / "images" / "10.png").unlink()
+@case("transforms.json", "none of them exists")
+def listed_photos_missing(root):
+    shutil.rmtree(made.nerfstudio(root) / "images")
     return root
 
 

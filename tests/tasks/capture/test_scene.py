@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ss_flow.task import FileRef
+from ss_flow.tasks.capture import ingest
 from ss_flow.tasks.capture.layout_colmap import read_points
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import natural_key
@@ -176,3 +178,14 @@ def test_the_real_captures_open():
     shelf, office = open_scene(SHARED / "apc_shelf"), open_scene(SHARED / "hololens_office")
     assert (len(shelf.names), shelf.kind, len(shelf.ground_truth)) == (15, "scannet", 15)
     assert (len(office.names), office.kind, office.metric) == (75, "nerfstudio", True)
+
+
+def test_frames_of_a_transforms_json_whose_photo_is_missing_are_left_out_with_a_warning(tmp_path):
+    made.nerfstudio(tmp_path)
+    whole = open_scene(tmp_path)
+    (tmp_path / "images" / "10.png").unlink()
+    scene = open_scene(tmp_path)
+    assert scene.skipped == ("10",) and scene.names == tuple(name for name in whole.names if name != "10")
+    files = tuple(FileRef(photo, "") for photo in scene.photos)
+    with pytest.warns(UserWarning, match="1 view is left out, without a photo, a pose or a depth map: 10."):
+        ingest.frames(names=scene.names, photos=files, lenses=scene.lenses, skipped=scene.skipped)

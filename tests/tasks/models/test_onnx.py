@@ -1,5 +1,10 @@
 """Sessions of networks, and cut graphs."""
 
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import onnx
 import pytest
@@ -7,6 +12,7 @@ from onnx import TensorProto, helper
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
+from ss_flow.tasks.models import onnx as networks
 from ss_flow.tasks.models.onnx import expose, open_session, run
 
 
@@ -90,3 +96,14 @@ def test_damaged_file_is_named(network, keep, outputs):
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"gone\.onnx does not exist"):
         open_session(FileRef(tmp_path / "gone.onnx", "gone"))
+
+
+def test_onnx_runtime_is_told_not_to_report_its_use_before_it_is_imported():
+    code = "import sys, os; from ss_flow.tasks.models import onnx; assert 'onnxruntime' not in sys.modules; "
+    code += "onnx.load_onnxruntime(); assert os.environ['ORT_DISABLE_TELEMETRY'] == '1'"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    roots = [Path(networks.__file__).parents[2] / name for name in ("tasks", "flows")]
+    sources = [path for root in roots for path in root.rglob("*.py")]
+    found = (re.findall(r"^ +import onnxruntime", p.read_text(), re.MULTILINE) for p in sources)
+    others = [p.name for p, lines in zip(sources, found, strict=True) if lines]
+    assert others == ["onnx.py"]
