@@ -5,10 +5,12 @@ Exit codes: 0 done, 1 failed, 2 bad usage or bad input, 3 done but degraded, 130
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import tyro
@@ -89,11 +91,19 @@ Command = tyro.conf.OmitSubcommandPrefixes[
 def main(arguments: list[str]) -> int:
     """Run one command; return the exit code."""
     errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    if not arguments:
+        with contextlib.suppress(SystemExit):
+            main(["--help"])
+        return BAD_INPUT
+    if arguments == ["--version"]:
+        print(f"ss-flow {version('ss-flow')}")
+        return 0
     try:
         command: Any = tyro.cli(
             Command,
             prog="ss-flow",
-            description="From a capture to instance-labelled 3D Gaussians; nothing is computed twice.",
+            description="From a capture to instance-labelled 3D Gaussians; nothing is computed twice. "
+            "`ss-flow demo` shows it on a room of its own, `ss-flow run PATH` takes yours.",
             args=arguments,
         )
         return int(command.run())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import hashlib
 import os
@@ -131,7 +132,9 @@ def entry_of(name: str) -> ModelEntry:
     """The catalogue's entry of a name. Raises InputError when there is none."""
     catalogue = load_catalogue()
     if name not in catalogue:
-        raise InputError(f"there is no model {name!r} in the catalogue; it has {', '.join(catalogue)}.")
+        meant = [known for known in catalogue if name.lower() in known] or difflib.get_close_matches(name, catalogue, 1)
+        hint = f" Did you mean {meant[0]!r}?" if meant else ""
+        raise InputError(f"there is no model {name!r} in the catalogue; it has {', '.join(catalogue)}.{hint}")
     return catalogue[name]
 
 

