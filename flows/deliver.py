@@ -14,7 +14,7 @@ from ss_flow.closure import code_closure
 from ss_flow.engine import Report
 from ss_flow.flows import settings
 from ss_flow.flows.params import Params
-from ss_flow.flows.split_splat import Networks
+from ss_flow.flows.split import Networks
 from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_cloud, write_masks, write_scene

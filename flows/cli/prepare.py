@@ -21,7 +21,8 @@ from ss_flow.flows.capture import Capture, capture
 from ss_flow.flows.cli.context import StoreOptions, choose_model
 from ss_flow.flows.deliver import deliver, run_document
 from ss_flow.flows.params import Params
-from ss_flow.flows.split_splat import Networks, split_splat
+from ss_flow.flows.split import Networks
+from ss_flow.flows.split_splat import split_splat
 from ss_flow.graph import Flow
 from ss_flow.resolution import Failure
 from ss_flow.task import FileRef

@@ -1,0 +1,158 @@
+"""Instances -> Gaussians -> one labelled scene: the second half of the DAG (Split&Splat, Sec. 3.2)."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from ss_flow.flows.capture import Capture
+from ss_flow.flows.params import Params
+from ss_flow.flows.split import Networks, Split
+from ss_flow.graph import INDEX, each, expand, gather, labelled, otherwise, pick
+from ss_flow.tasks.artifacts import (
+    Appearances,
+    Descriptors,
+    Gaussians,
+    InstanceMasks,
+    LabelMap,
+)
+from ss_flow.tasks.gaussians.views import Views
+from ss_flow.tasks.semantics.describe import describe
+from ss_flow.tasks.splat.collisions import MergePlan
+from ss_flow.tasks.splat.merge import assemble, global_pass, merge_pair
+from ss_flow.tasks.splat.plan import plan
+from ss_flow.tasks.splat.reconstruct import reconstruct, retrain
+from ss_flow.tasks.splat.refine import refine, rendered
+from ss_flow.tasks.splat.render_masks import render_masks
+from ss_flow.tasks.splat.resolve import exclusive, resolve_refined
+from ss_flow.tasks.split.appearances import shown_in
+
+R = TypeVar("R")
+
+
+def splat(capture: Capture, found: Split, networks: Networks, params: Params) -> dict[str, Any]:
+    """Instances -> Gaussians, each on its own; refined masks; one scene (Split&Splat, Sec. 3.2)."""
+    views = Views(capture.frames, capture.by_view, capture.depths, capture.unit)
+    settings, visibility = params.splat, params.split.visibility
+
+    def of_instance(row: int, build: Callable[[list[int]], R]) -> R:
+        """What `build` makes of the views that see an instance: a step for one instance depends on no others."""
+        return expand(found.appearances, lambda seen_in: build(seen_in.views(row)))
+
+    @functools.cache
+    def reconstructed(row: int) -> Gaussians:
+        return of_instance(
+            row,
+            lambda seen: reconstruct(
+                some(views, seen), found.instances[row], params=settings.reconstruct, visibility=visibility
+            ),
+        )
+
+    @functools.cache
+    def refined(row: int) -> InstanceMasks:
+        return of_instance(
+            row,
+            lambda seen: refine(
+                some(views, seen),
+                found.instances[row],
+                reconstructed(row),
+                pick(found.embeddings, seen) if networks.segmenter is not None else (),
+                model=networks.segmenter,
+                params=settings.refine,
+                visibility=visibility,
+            ),
+        )
+
+    def retrained(row: int) -> Gaussians:
+        return of_instance(
+            row,
+            lambda seen: retrain(
+                some(views, seen),
+                exclusive(refined(row), pick(masks_refined, seen)),
+                reconstructed(row),
+                params=settings.reconstruct,
+                visibility=visibility,
+            ),
+        )
+
+    def pictured(row: int, seen: list[int]) -> InstanceMasks:
+        if params.semantics.masks == "refined":
+            return refined(row)
+        return rendered(
+            some(views, seen), refined(row), reconstructed(row), params=settings.refine, visibility=visibility
+        )
+
+    def described(row: int) -> Descriptors:
+        return of_instance(
+            row,
+            lambda seen: describe(
+                pick(capture.frames, seen),
+                pictured(row, seen),
+                encoder=networks.encoder,
+                params=params.semantics.describe,
+            ),
+        )
+
+    def of_each(build: Callable[[int], R]) -> tuple[R, ...]:
+        return each(found.instances, INDEX, build=lambda _, row: build(row), on_error="skip")
+
+    masks_of_each = of_each(refined)
+    with labelled("splat"):
+        masks_refined = resolve_refined(views, masks_of_each, params=settings.resolve, visibility=visibility)
+        shown = shown_in(masks_refined)
+    merged = merge_rounds(views, of_each(retrained), masks_refined, shown, params, 0)
+    assembled = assemble(merged)
+    scene = otherwise(global_pass(views, assembled, masks_refined, params=settings.merge), lambda: assembled)
+    return {
+        "reconstruct": of_each(reconstructed),
+        "refine": masks_of_each,
+        "masks_refined": masks_refined,
+        "merge": merged,
+        "scene": scene,
+        "masks": render_masks(views, scene, masks_refined, params=settings.masks),
+        "describe": of_each(described),
+    }
+
+
+def some(views: Views, rows: list[int]) -> Views:
+    """Some views of a scene, in a flow."""
+    return Views(pick(views.frames, rows), pick(views.cameras, rows), pick(views.depths, rows), views.unit)
+
+
+def merge_rounds(
+    views: Views,
+    groups: tuple[Gaussians, ...],
+    masks: tuple[LabelMap, ...],
+    shown: Appearances,
+    params: Params,
+    number: int,
+) -> tuple[Gaussians, ...]:
+    """Merge the pairs that collide, disjoint pairs side by side, until none is left (spec P4).
+
+    shown: which views show which instance.
+    """
+
+    def build(planned: MergePlan) -> tuple[Gaussians, ...]:
+        if not len(planned.pairs):
+            return groups
+        merged: list[Gaussians] = []
+        for row, (a, b) in enumerate(planned.pairs.tolist()):
+            pair, seen = (groups[a], groups[b]), planned.views(row)
+            with labelled(f"{number}.{a}+{b}"):
+                refined = merge_pair(
+                    some(views, seen),
+                    *pair,
+                    pick(masks, seen),
+                    params=params.splat.merge,
+                    w_mask=planned.mask_weight,
+                    visibility=params.split.visibility,
+                )
+                # A pair that cannot be refined is joined as it is.
+                merged.append(otherwise(refined, functools.partial(assemble, pair)))
+        rest = [groups[i] for i in planned.singles.tolist()]
+        return merge_rounds(views, gather([*merged, *rest]), masks, shown, params, number + 1)
+
+    with labelled(str(number)):
+        planned = plan(groups, shown, params=params.splat.plan, round=number)
+    return expand(planned, build)

@@ -1,0 +1,186 @@
+"""Photos and depth -> instances that all views agree on: the first half of the DAG (Split&Splat, Sec. 3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from ss_flow.errors import InputError
+from ss_flow.flows.capture import Capture
+from ss_flow.flows.params import SplitParams
+from ss_flow.graph import each
+from ss_flow.tasks.artifacts import (
+    Appearances,
+    Clicks,
+    Hierarchy,
+    InstanceMasks,
+    MaskSet,
+    PointCloud,
+    PointLabels,
+    PointParts,
+    PromptedMasks,
+    Visibility,
+)
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
+from ss_flow.tasks.split import hints
+from ss_flow.tasks.split.appearances import appearances
+from ss_flow.tasks.split.cut import cut, cut_parts
+from ss_flow.tasks.split.dense import dense
+from ss_flow.tasks.split.dense_splatting import dense_splatting
+from ss_flow.tasks.split.embed import embed
+from ss_flow.tasks.split.hierarchy import hierarchy
+from ss_flow.tasks.split.observe import observe
+from ss_flow.tasks.split.parts import find_parts
+from ss_flow.tasks.split.propagate import propagate
+from ss_flow.tasks.split.reproject import reproject
+from ss_flow.tasks.split.reprompt import reprompt
+from ss_flow.tasks.split.segment import segment
+from ss_flow.tasks.split.segment_rgbd import segment_rgbd
+from ss_flow.tasks.split.tally import tally
+from ss_flow.tasks.split.visibility import visibility
+
+
+@dataclass(frozen=True)
+class Networks:
+    """The networks of a run; None stands for the stated fallback."""
+
+    segmenter: Model | None
+    encoder: Model | None
+    monodepth: Model | None
+
+
+@dataclass(frozen=True)
+class Split:
+    """Nodes of the first half, by the artifacts that they stand for."""
+
+    points: PointCloud
+    visibility: tuple[Visibility, ...]
+    masks: tuple[MaskSet, ...]
+    pieces: PointLabels
+    """The leaves of the tree."""
+    tree: Hierarchy
+    labels: PointLabels
+    """The instances, which the cut through the tree leaves."""
+    parts: PointParts
+    instances: tuple[InstanceMasks, ...]
+    """The background first."""
+    appearances: Appearances
+    """The views that see each of them."""
+    embeddings: tuple[Embedding, ...]
+    """One a view; none without a segmenter."""
+    hinted: PointLabels | None
+    """By the objects that were clicked, where some were."""
+
+
+def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
+    """Photos and depth -> view-consistent instances (Split&Splat, Sec. 3.1)."""
+    views = (capture.frames, capture.cameras, capture.depths)
+    if params.dense_source == "splatting":
+        points = dense_splatting(*views, capture.unit, params=params.dense, splatting=params.splatting)
+    else:
+        points = dense(*views, capture.unit, params=params.dense)
+    segmenter = networks.segmenter
+    embeddings: tuple[Embedding, ...] = ()
+    if segmenter is not None:
+        embeddings = each(capture.frames, names=capture.names, build=lambda frame: embed(frame, model=segmenter))
+    seen = each(
+        capture.by_view,
+        capture.depths,
+        names=capture.names,
+        build=lambda camera, depth: visibility(points, camera, depth, params=params.visibility),
+    )
+    hinted: PointLabels | None = None
+    if capture.masks is not None:
+        masks = capture.masks
+    elif capture.clicks is not None:
+        masks, hinted = _masks_of_hints(capture, capture.clicks, embeddings, points, seen, segmenter, params)
+    elif segmenter is not None:
+        masks = each(
+            capture.frames,
+            embeddings,
+            names=capture.names,
+            build=lambda frame, embedding: segment(frame, embedding, params=params.segment, model=segmenter),
+        )
+    else:
+        masks = each(
+            capture.frames,
+            capture.depths,
+            names=capture.names,
+            build=lambda frame, depth: segment_rgbd(frame, depth, capture.cameras, params=params.rgbd),
+        )
+    observed = each(
+        seen,
+        masks,
+        names=capture.names,
+        build=lambda visible, pool: observe(points, visible, pool, params=params.observe),
+    )
+    propagating, granularity = params.propagate, params.granularity
+    if capture.clicks is not None:  # what was clicked as two objects stays two
+        propagating, granularity = replace(propagating, touching_merge=False), 1.0
+    pieces = propagate(points, seen, observed, params=propagating)
+    counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
+    tree = hierarchy(points, capture.cameras, pieces, counted, params=params.hierarchy)
+    labels = cut(pieces, tree, granularity=granularity)
+    parts = cut_parts(pieces, find_parts(observed, masks, pieces, params=params.parts), labels)
+    prompted: tuple[PromptedMasks, ...] = ()
+    if segmenter is not None and capture.masks is None:
+        prompted = each(
+            capture.frames,
+            embeddings,
+            seen,
+            masks,
+            names=capture.names,
+            build=lambda frame, embedding, visible, pool: reprompt(
+                EmbeddedPhoto(frame, embedding),
+                visible,
+                pool,
+                labels,
+                model=segmenter,
+                params=params.reprompt,
+                selection=params.reproject.selection,
+            ),
+        )
+    instances = reproject(points, seen, masks, labels, parts, prompted, params=params.reproject)
+    seen_in = appearances(labels, seen)
+    return Split(points, seen, masks, pieces, tree, labels, parts, instances, seen_in, embeddings, hinted)
+
+
+def _masks_of_hints(
+    capture: Capture,
+    clicks: tuple[Clicks, ...],
+    embeddings: tuple[Embedding, ...],
+    points: PointCloud,
+    seen: tuple[Visibility, ...],
+    segmenter: Model | None,
+    params: SplitParams,
+) -> tuple[tuple[MaskSet, ...], PointLabels]:
+    """The masks of all views from points clicked in a few, and the points labelled by the clicked objects."""
+    if segmenter is None:
+        raise InputError(
+            "hints need a segmenter to be prompted with, and there is none; `ss-flow models list` names some."
+        )
+    clicked = each(
+        capture.frames,
+        embeddings,
+        clicks,
+        names=capture.names,
+        build=lambda frame, embedding, own: hints.clicked(EmbeddedPhoto(frame, embedding), own, model=segmenter),
+    )
+    hinted = hints.label(points, seen, clicked, erosion=params.observe.erosion, tau_label=params.propagate.tau_label)
+    masks = each(
+        capture.frames,
+        embeddings,
+        seen,
+        clicked,
+        names=capture.names,
+        build=lambda frame, embedding, visible, own: hints.spread(
+            EmbeddedPhoto(frame, embedding),
+            visible,
+            own,
+            hinted,
+            params=params.reprompt,
+            contained=params.segment.contained,
+            model=segmenter,
+        ),
+    )
+    return masks, hinted
