@@ -1,4 +1,4 @@
-"""`ss-flow batch`: many scenes, each of which ends for itself."""
+"""`ss-flow batch`: many scenes; one that fails does not stop the others."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Batch:
             for path in (path for path in folders if str(path) not in ended):
                 try:
                     scenes[path] = self._opened(path, self.out / folders[path], params, digests)
-                except Exception as error:  # whatever is wrong with one scene is no matter of the others
+                except Exception as error:  # a fault in one scene must not stop the others
                     errors[path] = _in_words(error)
             if errors and not scenes and not ended:
                 first = next(iter(errors.values()))
@@ -222,7 +222,7 @@ class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
             row = _row(path, document["status"], report, out, first_failure(document), measures(self._store, document))
         except Gone:
             raise
-        except Exception as error:  # a fault of one scene's result is no matter of the others
+        except Exception as error:  # a fault in one scene's result must not stop the others
             row = _row(path, "failed", report, error=_in_words(error))
         self._book.add(row)
 

@@ -126,7 +126,7 @@ class Wanted:
         return roots
 
     def _is_quiet(self, run: Run) -> bool:
-        """Whether nothing was written for so long that the run is not just about to claim that it lives."""
+        """Whether nothing was written for so long that this cannot be a run that has only just begun."""
         try:
             return max(path.stat().st_mtime for path in (run.folder, *run.folder.iterdir())) < self._quiet_before
         except FileNotFoundError:

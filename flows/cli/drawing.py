@@ -32,7 +32,7 @@ def draw_results(store: Store, run: Run, values: Sequence[Any], view: int, file:
 
 
 def _of_type(store: Store, run: Run, kind: type) -> list[Any]:
-    """What the first step of a run that gives this type gave."""
+    """The result of the first step of a run that gives this type."""
     for node in run.nodes():
         if node["outputs"] and isinstance(first := store.get(node["outputs"][0]), kind):
             return [first, *(store.get(digest) for digest in node["outputs"][1:])]

@@ -51,7 +51,7 @@ class Status:
         )
         for event in events:
             row = steps[event["step"]] if "step" in event else {}
-            if event["event"] == "restarted":  # what it had found, it finds again
+            if event["event"] == "restarted":  # the same results are found again
                 for row in steps.values():
                     row |= {"hit": 0, "skipped": 0, "running": 0}
             elif event["event"] == "started":

@@ -1,4 +1,4 @@
-"""What this machine has: networks, libraries, compilers' work."""
+"""What this machine has: networks, libraries, the compiled rasterizer."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Sweep:
         tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]],
         tyro.conf.arg(name="metric", metavar="NAME", help_behavior_hint="may be given several times"),
     ] = ()
-    """Tell only of these figures, such as split.miou; an unknown one is answered with those there are."""
+    """Tell only of these figures, such as split.miou; for an unknown one, the known ones are named."""
     query: str | None = None
     """Also search every result for this text, so that query.tau_corr can be swept."""
     masks: Path | None = None

@@ -1,4 +1,4 @@
-"""How several commands put things."""
+"""Sentences that several commands print."""
 
 from __future__ import annotations
 

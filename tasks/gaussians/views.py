@@ -187,8 +187,9 @@ def group_view(
     free = seen.outside
     if ignore_occluded:
         depth = propagated_depth(surface.points, seen.camera, surface.spacing)
-        in_front = (depth > 0) & ((seen.depth == 0) | (seen.depth + scene.tolerance(depth) < depth))
-        free &= ~in_front
+        # What lies in front of the surface, or may do so since no depth is known there.
+        covered = (depth > 0) & ((seen.depth == 0) | (seen.depth + scene.tolerance(depth) < depth))
+        free = free & ~covered
     return seen.training(free)
 
 
@@ -204,7 +205,7 @@ def background_view(
     free = seen.outside
     if ignore_occluded:
         depth = propagated_depth(surface.points, seen.camera, surface.spacing)
-        free &= (depth > 0) & (seen.depth > 0) & (seen.depth > depth + scene.tolerance(depth))
+        free = free & (depth > 0) & (seen.depth > depth + scene.tolerance(depth))
     return seen.training(free)
 
 
