@@ -98,9 +98,9 @@ def test_delta_must_be_below_tau_corr_and_not_equal(directions):
 
 def test_a_background_that_fits_best_leaves_the_objects_their_matches_unless_it_is_asked_for(directions):
     room = (at_degrees(0, 0), at_degrees(1, 10), at_degrees(2, 14), at_degrees(3, 30))
-    found = query(room, text="east", tau_corr=0.005)
+    found = query(room, text="east", params=QueryParams(tau_corr=0.005))
     assert (found.instance_id.tolist(), found.matches(), found.delta[0]) == ([1, 2, 3], [1], 0)
-    asked = query(room, text="east", tau_corr=0.005, background=True)
+    asked = query(room, text="east", params=QueryParams(tau_corr=0.005), background=True)
     assert (asked.instance_id.tolist(), asked.matches()) == ([0, 1, 2, 3], [0])
 
 
