@@ -370,8 +370,28 @@ class Descriptors:
     """Name of the text-image encoder."""
 
 
+class ViewLists:
+    """Some of a scene's views for each row, one list after the other."""
+
+    first: Int32
+    """[R + 1] where the views of each row begin in `view`."""
+    view: Int32
+    """[A] places of views in the scene's order, ascending for each row."""
+
+    def views(self, row: int) -> list[int]:
+        """The views of a row."""
+        found: list[int] = self.view[self.first[row] : self.first[row + 1]].tolist()
+        return found
+
+    @staticmethod
+    def arrays(views: Sequence[Sequence[int]]) -> dict[str, Int32]:
+        """The two arrays by their names; views: of each row, ascending."""
+        first = np.append(0, np.cumsum([len(of_row) for of_row in views])).astype(np.int32)
+        return {"first": first, "view": np.array([view for of_row in views for view in of_row], np.int32)}
+
+
 @dataclass(frozen=True)
-class Appearances:
+class Appearances(ViewLists):
     """Which views show which instances: what the steps for one instance depend on."""
 
     instance_id: Int32
@@ -381,22 +401,11 @@ class Appearances:
     view: Int32
     """[A] rows of the scene's views, ascending for each instance."""
 
-    def views(self, row: int) -> list[int]:
-        """The views that show the instance of this row."""
-        rows: list[int] = self.view[self.first[row] : self.first[row + 1]].tolist()
-        return rows
-
     def of(self, ids: Int32) -> list[int]:
         """The views that show any of these instances, ascending."""
         return sorted(
             {view for row in np.flatnonzero(np.isin(self.instance_id, ids)).tolist() for view in self.views(row)}
         )
-
-    @classmethod
-    def listed(cls, instance_id: Int32, views: Sequence[Sequence[int]]) -> Appearances:
-        """views: of each instance, ascending."""
-        first = np.append(0, np.cumsum([len(of_one) for of_one in views])).astype(np.int32)
-        return cls(instance_id, first, np.array([view for of_one in views for view in of_one], np.int32))
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,12 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     root = path.parent
     document = _document(path)
     listed = sorted(document["frames"], key=lambda f: (natural_key(f["file_path"]), f["file_path"]))
-    found = [(frame, photo) for frame in listed if (photo := _photo(root, frame["file_path"])) is not None]
+    places = [(frame, _photo(root, frame["file_path"])) for frame in listed]
+    found = [(frame, photo) for frame, photo in places if photo is not None]
     if not found:
         raise InputError(f"{path} lists {len(listed)} photos, and none of them exists; put them into {root}.")
     frames, photos = [frame for frame, _ in found], tuple(photo for _, photo in found)
-    missing = tuple(Path(frame["file_path"]).stem for frame in listed if _photo(root, frame["file_path"]) is None)
+    missing = tuple(Path(frame["file_path"]).stem for frame, photo in places if photo is None)
     with_depth = [f for f in frames if f.get("depth_file_path")]
     if with_depth and len(with_depth) < len(frames):
         lacking = next(f["file_path"] for f in frames if not f.get("depth_file_path"))

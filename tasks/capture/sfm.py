@@ -18,7 +18,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, Frame
 from ss_flow.tasks.capture.ingest import warn_of_skipped
 from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png, suffix_of
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, Positive
 
 _MATCHING_THREADS = 2
@@ -106,7 +106,7 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
 
     frame_of = {frame.name: frame for frame in frames}
     placed = set(cameras.names)
-    warn_of_skipped(tuple(frame.name for frame in frames if frame.name not in placed), "as no pose was found for them")
+    warn_of_skipped(tuple(frame.name for frame in frames if frame.name not in placed), "for which no pose was found")
     result = []
     for i, name in enumerate(cameras.names):
         frame = frame_of[name]
@@ -153,8 +153,7 @@ def _write_photos(frames: tuple[Frame, ...], root: Path) -> list[str]:
     """Write photos in one folder for each size, so that COLMAP shares a camera among photos of one size."""
     files = []
     for i, frame in enumerate(frames):
-        suffix = "jpg" if frame.encoded[:2].tobytes() == b"\xff\xd8" else "png"
-        file = f"{frame.width}x{frame.height}/{i:06d}.{suffix}"
+        file = f"{frame.width}x{frame.height}/{i:06d}.{suffix_of(frame)}"
         photo, mask = root / "photos" / file, root / "valid" / f"{file}.png"
         photo.parent.mkdir(parents=True, exist_ok=True)
         mask.parent.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ss_flow.tasks.artifacts import Cameras, Frame, LabelMap
-from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.geometry.images import encode_png, suffix_of
 
 
 def write_undistorted(folder: Path, frames: Sequence[Frame], cameras: Cameras, maps: Sequence[LabelMap]) -> None:
@@ -20,8 +20,7 @@ def write_undistorted(folder: Path, frames: Sequence[Frame], cameras: Cameras, m
         (folder / name).mkdir(parents=True)
     files = []
     for frame, ids in zip(frames, maps, strict=True):
-        suffix = "jpg" if frame.encoded[:2].tobytes() == b"\xff\xd8" else "png"
-        files.append(f"{frame.name}.{suffix}")
+        files.append(f"{frame.name}.{suffix_of(frame)}")
         (folder / "images" / files[-1]).write_bytes(frame.encoded.tobytes())
         (folder / "masks" / f"{frame.name}.png").write_bytes(encode_png(ids.ids).tobytes())
         if frame.valid.size:

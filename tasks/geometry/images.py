@@ -15,6 +15,11 @@ def decode_rgb(frame: Frame) -> UInt8:
     return np.ascontiguousarray(bgr[..., ::-1])
 
 
+def suffix_of(frame: Frame) -> str:
+    """What the name of a file with a frame's bytes ends in: "jpg" or "png"."""
+    return "jpg" if frame.encoded[:2].tobytes() == b"\xff\xd8" else "png"
+
+
 def decode_valid(frame: Frame) -> Bool:
     """[H, W] which pixels of a frame count."""
     if not frame.valid.size:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, ViewLists
 
 NOWHERE = ((np.inf,) * 3, (-np.inf,) * 3)
 """A box that holds nothing."""
@@ -19,7 +19,7 @@ _AROUND = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 
 
 @dataclass(frozen=True)
-class MergePlan:
+class MergePlan(ViewLists):
     """One round of merging: pairs that can be merged side by side."""
 
     pairs: Int32
@@ -36,11 +36,6 @@ class MergePlan:
     """[P + 1] where the views of each pair begin in `view`."""
     view: Int32
     """[A] rows of the scene's views, those that show any instance of a pair, ascending for each pair."""
-
-    def views(self, pair: int) -> list[int]:
-        """The views that show any instance of a pair."""
-        rows: list[int] = self.view[self.first[pair] : self.first[pair + 1]].tolist()
-        return rows
 
 
 def group_box(gaussians: Gaussians, *, min_opacity: float, quantile: float) -> Float64:

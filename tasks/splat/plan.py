@@ -41,9 +41,8 @@ def plan(groups: tuple[Gaussians, ...], shown: Appearances, *, params: PlanParam
     """The pairs of groups that are merged in a round, and the weight of the mask loss for them.
 
     groups: the instances, or what earlier rounds made of them, in any order. shown: the views of each instance. round:
-    from 0. The background (instance 0)
-    reaches everywhere; it stays by itself until the pass over the whole scene. Merging is over when the plan has no
-    pairs.
+    from 0. The background (instance 0) reaches everywhere; it stays by itself until the pass over the whole scene.
+    Merging is over when the plan has no pairs.
     """
     collisions = _collisions(groups, params)
     background = [i for i, g in enumerate(groups) if len(g) and not g.instance_id.any()]
@@ -63,8 +62,7 @@ def plan(groups: tuple[Gaussians, ...], shown: Appearances, *, params: PlanParam
         singles=np.setdiff1d(np.arange(len(groups)), pairs).astype(np.int32),
         mask_weight=params.mask_weights[min(round, len(params.mask_weights) - 1)],
         collisions=collisions.astype(np.float32),
-        first=np.append(0, np.cumsum([len(rows) for rows in views])).astype(np.int32),
-        view=np.array([view for rows in views for view in rows], np.int32),
+        **MergePlan.arrays(views),
     )
 
 

@@ -9,7 +9,7 @@ from ss_flow.tasks.splat.collisions import collision_matrix, group_box, match_pa
 from ss_flow.tasks.splat.plan import PlanParams, plan
 
 EXACT = PlanParams(bbox_quantile=0.0)
-NOWHERE_SHOWN = Appearances.listed(np.zeros(0, np.int32), [])
+NOWHERE_SHOWN = Appearances(np.zeros(0, np.int32), **Appearances.arrays([]))
 
 
 def group(points, instance_id: int, opacity: float = 0.9) -> Gaussians:
