@@ -53,9 +53,11 @@ COLOURS = {"ok": "green", "degraded": "yellow", "failed": "red"}
 class Batch:
     """Run many scenes, each into a folder of its own; one that fails leaves the others alone."""
 
-    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    scenes: Annotated[
+        tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PATH ...]", help_behavior_hint="")
+    ] = ()
     """Captures, as `run` takes them, or quoted patterns such as 'scans/*/'."""
-    list_file: Annotated[Path | None, tyro.conf.arg(name="list")] = None
+    list_file: Annotated[Path | None, tyro.conf.arg(name="list", metavar="PATH", help_behavior_hint="")] = None
     """A file with more of them, one a line, relative to the file's own folder; lines that begin with # do not count."""
     out: Path = Path("ss-flow-out")
     """The folder to write: NAME/ for each scene, and batch.json."""

@@ -22,7 +22,7 @@ from ss_flow.cache.survey import Survey, Tally, Usage
 from ss_flow.cache.verify import verify
 from ss_flow.engine import RUN_CLAIM
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.context import OptionalCount, OptionalText, StoreOptions, console
 from ss_flow.flows.cli.pins import tell_pins
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.runs import Run, latest_runs
@@ -39,12 +39,12 @@ SHOWN = 10
 class CacheCollect:
     """Delete results that neither a pin nor a run needs; with limits, also those that were not used for long."""
 
-    keep_runs: int | None = None
+    keep_runs: OptionalCount = None
     """Keep only the latest so many runs of each scene, and delete the records of older ones; all, when left out."""
-    max_size: str | None = None
+    max_size: OptionalText = None
     """Delete results until they take no more room than this (500MB, 20GB, 1.5TiB), least recently used first; what is
     pinned or belongs to a living run stays."""
-    older_than: str | None = None
+    older_than: OptionalText = None
     """Delete results that were not used for this long (12h, 30d); what is pinned or belongs to a living run stays."""
     grace: str = f"{GRACE_SECONDS / 3600:g}h"
     """Nothing that was written or used within this time goes. While a run lives it is an hour at least."""

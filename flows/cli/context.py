@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from rich.console import Console
 
 from ss_flow.cache.errors import StoreFailure
@@ -16,12 +18,20 @@ from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.tasks.models import catalogue
 
+# What may be left out: the help then shows what to give, not "{None}|PATH" and "(default: None)".
+PositionalPath = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PATH]", help_behavior_hint="")]
+PositionalText = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[TEXT]", help_behavior_hint="")]
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
+OptionalCount = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
+OptionalNumber = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
+
 
 @dataclass(frozen=True)
 class StoreOptions:
     """Where results are kept."""
 
-    cache: str | None = None
+    cache: OptionalText = None
     """Folder of the store, or s3://BUCKET/PREFIX; by default SS_FLOW_CACHE, or else ss-flow in the user's cache
     folder."""
 

@@ -19,7 +19,7 @@ from rich.table import Table
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.context import OptionalPath, PositionalPath, StoreOptions, console
 from ss_flow.runs import Run, latest_runs
 from ss_flow.telemetry import trace
 
@@ -30,11 +30,11 @@ Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 class Status:
     """Tell what the latest run did, step by step; also while it runs."""
 
-    scene: Annotated[Path | None, tyro.conf.Positional] = None
+    scene: PositionalPath = None
     """Only runs of this scene."""
     json: bool = False
     """Print one JSON document."""
-    otlp: Path | None = None
+    otlp: OptionalPath = None
     """Also write the run as an OpenTelemetry trace (OTLP, JSON) to this file."""
     store: Options = StoreOptions()
     """Where results are kept."""
@@ -94,7 +94,7 @@ class Why:
 
     step: Annotated[str, tyro.conf.Positional]
     """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
-    scene: Annotated[Path | None, tyro.conf.Positional] = None
+    scene: PositionalPath = None
     """The scene; the one that ran last, when left out."""
     store: Options = StoreOptions()
     """Where results are kept."""
@@ -153,7 +153,7 @@ def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:
 class Graph:
     """Draw what feeds what in the latest run, a box a step, in Mermaid's notation."""
 
-    scene: Annotated[Path | None, tyro.conf.Positional] = None
+    scene: PositionalPath = None
     """The scene; the one that ran last, when left out."""
     store: Options = StoreOptions()
     """Where results are kept."""
@@ -172,7 +172,7 @@ class Graph:
 class CacheList:
     """List what the latest run left in the store: a line a result."""
 
-    scene: Annotated[Path | None, tyro.conf.Positional] = None
+    scene: PositionalPath = None
     """The scene; the one that ran last, when left out."""
     json: bool = False
     """Print one JSON document."""
@@ -208,11 +208,11 @@ class CacheShow:
 
     what: Annotated[str, tyro.conf.Positional]
     """A step of the latest run (propagate, segment[0003]), or the first characters of a digest."""
-    png: Path | None = None
+    png: OptionalPath = None
     """Write a picture of it to this file."""
     view: int = 0
     """Draw points and Gaussians as this view's camera sees them."""
-    scene: Path | None = None
+    scene: OptionalPath = None
     """The scene; the one that ran last, when left out."""
     store: Options = StoreOptions()
     """Where results are kept."""

@@ -18,7 +18,7 @@ from ss_flow.cache.pins import Pin, pin, read_pins, unpin
 from ss_flow.cache.store import Store
 from ss_flow.cache.survey import Survey
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.context import OptionalPath, PositionalText, StoreOptions, console
 from ss_flow.flows.cli.inspect import latest_run, named
 from ss_flow.runs import Run, latest_runs
 
@@ -29,10 +29,10 @@ Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 class CachePin:
     """Keep results whatever `cache gc` deletes; without a name, list what is pinned."""
 
-    what: Annotated[str | None, tyro.conf.Positional] = None
+    what: PositionalText = None
     """A step of the latest run (propagate, segment[0003]), the first characters of a digest, or a scene: then all of
     its latest run."""
-    scene: Path | None = None
+    scene: OptionalPath = None
     """The scene that the step is of; the one that ran last, when left out."""
     json: bool = False
     """Print one JSON document."""
@@ -86,7 +86,7 @@ class CacheUnpin:
 
     what: Annotated[str, tyro.conf.Positional]
     """What was pinned, as `cache pin` lists it; the first characters of a digest will do."""
-    scene: Path | None = None
+    scene: OptionalPath = None
     """Only what was pinned of this scene."""
     store: Options = StoreOptions()
     """Where results are kept."""

@@ -13,7 +13,7 @@ from rich.table import Table
 from ss_flow.cache.store import Store
 from ss_flow.engine import Request, run_flows
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, choose_model, console, file_digests
+from ss_flow.flows.cli.context import OptionalNumber, StoreOptions, choose_model, console, file_digests
 from ss_flow.graph import stored
 from ss_flow.keys import Value
 from ss_flow.resolution import Failure
@@ -29,7 +29,7 @@ class Query:
     """The output folder of a run."""
     text: Annotated[str, tyro.conf.Positional]
     """What to look for, such as "red mug"."""
-    tau_corr: float | None = None
+    tau_corr: OptionalNumber = None
     """How much further than the best an instance may be and still match; the run's own value when left out."""
     background: bool = False
     """Rank the background too, as if it were an object."""

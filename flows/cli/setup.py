@@ -14,7 +14,7 @@ import tyro
 from rich.table import Table
 
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.context import PositionalText, StoreOptions, console
 from ss_flow.tasks.models import catalogue
 
 
@@ -68,7 +68,7 @@ class ModelsFetch:
 class ModelsVerify:
     """Check the weights that are here against their digests."""
 
-    name: Annotated[str | None, tyro.conf.Positional] = None
+    name: PositionalText = None
     """Name in the catalogue; all that are here, when left out."""
 
     def run(self) -> int:

@@ -19,7 +19,7 @@ from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import settings
-from ss_flow.flows.cli.context import console, file_digests
+from ss_flow.flows.cli.context import OptionalPath, OptionalText, console, file_digests
 from ss_flow.flows.cli.prepare import (
     Prefixed,
     Prepared,
@@ -63,9 +63,9 @@ class Sweep:
     `ss-flow run` with the chosen values gives one at once, since all its results are there.
     """
 
-    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH ...", help_behavior_hint="")]
     """Captures, as `run` takes them."""
-    out: Path | None = None
+    out: OptionalPath = None
     """The folder for sweep.json, sweep.csv and sweep.png; by default ss-flow-out/NAME-sweep."""
     zipped: Annotated[bool, tyro.conf.arg(name="zip")] = False
     """Take the first values together, the second together, and so on, instead of every combination."""
@@ -74,11 +74,11 @@ class Sweep:
         tyro.conf.arg(name="metric", metavar="NAME", help_behavior_hint="may be given several times"),
     ] = ()
     """Tell only of these figures, such as split.miou; for an unknown one, the known ones are named."""
-    query: str | None = None
+    query: OptionalText = None
     """Also search every result for this text, so that query.tau_corr can be swept."""
-    masks: Path | None = None
+    masks: OptionalPath = None
     """Ready-made instance masks for the only scene, as `run` takes them."""
-    hints: Path | None = None
+    hints: OptionalPath = None
     """A file of points clicked on objects of the only scene, as `run` takes it."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
     """How to run."""
