@@ -107,8 +107,9 @@ class SemanticsParams:
 class EvaluateParams:
     """Measuring against ground truth, where there is some."""
 
-    zero_is_void: bool = True
-    """Whether 0 in the ground truth means "not annotated" and does not count; otherwise it is background."""
+    zero_is_void: bool | None = None
+    """Whether 0 in the ground truth means "not annotated" and does not count, or is background; none = it does not
+    count unless the capture's `instances.json` names 0, as that of a generated room does."""
 
 
 @dataclass(frozen=True)

@@ -34,17 +34,16 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         "reproject": found.instances,
         "masks_split": masks_split,
     }
+    void = params.evaluate.zero_is_void is not False
     if capture.truth is not None:
         with labelled("split"):
-            results["metrics_split"] = evaluate_masks(
-                masks_split, capture.truth, found.tree, zero_is_void=params.evaluate.zero_is_void
-            )
+            results["metrics_split"] = evaluate_masks(masks_split, capture.truth, found.tree, zero_is_void=void)
     results |= splat(capture, found, networks, params)
     if capture.truth is not None:
         for stage, masks in (("refined", "masks_refined"), ("splat", "masks")):
             with labelled(stage):
                 results[f"metrics_{stage}"] = evaluate_masks(
-                    results[masks], capture.truth, found.tree, zero_is_void=params.evaluate.zero_is_void
+                    results[masks], capture.truth, found.tree, zero_is_void=void
                 )
     if held_out is not None:
         results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])

@@ -18,7 +18,7 @@ from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows import settings
 from ss_flow.flows.capture import Capture, capture
-from ss_flow.flows.cli.context import StoreOptions, choose_model
+from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model
 from ss_flow.flows.deliver import deliver, run_document
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
@@ -46,11 +46,11 @@ class RunOptions:
     (for a quick look) or thorough (for a machine with time)."""
     assignments: Assignments = ()
     """Set a parameter, as in --set split.tau_label=0.8."""
-    until: str | None = None
+    until: OptionalText = None
     """Stop when this step's result is there."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""
-    memory: str | None = None
+    memory: OptionalText = None
     """How much memory tasks may declare together, such as 8GB; what is free, when left out."""
     executor: str = "threads"
     """threads, processes, dask (a cluster on this machine) or dask://HOST:PORT."""
@@ -121,6 +121,8 @@ def prepare(
     Raises InputError when a network cannot be used.
     """
     scene = scene.every(params.capture.stride)
+    if params.evaluate.zero_is_void is None:
+        params = replace(params, evaluate=replace(params.evaluate, zero_is_void=scene.zero_is_void))
     networks = Networks(
         segmenter=choose_model("segmenter", params.split.segmenter, digests, wanted=not scene.has_masks),
         encoder=choose_model("text-image", params.semantics.encoder, digests),

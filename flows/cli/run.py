@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from rich.table import Table
 
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.flows import settings
-from ss_flow.flows.cli.context import console, file_digests
+from ss_flow.flows.cli.context import OptionalPath, console, file_digests
 from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare
 from ss_flow.flows.cli.telling import hits_of, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
@@ -32,12 +31,12 @@ class Run:
     scene: Annotated[Path, tyro.conf.Positional]
     """A folder of photos, a video, a COLMAP workspace, a nerfstudio transforms.json, a ScanNet export or .sens file, or
     a TUM RGB-D folder."""
-    out: Path | None = None
+    out: OptionalPath = None
     """The folder to write; by default ss-flow-out/NAME of the scene."""
-    masks: Path | None = None
+    masks: OptionalPath = None
     """Ready-made instance masks in the place of a segmenter: a folder of uint16 PNG files named like the photos, or a
     COCO file (.json)."""
-    hints: Path | None = None
+    hints: OptionalPath = None
     """A file (.json) of a few points clicked on objects in a few views; the segmenter looks for these objects only."""
     calibrate: Literal["none", "depth"] = "none"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
@@ -78,7 +77,6 @@ class Demo:
         check_place(self.out / "result")
         scene = demo_scene(self.out, self.masks, self.objects, self.views, self.seed)
         params = settings.preset(Params(), self.execution.preset)
-        params = dataclasses.replace(params, evaluate=dataclasses.replace(params.evaluate, zero_is_void=False))
         return run_scene(open_scene(scene), self.out / "result", params, self.execution)
 
 

@@ -152,10 +152,11 @@ def write_scene(
 
     `color/NNNN.jpg`, `depth/NNNN.png` (uint16 millimetres), `pose/NNNN.txt` (camera-to-world), `intrinsic/` (4 x 4,
     integer pixel centres), `instance/NNNN.png` (uint16 ground truth) and `instances.json` (id -> name, whose first
-    word is the colour); the same in `held_out/` for the views kept back. With `masks`, also `instance_masks/NNNN.png`
-    (uint16, 0 = no mask): the true masks, or masks degraded with `degradation` and `seed`. Where things have parts,
-    also `part/NNNN.png` (uint8, ids within the instance) and `parts.json` (instance id -> name, kind "thing" or
-    "stuff", parts by id; the structure is 0); where something stands before the lens, `valid/NNNN.png` (0 = ignore).
+    word is the colour; also of 0, the structure, since every pixel is annotated); the same in `held_out/` for the views
+    kept back. With `masks`, also `instance_masks/NNNN.png` (uint16, 0 = no mask): the true masks, or masks degraded
+    with `degradation` and `seed`. Where things have parts, also `part/NNNN.png` (uint8, ids within the instance) and
+    `parts.json` (instance id -> name, kind "thing" or "stuff", parts by id; the structure is 0); where something stands
+    before the lens, `valid/NNNN.png` (0 = ignore).
 
     Raises InputError when `folder` already holds something.
     """
@@ -164,7 +165,7 @@ def write_scene(
     _write_views(room, folder)
     if len(room.held_out):
         _write_views(room.held_out, folder / "held_out")
-    names = {str(o.instance_id): o.name for o in room.objects}
+    names = {str(o.instance_id): o.name for o in (room.structure, *room.objects)}
     (folder / "instances.json").write_text(json.dumps(names, indent=1) + "\n", encoding="utf-8")
     if room.parts.any():
         tree = {

@@ -12,7 +12,7 @@ from ss_flow.tasks.capture.layout_colmap import is_colmap, open_colmap
 from ss_flow.tasks.capture.layout_nerfstudio import open_nerfstudio
 from ss_flow.tasks.capture.layout_scannet import is_scannet, open_scannet, open_sens
 from ss_flow.tasks.capture.layout_tum import open_tum
-from ss_flow.tasks.capture.scene_files import PHOTO_SUFFIXES, VIDEO_SUFFIXES, SceneFiles, by_stem, files_in
+from ss_flow.tasks.capture.scene_files import PHOTO_SUFFIXES, VIDEO_SUFFIXES, SceneFiles, by_stem, files_in, read_json
 
 ACCEPTED = (
     "a folder of photos, a video, a COLMAP workspace (sparse/ and images/), a nerfstudio transforms.json, a ScanNet "
@@ -28,7 +28,8 @@ def open_scene(path: Path, masks: Path | None = None, hints: Path | None = None)
     masks: a folder of ready-made instance masks, one image of ids a view, named by the view's stem, or a COCO file.
     hints: a file of points clicked on objects, in the place of masks.
         By default, `instance_masks/`, `instance_masks.json` or `hints.json` in the scene's folder, where one exists.
-        Likewise `instance/` is ground truth, and `valid/` (or what the layout itself lists) holds masks that are 0
+        Likewise `instance/` is ground truth, of which every pixel is annotated where `instances.json` (id -> name)
+        names 0; and `valid/` (or what the layout itself lists) holds masks that are 0
         where a pixel is to be ignored.
     Raises InputError when nothing is recognised, or a file that the layout needs is missing or makes no sense, or masks
     are given in two ways.
@@ -57,12 +58,22 @@ def open_scene(path: Path, masks: Path | None = None, hints: Path | None = None)
             "view, or as a COCO file."
         )
     if in_folder and (path / "instance").is_dir():
-        scene = replace(scene, ground_truth=_some_by_name(path / "instance", scene.names))
+        scene = replace(
+            scene,
+            ground_truth=_some_by_name(path / "instance", scene.names),
+            zero_is_void=not _names_zero(path / "instances.json"),
+        )
     if in_folder and (path / "valid").is_dir() and not any(scene.valid):
         scene = replace(scene, valid=_some_by_name(path / "valid", scene.names))
     if not scene.valid:
         scene = replace(scene, valid=(None,) * len(scene.names))
     return scene
+
+
+def _names_zero(file: Path) -> bool:
+    """Whether a file of names, if there is one, gives the id 0 a name."""
+    names = read_json(file) if file.is_file() else None
+    return isinstance(names, dict) and "0" in names
 
 
 def _found_masks(folder: Path) -> tuple[Path | None, Path | None]:

@@ -86,6 +86,8 @@ class SceneFiles:
     """Points clicked on objects, at which the segmenter is to be prompted."""
     ground_truth: tuple[Path | None, ...] | None = None
     """Annotated instances: uint16 images of ids, 0 = not annotated or background."""
+    zero_is_void: bool = True
+    """Whether 0 in them means "not annotated"; otherwise it is background."""
     skipped: tuple[str, ...] = ()
     """Views of the capture that are left out, for lack of a photo, a pose or a depth map."""
 

@@ -22,7 +22,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -302,8 +302,7 @@ def main() -> None:
 def told(folder: Path, preset: str, jobs: int, store: Store, args: argparse.Namespace) -> None:
     """Run, measure, print a line."""
     params = settings.apply(settings.preset(Params(), preset), args.set)
-    known = replace(params.evaluate, zero_is_void=not folder.name.startswith("room-"))
-    found = outcome(folder, replace(params, evaluate=known), jobs, store)
+    found = outcome(folder, params, jobs, store)
     clean = list(cleanliness(found))
     metrics = found.metrics
     steps = seconds_by_step(found.report)

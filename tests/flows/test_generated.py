@@ -16,6 +16,7 @@ from ss_flow.flows.generated import Room, RoomParams, generate, write_scene
 from ss_flow.flows.generated.layout import MAX_OBJECTS, furnish
 from ss_flow.flows.generated.masks import DegradeParams, _touching, degrade
 from ss_flow.flows.generated.shapes import SHAPES, ball, box, can, turned_profile
+from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, pixels_in_view
 
 SMALL = RoomParams(objects=10, views=12, width=120, height=90, seed=0, held_out=3)
@@ -179,7 +180,8 @@ def test_a_written_scene_reads_back_as_the_room(room: Room, tmp_path: Path) -> N
         color = cv2.imread(str(folder / "color" / f"{name}.jpg"))[..., ::-1]
         assert np.abs(color.astype(int) - room.rgb[i]).mean() < 4
     names = json.loads((folder / "instances.json").read_text())
-    assert names == {str(o.instance_id): o.name for o in room.objects}
+    assert names == {str(o.instance_id): o.name for o in (room.structure, *room.objects)}
+    assert not open_scene(folder).zero_is_void
     assert len(list((folder / "held_out" / "color").iterdir())) == 3
 
 
