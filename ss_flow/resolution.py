@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ss_flow.graph import Call, Expand, Gather, Item, Node, Otherwise, Pick, Stored, sources_of
+from ss_flow.graph import Call, Expand, Flow, Gather, Item, Node, Otherwise, Pick, Stored, sources_of
 from ss_flow.keys import Value
 
 
@@ -37,8 +37,8 @@ class Resolution:
     ) -> None:
         self._load, self._call, self._skipped = load, call, skipped
         self.values: dict[Node, Value | Failure] = {}
-        self.known_calls = 0
-        """How many calls are needed, as far as the graph is known."""
+        self.known_calls: dict[Flow, Counter[str]] = defaultdict(Counter)
+        """How many calls of each step are needed, as far as the graph is known."""
         self._unresolved: dict[Node, int] = {}
         self._consumers: dict[Node, list[Node]] = defaultdict(list)
         self._awaited: dict[Node, list[Callable[[], None]]] = defaultdict(list)
@@ -55,7 +55,8 @@ class Resolution:
             node = pending.pop()
             if node in self._unresolved:
                 continue
-            self.known_calls += isinstance(node, Call)
+            if isinstance(node, Call):
+                self.known_calls[node.flow][node.step] += 1
             sources = list(dict.fromkeys(sources_of(node)))
             self._await(node, sources)
             pending.extend(sources)

@@ -280,9 +280,9 @@ class Scheduler:
             self._graph.settle(node, failure)
 
     def _tell(self, kind: str, node: Node, **details: Any) -> None:
-        self._flows[node.flow].reporter.event(
-            kind, label=node.label, step=node.step, item=node.item, known=self._graph.known_calls, **details
-        )
+        known = self._graph.known_calls[node.flow]
+        told = {"label": node.label, "step": node.step, "item": node.item, "of": known[node.step]}
+        self._flows[node.flow].reporter.event(kind, **told, known=known.total(), **details)
 
 
 def _described(error: BaseException) -> str:

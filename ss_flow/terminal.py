@@ -1,7 +1,12 @@
-"""The live display of a run."""
+"""What a person hears of a run: a live display on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console
@@ -12,14 +17,39 @@ from rich.progress import TaskID as RowId
 from ss_flow.events import Reporter
 
 WORTH_SECONDS = 1.0
-"""Shorter steps leave no line behind."""
+"""Shorter nodes leave no line behind on a terminal."""
+ALIVE_SECONDS = 30.0
+"""Elsewhere, how often a line says how far the running nodes are."""
+_ENDED = ("hit", "finished", "failed", "skipped")
 
 
-class Terminal(Reporter):
-    """A live display: how many nodes are done, and how far each running one is."""
+class Messages(Reporter):
+    """Says what has to be known at once: warnings, failures, second tries, and that the run stops."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
+
+    def event(self, kind: str, **details: Any) -> None:
+        label = details.get("label", "")
+        for warning in details.get("warnings", ()):
+            self.say("yellow", "warning", f"{label}: {warning}")
+        if kind == "failed" and not details["bad_input"]:  # whoever asked for the run tells of bad input, once
+            self.say("red", "failed", f"{label}: {details['error']}")
+        elif kind in ("retried", "restarted"):
+            self.say("yellow", "again", f"{f'{label}: ' if label else ''}{details['because']}")
+        elif kind == "stopping" and details["running"]:
+            words = f"waiting for what runs ({len(details['running'])}) to finish, or to keep what it has"
+            self.say("yellow", "stopping", f"{words}; Ctrl-C again stops at once")
+
+    def say(self, style: str, word: str, text: str) -> None:
+        self._console.print(f"[{style}]{word:<6}[/] {escape(text)}", highlight=False, soft_wrap=True)
+
+
+class Terminal(Messages):
+    """A live display: how many nodes are done, and how far each running one is."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console)
         self._display = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -29,10 +59,10 @@ class Terminal(Reporter):
             TextColumn("[dim]{task.fields[note]}"),
             console=console,
             transient=True,
-            disable=not console.is_terminal,
         )
         self._all = self._display.add_task("[bold]all steps", total=None, note="")
         self._rows: dict[str, RowId] = {}
+        self._known: dict[str, int] = {}
         self._done = 0
         self._display.start()
 
@@ -44,20 +74,13 @@ class Terminal(Reporter):
             self._display.remove_task(self._rows.pop(label))
         elif kind == "restarted":
             self._done = 0
-        if kind in ("hit", "finished", "failed", "skipped"):
+        if kind in _ENDED:
             self._done += 1
-            self._display.update(self._all, completed=self._done, total=max(self._done, details.get("known", 0)))
+            self._known[details.get("flow", "")] = details["known"]
+            self._display.update(self._all, completed=self._done, total=max(self._done, sum(self._known.values())))
         if kind == "finished" and details["seconds"] >= WORTH_SECONDS:
-            self._console.print(f"[green]done[/]  {label:<34} {details['seconds']:8.1f} s", highlight=False)
-        for warning in details.get("warnings", ()):
-            self._console.print(f"[yellow]warning[/] {label}: {escape(warning)}", highlight=False, soft_wrap=True)
-        if kind == "failed" and not details["bad_input"]:  # whoever asked for the run tells of bad input, once
-            self._console.print(f"[red]failed[/] {label}: {escape(details['error'])}", highlight=False)
-        elif kind in ("retried", "restarted"):
-            self._console.print(f"[yellow]again[/]  {label}: {escape(details['because'])}", highlight=False)
-        elif kind == "stopping" and details["running"]:
-            words = f"waiting for what runs ({len(details['running'])}) to finish, or to keep what it has"
-            self._console.print(f"[yellow]stopping[/] {words}; Ctrl-C again stops at once", highlight=False)
+            self.say("green", "done", f"{details['label']:<34} {details['seconds']:8.1f} s")
+        super().event(kind, **details)
 
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
         if (label := escape(label)) in self._rows:
@@ -65,3 +88,88 @@ class Terminal(Reporter):
 
     def close(self) -> None:
         self._display.stop()
+
+
+@dataclass
+class _Step:
+    """How far the nodes of a step are."""
+
+    known: int = 0
+    ended: int = 0
+    there: int = 0
+    """Those of them that have a result."""
+    computed: int = 0
+    told: int = 0
+    """How many were computed when the step was last told of."""
+    seconds: float = 0.0
+
+
+class Log(Messages):
+    """Plain lines, for a file or a pipe: one a step, when the last of its known nodes has ended, and now and then one
+    for each node that runs for long.
+
+    What was found in the store makes no line. every: seconds between two lines of a running node.
+    """
+
+    def __init__(self, console: Console, *, every: float = ALIVE_SECONDS) -> None:
+        super().__init__(console)
+        self._steps: dict[str, _Step] = {}
+        self._begun: dict[str, float] = {}
+        self._progress: dict[str, str] = {}
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._beat = threading.Thread(target=self._say_alive, args=(every,), name="alive", daemon=True)
+        self._beat.start()
+
+    def event(self, kind: str, **details: Any) -> None:
+        label = details.get("label", "")
+        with self._lock:
+            if kind == "started":
+                self._begun[label] = time.monotonic()
+            elif kind in ("finished", "failed", "retried"):
+                self._begun.pop(label, None)
+                self._progress.pop(label, None)
+            elif kind == "restarted":
+                for step in self._steps.values():
+                    step.ended = step.there = 0
+            if kind in _ENDED:
+                step = self._steps.setdefault(f"{details.get('flow', '')} {details['step']}".strip(), _Step())
+                step.known = details["of"]
+                step.ended += 1
+                step.there += kind in ("hit", "finished")
+                step.computed += kind == "finished"
+                step.seconds += details["seconds"] if kind == "finished" else 0.0
+        super().event(kind, **details)
+
+    def progressed(self, label: str, done: int, total: int, note: str) -> None:
+        with self._lock:
+            if label in self._begun:
+                self._progress[label] = f", {done} of {total}{f' ({note})' if note else ''}"
+
+    def pause(self) -> None:
+        self._say_done(lambda step: step.ended >= step.known)
+
+    def close(self) -> None:
+        """Also tells of steps that were interrupted."""
+        self._closed.set()
+        self._beat.join()
+        self._say_done(lambda step: True)
+
+    def _say_done(self, which: Callable[[_Step], bool]) -> None:
+        for name, step in self._steps.items():
+            if step.computed > step.told and which(step):
+                step.told = step.computed
+                self.say("green", "done", f"{name:<34} {step.there:5} of {step.known:<5} {step.seconds:8.1f} s")
+
+    def _say_alive(self, every: float) -> None:
+        while not self._closed.wait(every):
+            with self._lock:
+                now = time.monotonic()
+                lines = [
+                    f"{label}{self._progress.get(label, '')}, {now - begun:.0f} s so far"
+                    for label, begun in self._begun.items()
+                    if now - begun >= every
+                ]
+            with contextlib.suppress(BrokenPipeError):  # nobody reads any more: the main thread will find out
+                for line in lines:
+                    self.say("cyan", "runs", line)

@@ -20,7 +20,8 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import OptionalPath, PositionalPath, StoreOptions, console
-from ss_flow.runs import Run, latest_runs
+from ss_flow.flows.cli.telling import print_table
+from ss_flow.runs import DONE, Run, latest_runs, settled
 from ss_flow.telemetry import trace
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -46,37 +47,48 @@ class Status:
                 raise InputError(f"{self.otlp} cannot be written; --otlp must name a file in a folder.")
             write_atomically(self.otlp, json.dumps(trace(run)) + "\n")
         events = list(run.events())
-        steps: dict[str, dict[str, Any]] = defaultdict(
-            lambda: {"hit": 0, "finished": 0, "failed": 0, "skipped": 0, "running": 0, "seconds": 0.0}
-        )
-        for event in events:
-            row = steps[event["step"]] if "step" in event else {}
-            if event["event"] == "restarted":  # the same results are found again
-                for row in steps.values():
-                    row |= {"hit": 0, "skipped": 0, "running": 0}
-            elif event["event"] == "started":
-                row["running"] += 1
-            elif event["event"] in row:
-                row[event["event"]] += 1
-                row["running"] -= event["event"] in ("finished", "failed") and row["running"] > 0
-                row["seconds"] += event["seconds"] if event["event"] == "finished" else 0.0
+        steps = _steps(events)
         last = next((e for e in reversed(events) if e["event"] in ("run ended", "restarted")), None)
         ended = last if last and last["event"] == "run ended" else None
         state = _state(ended, events)
-        document = {"scene": run.scene, "started": run.header["started"], "state": state, "steps": steps}
+        done = sum(event["event"] in DONE for event in settled(events))
+        expected = max(done, *(event.get("known", 0) for event in events))
+        about = {"scene": run.scene, "started": run.header["started"], "state": state}
+        document = about | {"done": done, "expected": expected, "steps": steps}
         if self.json:
             print(json.dumps(document, indent=1))
             return 0
         out = console(json=False)
-        out.print(
-            f"{escape(run.scene)}: {state}, started {time.strftime('%F %T', time.localtime(run.header['started']))}"
-        )
-        table = Table("step", "reused", "computed", "running", "failed", "seconds", box=None)
+        started = time.strftime("%F %T", time.localtime(run.header["started"]))
+        growing = "" if state.startswith("done") else " or more"  # some results decide how many others there are
+        out.print(escape(f"{run.scene}: {state}, started {started}, {done} of {expected}{growing} results are there"))
+        table = Table("step", "of", "reused", "computed", "running", "failed", "seconds", box=None)
         for step, row in steps.items():
-            counts = (row["hit"], row["finished"], row["running"], row["failed"] + row["skipped"])
+            failed = row["failed"] + row["skipped"]
+            counts = (row["expected"], row["hit"], row["finished"], row["running"], failed)
             table.add_row(step, *(str(n or "") for n in counts), f"{row['seconds']:.1f}" if row["seconds"] else "")
-        out.print(table)
+        print_table(table, out)
         return 0
+
+
+def _steps(events: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """How many nodes of each step were found, computed and so on, and how many are needed as far as is known."""
+    steps: dict[str, dict[str, Any]] = defaultdict(
+        lambda: {"hit": 0, "finished": 0, "failed": 0, "skipped": 0, "running": 0, "expected": 0, "seconds": 0.0}
+    )
+    for event in events:
+        row = steps[event["step"]] if "step" in event else {}
+        row["expected"] = event.get("of", 0)
+        if event["event"] == "restarted":  # the same results are found again
+            for row in steps.values():
+                row |= {"hit": 0, "skipped": 0, "running": 0}
+        elif event["event"] == "started":
+            row["running"] += 1
+        elif event["event"] in row:
+            row[event["event"]] += 1
+            row["running"] -= event["event"] in ("finished", "failed") and row["running"] > 0
+            row["seconds"] += event["seconds"] if event["event"] == "finished" else 0.0
+    return steps
 
 
 def _state(ended: dict[str, Any] | None, events: list[dict[str, Any]]) -> str:
@@ -198,7 +210,7 @@ class CacheList:
                 f"{row['bytes'] / 1000:.0f}",
                 f"{row['seconds']:.1f}",
             )
-        console(json=False).print(table)
+        print_table(table, console(json=False))
         return 0
 
 

@@ -192,21 +192,22 @@ class Prefixed(Reporter):
 
     def event(self, kind: str, **details: Any) -> None:
         if "label" in details:
-            self._whole.event(kind, **{**details, "label": f"{self._prefix} {details['label']}"})
+            self._whole.event(kind, **{**details, "label": f"{self._prefix} {details['label']}", "flow": self._prefix})
         elif self._leading:
             self._whole.event(kind, **details)
 
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
         self._whole.progressed(f"{self._prefix} {label}", done, total, note)
 
+    def pause(self) -> None:
+        if self._leading:
+            self._whole.pause()
+
 
 @contextlib.contextmanager
 def display(out: Console) -> Iterator[Reporter]:
-    """A live display on a terminal, plain lines elsewhere; it is gone at the end."""
-    from ss_flow.terminal import Terminal
+    """A live display on a terminal, gone at the end; plain lines elsewhere."""
+    from ss_flow.terminal import Log, Terminal
 
-    terminal = Terminal(out)
-    try:
-        yield terminal
-    finally:
-        terminal.close()
+    with contextlib.closing(Terminal(out) if out.is_terminal else Log(out)) as screen:
+        yield screen

@@ -11,6 +11,7 @@ import pytest
 from tiny_runs import ss_flow
 
 from ss_flow.cache.store import Store
+from ss_flow.runs import latest_runs
 
 
 def test_status_counts_what_each_step_did(tiny):
@@ -21,6 +22,23 @@ def test_status_counts_what_each_step_did(tiny):
     assert document["scene"] == str(tiny.scene) and document["state"] == "done"
     visible = document["steps"]["split.visibility"]
     assert (visible["finished"], visible["hit"], visible["running"], visible["failed"]) == (5, 0, 0, 0)
+    nodes = len(tiny.called.document()["nodes"])
+    assert document["done"] == document["expected"] == nodes
+    assert f", {nodes} of {nodes} results are there\n" in words.out
+    assert all(row["expected"] == row["finished"] + row["hit"] for row in document["steps"].values())
+
+
+def test_status_of_a_run_that_was_cut_short_says_how_much_there_is_to_do(warm):
+    """Cut the record in the middle of the views, as a kill would."""
+    run = next(latest_runs(warm.store / "roots/runs"))
+    lines = (run.folder / "events.jsonl").read_text().splitlines()
+    last = max(i for i, line in enumerate(lines) if json.loads(line).get("label") == "split.visibility[0002]")
+    (run.folder / "events.jsonl").write_text("\n".join(lines[: last + 1]))
+    document = json.loads(ss_flow("status", "--json", "--cache", warm.store).out)
+    visible = document["steps"]["split.visibility"]
+    assert visible["finished"] < visible["expected"] == 5 and document["done"] < document["expected"]
+    words = ss_flow("status", "--cache", warm.store).out
+    assert f", {document['done']} of {document['expected']} or more results are there\n" in words
 
 
 def test_why_says_that_nothing_was_known_on_the_first_run(tiny):
