@@ -1,13 +1,10 @@
-"""The number of Gaussians under control: clone, split and prune (Kerbl et al. 2023, Sec. 5).
-
-`mcmc.py` holds the other strategy. A strategy sees every step and may rearrange the rows of `Parameters`.
-"""
+"""The number of Gaussians under control: clone, split and prune (Kerbl et al. 2023, Sec. 5)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,48 +25,14 @@ REFERENCE_ROWS = 512
 
 @dataclass(frozen=True)
 class Seen:
-    """What one step tells a strategy."""
+    """What one step tells of the Gaussians."""
 
-    gradients: Mapping[str, Float32]
-    """By parameter, and "centers" [N, 2] towards the projected means."""
+    centers: Float32
+    """[N, 2] gradient towards the projected means."""
     radii: Float32
     """[N] pixels, 0 = not in view."""
     pixels: int
     """In the mean that the loss is."""
-    means_rate: float
-    """Learning rate of the means, world units."""
-
-
-class Strategy(Protocol):
-    """Something that decides how many Gaussians there are, and where."""
-
-    def regularise(self, parameters: Parameters, gradients: Mapping[str, Float32]) -> None:
-        """Add to the gradients, in place, before they are applied."""
-
-    def after(self, step: int, parameters: Parameters, seen: Seen, generator: np.random.Generator) -> None:
-        """Act after a step (the first is 1)."""
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """What it remembers, to go on from later."""
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from what `state` gave."""
-
-
-class Fixed:
-    """No strategy: the Gaussians stay as many as they are."""
-
-    def regularise(self, parameters: Parameters, gradients: Mapping[str, Float32]) -> None:
-        pass
-
-    def after(self, step: int, parameters: Parameters, seen: Seen, generator: np.random.Generator) -> None:
-        pass
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        return {}
-
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        pass
 
 
 @dataclass(frozen=True)
@@ -129,13 +92,11 @@ class AdaptiveControl:
         self._threshold, self._extent, self._most, self._prune_opacity = threshold, extent, most, prune_opacity
         self._record = GradientRecord(count)
 
-    def regularise(self, parameters: Parameters, gradients: Mapping[str, Float32]) -> None:
-        pass
-
     def after(self, step: int, parameters: Parameters, seen: Seen, generator: np.random.Generator) -> None:
+        """Act after a step (the first is 1); may rearrange the rows of the parameters."""
         if step > self.last_step:
             return
-        self._record.add(seen.gradients["centers"], seen.radii, seen.pixels)
+        self._record.add(seen.centers, seen.radii, seen.pixels)
         if self._schedule.densifies(step):
             rows = densify(
                 parameters.values,
@@ -155,9 +116,11 @@ class AdaptiveControl:
             parameters.limit_opacity(0.01)
 
     def state(self) -> dict[str, NDArray[Any]]:
+        """What it remembers, to go on from later."""
         return {"record.sum": self._record.sum, "record.seen": self._record.seen}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what `state` gave."""
         self._record.sum, self._record.seen = state["record.sum"], state["record.seen"]
 
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
 from ss_flow.tasks.artifacts import Float32, Gaussians
 from ss_flow.tasks.gaussians.backends import backend_for
-from ss_flow.tasks.gaussians.densification import AdaptiveControl, Fixed, Schedule, Seen, Strategy
-from ss_flow.tasks.gaussians.mcmc import MarkovChain
+from ss_flow.tasks.gaussians.densification import AdaptiveControl, Schedule, Seen
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target, decayed
 from ss_flow.tasks.gaussians.optimizer import Parameters
@@ -70,9 +69,8 @@ class TrainParams:
     """What is made small."""
     mask_weight: NonNegative = 0.0
     """Weight of the mask loss of merging, w_mask (spec A25)."""
-    densify: Literal["classic", "mcmc", "none"] = "classic"
-    """How the number of Gaussians grows: "classic" clones and splits as in 3DGS, "mcmc" moves faint Gaussians to where
-    opaque ones are and grows by 5 % at a time, "none" leaves it."""
+    densify: Literal["classic", "none"] = "classic"
+    """How the number of Gaussians grows: "classic" clones and splits as in 3DGS, "none" leaves it."""
     densify_grad: Positive = 2e-4
     """Mean screen gradient from which a Gaussian is cloned or split, in 3DGS's units for images 512 pixels high."""
     schedule: Schedule = Schedule()
@@ -123,7 +121,7 @@ def train(
     if not (extents > 0).all():
         raise ValueError(f"the extent must be positive, not {extents.min()}")
     for name, value, allowed in (
-        ("densify", params.densify, ("classic", "mcmc", "none")),
+        ("densify", params.densify, ("classic", "none")),
         ("background", params.objective.background, ("random", "black")),
         ("depth_error", params.objective.depth_error, ("relative", "inverse")),
     ):
@@ -175,7 +173,7 @@ class _Training:
         self._extent = float(extents.max())
         # A few sparse points of a small thing must be let fill the space between them.
         self._longest = np.maximum(np.float32(params.max_scale) * extents, np.exp(initial.log_scales.max(axis=1)))
-        self._strategy = _strategy(params, len(initial), self._extent)
+        self._control = _control(params, len(initial), self._extent)
         self.step = 0
         self.losses = np.zeros(params.iterations, np.float32)
         self._order: list[int] = []
@@ -198,14 +196,14 @@ class _Training:
         self.losses[self.step - 1] = found.loss
         if not np.isfinite(found.loss):
             raise TrainingDiverged(f"training of {len(parameters)} Gaussians diverged at step {self.step}")
-        self._strategy.regularise(parameters, found.gradients)
         extents = self._extents[parameters.origin]
         means_rate = decayed(params.rates.position, params.rates.position_final, done_share)
         parameters.step(found.gradients, _by_name(params.rates), self.step, degree, np.float32(means_rate) * extents)
         if params.max_scale:
             parameters.limit_scale(self._longest[parameters.origin])
-        seen = Seen(found.gradients, found.radii, target.pixels, means_rate * self._extent)
-        self._strategy.after(self.step, parameters, seen, self._generator)
+        if self._control is not None:
+            seen = Seen(found.gradients["centers"], found.radii, target.pixels)
+            self._control.after(self.step, parameters, seen, self._generator)
 
     def check(self) -> None:
         """Raises TrainingDiverged when a parameter is no longer finite."""
@@ -220,7 +218,8 @@ class _Training:
             "order": np.array(self._order, np.int64),
             "generator": np.frombuffer(json.dumps(self._generator.bit_generator.state).encode(), np.uint8),
         }
-        save_checkpoint({**state, **self.parameters.state(), **self._strategy.state()})
+        control = {} if self._control is None else self._control.state()
+        save_checkpoint({**state, **self.parameters.state(), **control})
 
     def resume(self) -> None:
         """Go on from what an earlier try kept, if there is any."""
@@ -231,7 +230,8 @@ class _Training:
         self.losses[:] = state["losses"]
         self._generator.bit_generator.state = json.loads(state["generator"].tobytes())
         self.parameters.restore(state)
-        self._strategy.restore(state)
+        if self._control is not None:
+            self._control.restore(state)
 
     def finish(self) -> TrainResult:
         """Drop what shows nowhere; the PSNR of what stays."""
@@ -254,20 +254,17 @@ class _Training:
         return TrainResult(parameters.to_gaussians(self._initial), psnr, self.step, self.losses[: self.step])
 
 
-def _strategy(params: TrainParams, count: int, extent: float) -> Strategy:
-    most = params.max_gaussians or sys.maxsize
-    if params.densify == "mcmc":
-        return MarkovChain(params.iterations, extent=extent, most=most)
-    if params.densify == "classic":
-        return AdaptiveControl(
-            count,
-            params.schedule.of(params.iterations),
-            threshold=params.densify_grad,
-            extent=extent,
-            most=most,
-            prune_opacity=params.prune_opacity,
-        )
-    return Fixed()
+def _control(params: TrainParams, count: int, extent: float) -> AdaptiveControl | None:
+    if params.densify == "none":
+        return None
+    return AdaptiveControl(
+        count,
+        params.schedule.of(params.iterations),
+        threshold=params.densify_grad,
+        extent=extent,
+        most=params.max_gaussians or sys.maxsize,
+        prune_opacity=params.prune_opacity,
+    )
 
 
 def _by_name(rates: LearningRates) -> dict[str, float]:

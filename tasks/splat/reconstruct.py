@@ -49,9 +49,8 @@ class ReconstructParams:
     """What the training makes small."""
     ignore_occluded: bool = True
     """Whether pixels where something else is in front are left out; False calls them empty, as in the paper."""
-    densify: Literal["classic", "mcmc", "none"] = "classic"
-    """How their number grows: "classic" clones and splits where the picture is still wrong (3DGS), "mcmc" moves faint
-    Gaussians to where opaque ones are and grows by 5 % at a time (for many views), "none" leaves it."""
+    densify: Literal["classic", "none"] = "classic"
+    """How their number grows: "classic" clones and splits where the picture is still wrong (3DGS), "none" leaves it."""
     schedule: Schedule = Schedule()
     """When "classic" clones and splits."""
     prune_contribution: Fraction = 1 / 255

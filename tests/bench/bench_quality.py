@@ -1,6 +1,6 @@
 """PSNR and SSIM of plain 3DGS on held-out views (every eighth) after so many iterations.
 
-python tests/bench/bench_quality.py CAPTURE --iterations 1000 5000 10000 --densify classic mcmc
+python tests/bench/bench_quality.py CAPTURE --iterations 1000 5000 10000 --densify classic none
 """
 
 from __future__ import annotations

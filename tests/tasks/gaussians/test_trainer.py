@@ -11,7 +11,6 @@ import pytest
 from ss_flow.running import Surroundings, running
 from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
-from ss_flow.tasks.gaussians.mcmc import divide
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.render import render
@@ -277,9 +276,8 @@ def test_the_mismatch_is_the_absolute_error_of_all_label_masks():
         assert np.allclose(a[name], b[name], atol=1e-5), name
 
 
-@pytest.mark.parametrize("strategy", ["classic", "mcmc"])
-def test_the_number_of_threads_changes_no_byte(strategy):
-    params = TrainParams(iterations=240, densify=strategy)
+def test_the_number_of_threads_changes_no_byte():
+    params = TrainParams(iterations=240)
     trained = []
     for cores in (1, 2, 3):
         with running(Surroundings(cores=cores)):
@@ -293,7 +291,7 @@ def test_the_number_of_threads_changes_no_byte(strategy):
         assert other.loss.tobytes() == trained[0].loss.tobytes()
 
 
-@pytest.mark.parametrize("strategy", ["classic", "mcmc", "none"])
+@pytest.mark.parametrize("strategy", ["classic", "none"])
 def test_a_training_that_was_interrupted_goes_on_to_the_same_bytes(strategy, tmp_path):
     params = TrainParams(iterations=320, densify=strategy)
     alone = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1)
@@ -318,25 +316,3 @@ def test_a_training_that_was_interrupted_goes_on_to_the_same_bytes(strategy, tmp
     assert resumed.gaussians.means.tobytes() == alone.gaussians.means.tobytes()
     assert resumed.gaussians.sh.tobytes() == alone.gaussians.sh.tobytes()
     assert resumed.loss.tobytes() == alone.loss.tobytes()
-
-
-def test_sharing_a_gaussian_keeps_the_picture():
-    """Shares at one place look like the one they came from, in the middle and nearly so around it."""
-    opacity = np.array([0.3, 0.8, 0.95])
-    for shares in (2, 5):
-        each, factor = divide(opacity, np.full(3, shares))
-        x = np.linspace(-8, 8, 161)[:, None]
-        # Along a line, the integral of alpha is kept (Eq. 9 matches rendered images, summed over all pixels).
-        before = opacity * np.exp(-(x**2) / 2)
-        after = 1 - (1 - each * np.exp(-(x**2) / (2 * factor**2))) ** shares
-        assert np.allclose(after[80], opacity) and (factor < 1).all()
-        assert np.allclose(after.sum(axis=0), before.sum(axis=0), rtol=1e-6)
-
-
-def test_the_markov_chain_grows_to_its_cap_and_improves_the_ball():
-    few = select(ball_points(), np.arange(60))
-    params = TrainParams(iterations=1500, sh_degree=0, max_gaussians=150)
-    plain = train(few, VIEWS, params=replace(params, densify="none"), extent=1.6, seed=1)
-    grown = train(few, VIEWS, params=replace(params, densify="mcmc"), extent=1.6, seed=1)
-    assert 60 < len(grown.gaussians) <= 150
-    assert grown.psnr > plain.psnr
