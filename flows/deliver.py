@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,25 @@ FALLBACKS = {
     "encoder": "colour words (no network)",
     "monodepth": None,
 }
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results of a run by name, read from the store when they are asked for."""
+
+    store: Store
+    digests: dict[str, Any]
+
+    def one(self, name: str) -> Any:
+        return self.store.get(self.digests[name])
+
+    def all(self, name: str) -> list[Any]:
+        return [self.store.get(value) for value in self.digests[name]]
+
+    def missing(self) -> list[str]:
+        """Names of what the store no longer holds."""
+        listed = {name: [value] if isinstance(value, str) else value for name, value in self.digests.items()}
+        return [name for name, values in listed.items() if not all(value in self.store for value in values)]
 
 
 def run_document(store: Store, scene: SceneFiles, params: Params, networks: Networks, report: Report) -> dict[str, Any]:
@@ -97,29 +117,30 @@ def write_all(
     """Write everything but run.json."""
     from ss_flow.tasks.capture.lens import photo_lens
     from ss_flow.tasks.deliver.instances_json import instances_document
-    from ss_flow.tasks.deliver.report import report_html, report_pictures
     from ss_flow.tasks.deliver.undistorted import write_undistorted
 
-    results = document["results"]
-
-    def one(name: str) -> Any:
-        return store.get(results[name])
-
-    def several(name: str) -> list[Any]:
-        return [store.get(value) for value in results[name]]
-
-    frames, cameras, scene = several("ingest"), one("cameras"), one("scene")
-    split_maps, maps = several("masks_split"), several("masks")
-    instances = instances_document(several("refine"), scene, one("names"), one("hierarchy"))
+    results = Results(store, document["results"])
+    frames, cameras, scene = results.all("ingest"), results.one("cameras"), results.one("scene")
+    maps = {folder / name: results.all(name) for name in ("masks_split", "masks")}
+    instances = instances_document(results.all("refine"), scene, results.one("names"), results.one("hierarchy"))
     write_scene(folder, scene, instances)
-    write_cloud(folder, one("dense"), one("cut"), one("parts"))
+    write_cloud(folder, results.one("dense"), results.one("cut"), results.one("parts"))
     stated = dict(zip(scene_files.names, scene_files.lenses, strict=True)) if scene_files.lenses else {}
     lenses = [photo_lens(frame, stated.get(frame.name), cameras) for frame in frames]
-    write_masks({folder / "masks_split": split_maps, folder / "masks": maps}, frames, lenses)
+    write_masks(maps, frames, lenses)
     if undistorted:
-        write_undistorted(folder / "undistorted", frames, cameras, maps)
-    pictures = report_pictures(frames, cameras, several("depth"), split_maps, maps, scene)
-    (folder / "report.html").write_text(report_html(document, pictures=pictures, instances=instances), encoding="utf-8")
+        write_undistorted(folder / "undistorted", frames, cameras, maps[folder / "masks"])
+    write_report(folder / "report.html", results, document, instances)
+
+
+def write_report(file: Path, results: Results, document: dict[str, Any], instances: dict[str, Any]) -> None:
+    """Write report.html, whole or not at all. instances: the document of instances.json."""
+    from ss_flow.tasks.deliver.report import report_html, report_pictures
+
+    frames, cameras, depths = results.all("ingest"), results.one("cameras"), results.all("depth")
+    maps = results.all("masks_split"), results.all("masks")
+    pictures = report_pictures(frames, cameras, depths, *maps, results.one("scene"))
+    write_atomically(file, report_html(document, pictures=pictures, instances=instances))
 
 
 def _content_of(folder: Path) -> str | None:

@@ -27,9 +27,11 @@ from ss_flow.errors import InputError  # noqa: E402
 from ss_flow.executors import ExecutorLost  # noqa: E402
 from ss_flow.flows.cli.batch import Batch  # noqa: E402
 from ss_flow.flows.cli.care import CacheCollect, CacheUsage, CacheVerify  # noqa: E402
+from ss_flow.flows.cli.diff import Diff  # noqa: E402
 from ss_flow.flows.cli.inspect import CacheList, CacheShow, Graph, Status, Why  # noqa: E402
 from ss_flow.flows.cli.pins import CachePin, CacheUnpin  # noqa: E402
 from ss_flow.flows.cli.query import Query  # noqa: E402
+from ss_flow.flows.cli.report import WriteReport  # noqa: E402
 from ss_flow.flows.cli.run import Demo, Run  # noqa: E402
 from ss_flow.flows.cli.setup import Doctor, ModelsFetch, ModelsList, ModelsVerify  # noqa: E402
 from ss_flow.flows.cli.sweep import Sweep  # noqa: E402
@@ -80,6 +82,8 @@ Command = tyro.conf.OmitSubcommandPrefixes[
         | Annotated[Status, _sub("status")]
         | Annotated[Why, _sub("why")]
         | Annotated[Graph, _sub("graph")]
+        | Annotated[Diff, _sub("diff")]
+        | Annotated[WriteReport, _sub("report")]
         | Annotated[Query, _sub("query")]
         | Annotated[Cache, _sub("cache")]
         | Annotated[Models, _sub("models")]

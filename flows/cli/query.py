@@ -40,7 +40,7 @@ class Query:
 
     def run(self) -> int:
         document = read_run(self.result)
-        instances = _read_json(self.result / "instances.json")
+        instances = read_json(self.result / "instances.json")
         own_store = self.store if self.store.cache else StoreOptions(document["store"])
         store = own_store.existing_store()
         descriptors = tuple(document["results"]["describe"])
@@ -121,13 +121,14 @@ def read_run(folder: Path) -> dict[str, Any]:
     file = folder / RUN_FILE
     if not file.is_file():
         raise InputError(f"{folder} is not the output folder of a run: it has no {RUN_FILE}.")
-    document = _read_json(file)
+    document = read_json(file)
     if not {"store", "scene", "params", "results"} <= document.keys():
         raise InputError(f"{file} is damaged: it lacks what a run writes; run the scene again.")
     return document
 
 
-def _read_json(file: Path) -> dict[str, Any]:
+def read_json(file: Path) -> dict[str, Any]:
+    """A JSON document of an output folder. Raises InputError when it cannot be read."""
     try:
         return dict(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:

@@ -216,7 +216,10 @@ def _flat(values: object, prefix: str = "") -> list[tuple[str, str]]:
         for name, value in values.items():
             rows += _flat(value, f"{prefix}.{name}" if prefix else str(name))
         return rows
-    text = "–" if values is None else f"{values:g}" if isinstance(values, float) else str(values)
+    if isinstance(values, list | tuple):  # a tuple comes back from run.json as a list
+        text = ", ".join(str(value) for value in values)
+    else:
+        text = "–" if values is None else f"{values:g}" if isinstance(values, float) else str(values)
     return [(prefix, text)]
 
 

@@ -1,0 +1,164 @@
+"""`ss-flow diff`: what two results differ in, from what was asked to what came of it."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from ss_flow.errors import InputError
+from ss_flow.flows.cli.context import console
+from ss_flow.flows.cli.query import read_run
+from ss_flow.tasks.evaluate.comparison import Correspondence, correspondence
+
+_SHOWN = 10
+"""Lines of a list that the terminal shows; --json has them all."""
+_CHANGED = 0.9
+"""IoU below which a pair of instances is told."""
+
+
+@dataclass(frozen=True)
+class Diff:
+    """Tell what two results differ in: parameters, networks, metrics, steps, and which objects are which.
+
+    Objects are compared in the masks of the views that both results have; ids need not agree.
+    """
+
+    first: Annotated[Path, tyro.conf.Positional]
+    """The output folder of a run."""
+    second: Annotated[Path, tyro.conf.Positional]
+    """That of another one."""
+    json: bool = False
+    """Print one JSON document."""
+
+    def run(self) -> int:
+        first, second = read_run(self.first), read_run(self.second)
+        views = _views_of_both(self.first, self.second)
+        matched = correspondence(_id_images(views)) if views else None
+        document = {
+            "runs": [str(self.first), str(self.second)],
+            "scenes": [first["scene"], second["scene"]],
+            "params": _changed(first["params"], second["params"]),
+            "models": _changed(first["models"], second["models"]),
+            "metrics": _both(_flat(first["metrics"]), _flat(second["metrics"])),
+            "steps": _steps(first["nodes"], second["nodes"]),
+            "instances": None if matched is None else _instances(matched, len(views)),
+        }
+        if self.json:
+            print(json.dumps(document, indent=1))
+        else:
+            _tell(document, console(json=False))
+        return 0
+
+
+def _changed(first: dict[str, Any], second: dict[str, Any]) -> dict[str, list[Any]]:
+    return {name: pair for name, pair in _both(first, second).items() if pair[0] != pair[1]}
+
+
+def _both(first: dict[str, Any], second: dict[str, Any]) -> dict[str, list[Any]]:
+    """The values of each name in the two, None where one lacks it."""
+    return {name: [first.get(name), second.get(name)] for name in {**first, **second}}
+
+
+def _flat(metrics: dict[str, dict[str, float]]) -> dict[str, float]:
+    return {f"{stage}.{name}": value for stage, values in metrics.items() for name, value in values.items()}
+
+
+def _steps(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """By step: nodes with the same result in both, with another one, or in one run only; and seconds of computation."""
+    sides = [{(node["step"], str(node["item"])): node for node in nodes} for nodes in (first, second)]
+    steps: dict[str, dict[str, Any]] = defaultdict(
+        lambda: {"same": 0, "different": 0, "only_first": 0, "only_second": 0, "seconds": [0.0, 0.0]}
+    )
+    for label in {**sides[0], **sides[1]}:
+        row, a, b = steps[label[0]], sides[0].get(label), sides[1].get(label)
+        for side, node in enumerate((a, b)):
+            row["seconds"][side] += node["seconds"] if node else 0.0
+        if a and b:
+            row["same" if a["outputs"] == b["outputs"] else "different"] += 1
+        else:
+            row["only_first" if a else "only_second"] += 1
+    return dict(steps)
+
+
+def _views_of_both(first: Path, second: Path) -> list[tuple[Path, Path]]:
+    return [(a, b) for a in sorted((first / "masks").glob("*.png")) if (b := second / "masks" / a.name).is_file()]
+
+
+def _id_images(views: list[tuple[Path, Path]]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    import cv2
+
+    for files in views:
+        a, b = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files)
+        for file, image in zip(files, (a, b), strict=True):
+            if image is None or image.ndim != 2:
+                raise InputError(f"{file} is damaged: it is no image of ids; run the scene again.")
+        if a.shape != b.shape:
+            raise InputError(f"{files[0]} and {files[1]} differ in size; diff compares runs of the same photos.")
+        yield a, b
+
+
+def _instances(found: Correspondence, views: int) -> dict[str, Any]:
+    return {
+        "views": views,
+        "agreement": found.agreement,
+        "pairs": [{"first": a, "second": b, "iou": iou} for (a, b), iou in sorted(found.pairs.items())],
+        "in_pieces": [{"first": a, "second": list(pieces)} for a, pieces in found.in_pieces.items()],
+        "joined": [{"second": b, "first": list(pieces)} for b, pieces in found.joined.items()],
+        "only_first": list(found.only_first),
+        "only_second": list(found.only_second),
+    }
+
+
+def _tell(document: dict[str, Any], out: Console) -> None:
+    if document["scenes"][0] != document["scenes"][1]:
+        out.print(escape("scenes: {} and {}".format(*document["scenes"])))
+    for title in ("params", "models"):
+        for name, (a, b) in document[title].items():
+            out.print(escape(f"{name}: {a} -> {b}"))
+    if document["metrics"]:
+        table = Table("metric", "first", "second", "difference", box=None)
+        for name, pair in document["metrics"].items():
+            a, b = ("" if value is None else f"{value:.4f}" for value in pair)
+            table.add_row(name, a, b, "" if None in pair else f"{pair[1] - pair[0]:+.4f}")
+        out.print(table)
+    table = Table("step", "same", "different", "only first", "only second", "seconds", box=None)
+    for step, row in document["steps"].items():
+        counts = (str(row[name] or "") for name in ("same", "different", "only_first", "only_second"))
+        table.add_row(step, *counts, "{:.1f} / {:.1f}".format(*row["seconds"]))
+    out.print(table)
+    found = document["instances"]
+    if found is None:
+        out.print("objects: not compared; the two results have no view of the same name.")
+        return
+    what = f"mean IoU over {found['views']} views; an object without a partner counts 0"
+    out.print(f"objects: agreement {found['agreement']:.3f} ({what})")
+    for line in _lines(found)[:_SHOWN]:
+        out.print(f"  {line}")
+    if (more := len(_lines(found)) - _SHOWN) > 0:
+        out.print(f"  and {more} more; --json lists them all")
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    """What a reader should know of the objects, the gravest first."""
+
+    def listed(ids: list[int]) -> str:
+        return ", ".join(str(i) for i in ids)
+
+    changed = sorted((pair["iou"], pair["first"], pair["second"]) for pair in found["pairs"])
+    return [
+        *(f"{row['first']} of the first is in pieces: {listed(row['second'])}" for row in found["in_pieces"]),
+        *(f"{row['second']} of the second joins {listed(row['first'])}" for row in found["joined"]),
+        *([f"only in the first: {listed(found['only_first'])}"] if found["only_first"] else []),
+        *([f"only in the second: {listed(found['only_second'])}"] if found["only_second"] else []),
+        *(f"{a} is {b} there, IoU {iou:.3f}" for iou, a, b in changed if iou < _CHANGED),
+    ]

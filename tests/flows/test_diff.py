@@ -1,0 +1,70 @@
+"""Two results side by side."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+from tiny_runs import run_tiny, ss_flow
+
+
+def test_a_result_agrees_with_itself(tiny):
+    answer = ss_flow("diff", tiny.out, tiny.out, "--json")
+    assert answer.code == 0, answer.err
+    document = answer.document()
+    assert document["params"] == {} and document["models"] == {}
+    assert document["instances"]["agreement"] == 1.0
+    nodes = json.loads((tiny.out / "run.json").read_text())["nodes"]
+    assert sum(step["same"] for step in document["steps"].values()) == len(nodes)
+    assert all(a == b for a, b in document["metrics"].values())
+
+
+def test_a_changed_parameter_and_what_it_changed_are_told(warm, tmp_path):
+    other = tmp_path / "other"
+    assert run_tiny(warm.scene, warm.store, "--set", "masks.share=0", out=other).code == 0
+    document = ss_flow("diff", warm.out, other, "--json").document()
+    assert list(document["params"]) == ["splat.masks.share"]
+    assert document["params"]["splat.masks.share"][1] == 0
+    changed = [step for step, row in document["steps"].items() if row["different"]]
+    assert "splat.render_masks" in changed and "split.propagate" not in changed
+    told = ss_flow("diff", warm.out, other)
+    assert told.code == 0 and "splat.masks.share" in told.out and "agreement" in told.out
+
+
+def test_objects_are_matched_whatever_their_ids(tiny, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(tiny.out, other)
+    ids: set[int] = set()
+    for file in (other / "masks").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        ids |= set(np.unique(image).tolist())
+        cv2.imwrite(str(file), np.where(image > 0, image + 100, 0).astype(np.uint16))
+    found = ss_flow("diff", tiny.out, other, "--json").document()["instances"]
+    assert [(pair["first"], pair["second"]) for pair in found["pairs"]] == [(i, i + 100) for i in sorted(ids - {0})]
+    assert found["agreement"] == 1.0
+
+
+def test_results_without_a_view_in_common_are_compared_without_objects(tiny, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(tiny.out, other)
+    for file in (other / "masks").iterdir():
+        file.rename(file.with_stem(f"other-{file.stem}"))
+    answer = ss_flow("diff", tiny.out, other, "--json")
+    assert answer.code == 0 and answer.document()["instances"] is None
+    assert "no view of the same name" in ss_flow("diff", tiny.out, other).out
+
+
+def test_bad_input_gets_one_sentence(tiny, tmp_path):
+    answer = ss_flow("diff", tiny.out, tmp_path)
+    assert answer.code == 2 and "not the output folder of a run" in answer.err
+    other = tmp_path / "other"
+    shutil.copytree(tiny.out, other)
+    file = sorted((other / "masks").iterdir())[0]
+    file.write_bytes(b"no image")
+    answer = ss_flow("diff", tiny.out, other)
+    assert answer.code == 2 and file.name in answer.err and answer.err.count("\n") == 1
+    cv2.imwrite(str(file), np.zeros((3, 3), np.uint16))
+    answer = ss_flow("diff", tiny.out, other)
+    assert answer.code == 2 and "differ in size" in answer.err
