@@ -217,7 +217,7 @@ def _flat(values: object, prefix: str = "") -> list[tuple[str, str]]:
             rows += _flat(value, f"{prefix}.{name}" if prefix else str(name))
         return rows
     if isinstance(values, list | tuple):  # a tuple comes back from run.json as a list
-        text = ", ".join(str(value) for value in values)
+        text = str(tuple(values))
     else:
         text = "–" if values is None else f"{values:g}" if isinstance(values, float) else str(values)
     return [(prefix, text)]
