@@ -14,9 +14,18 @@ from ss_flow.tasks.evaluate.novel_view import novel_view
 from ss_flow.tasks.semantics.name import given_names, name
 from ss_flow.tasks.splat.resolve import resolve
 
+LEADS_TO = {
+    "exclusive": "merge",
+    "retrain": "merge",
+    "plan": "merge",
+    "merge_pair": "merge",
+    "rendered": "describe",
+}
+"""Steps of which only other results tell what nodes there are: the result that all of these lead to."""
+
 
 def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Any]:
-    """The whole DAG. Returns its results by step; `--until` takes these names."""
+    """The whole DAG. Returns its results by name."""
     found = split(capture, networks, params.split)
     with labelled("split"):
         masks_split = resolve(capture.cameras, found.instances)

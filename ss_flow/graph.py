@@ -170,6 +170,29 @@ def sources_of(node: Node) -> list[Node]:
     return []
 
 
+def nodes_by_step(outputs: Iterable[Node]) -> dict[str, list[Node]]:
+    """The nodes that these need, by step, as far as is known before anything has run.
+
+    Of a step that `each` applies to a list, the node of the whole list. Called in the flow.
+    """
+    found: dict[str, list[Node]] = {}
+    seen: set[Node] = set()
+    pending = list(outputs)
+    while pending:
+        node = pending.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        pending += sources_of(node)
+        made = node
+        if isinstance(node, Expand) and not node.loads:  # what it makes of a list shows in what it makes of one item
+            (made,) = sources_of(node.build(*(1 for _ in node.sources)))
+            pending += sources_of(made)
+        if isinstance(made, Call):
+            found.setdefault(made.step, []).append(node)
+    return found
+
+
 def gather(nodes: Sequence[A]) -> tuple[A, ...]:
     """A list of the artifacts of several nodes.
 

@@ -120,6 +120,8 @@ class Batch:
             print(json.dumps(book.rows))
         else:
             print_table(_table(book.rows, folders), tell)
+        if not options.delivers:
+            tell.print(escape(f"{options.stops_early}: only {self.out / BATCH_FILE} is written"))
         return STATUS_EXIT["ok" if all(row["status"] == "ok" for row in book.rows) else "degraded"]
 
     def _opened(self, path: Path, out: Path, params: Params, digests: FileDigests) -> Prepared:

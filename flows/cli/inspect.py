@@ -142,6 +142,18 @@ def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, An
     return [n for n in nodes if not digests.isdisjoint(n.get("outputs", ()))]
 
 
+def run_with(store: Store, scene: Path | None, name: str) -> tuple[Run | None, list[dict[str, Any]]]:
+    """The latest run of a scene, or of the scene that ran last, that has results of this name, and their nodes.
+
+    The very last run may have stopped before them (`--until`, an interrupt). (None, []) where no run has them.
+    """
+    with contextlib.suppress(InputError):  # there is no run at all
+        for run in latest_runs(store.runs, latest_run(store, scene).scene):
+            if nodes := named(run, run.nodes(), name):
+                return run, nodes
+    return None, []
+
+
 def _times(nodes: list[dict[str, Any]]) -> str:
     return f" ({len(nodes)} of them)" if len(nodes) > 1 else ""
 
@@ -219,7 +231,7 @@ class CacheShow:
     """Describe one result, or draw it as a picture."""
 
     what: Annotated[str, tyro.conf.Positional]
-    """A step of the latest run (propagate, segment[0003]), or the first characters of a digest."""
+    """A step (propagate, segment[0003]) of the latest run that got to it, or the first characters of a digest."""
     png: OptionalPath = None
     """Write a picture of it to this file."""
     view: int = 0
@@ -233,7 +245,8 @@ class CacheShow:
         store = self.store.existing_store()
         if self.png and (self.png.is_dir() or not next(p for p in self.png.absolute().parents if p.exists()).is_dir()):
             raise InputError(f"{self.png} cannot be written; --png must name a file in a folder.")
-        values = [store.get(digest) for digest in self._digests(store)]
+        run, digests = self._found(store)
+        values = [store.get(digest) for digest in digests]
         out = console(json=False)
         for value in values[:1] if len(values) > 8 else values:
             out.print(f"[bold]{type(value).__name__}[/]")
@@ -244,19 +257,19 @@ class CacheShow:
         if self.png:
             from ss_flow.flows.cli.drawing import draw_results
 
-            draw_results(store, latest_run(store, self.scene), values, self.view, self.png)
+            draw_results(store, run or latest_run(store, self.scene), values, self.view, self.png)
             out.print(escape(f"drawn to {self.png}"))
         return 0
 
-    def _digests(self, store: Store) -> list[str]:
-        with contextlib.suppress(InputError):
-            run = latest_run(store, self.scene)
-            if nodes := named(run, run.nodes(), self.what):
-                return run.results().get(self.what) or [digest for node in nodes for digest in node["outputs"]]
+    def _found(self, store: Store) -> tuple[Run | None, list[str]]:
+        run, nodes = run_with(store, self.scene, self.what)
+        if run:
+            outputs = [digest for node in nodes for digest in node["outputs"]]
+            return run, run.results().get(self.what) or outputs
         found = store.find(self.what)
         if len(found) == 1:
-            return found
-        problem = f"stands for {len(found)} results" if found else "is neither a step of the latest run nor a digest"
+            return None, found
+        problem = f"stands for {len(found)} results" if found else "is neither a step of the latest runs nor a digest"
         raise InputError(f"{self.what!r} {problem}; `ss-flow cache ls` lists what there is.")
 
 

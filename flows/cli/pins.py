@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import time
@@ -19,7 +18,7 @@ from ss_flow.cache.store import Store
 from ss_flow.cache.survey import Survey
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import OptionalPath, PositionalText, StoreOptions, console
-from ss_flow.flows.cli.inspect import latest_run, named
+from ss_flow.flows.cli.inspect import run_with
 from ss_flow.runs import Run, latest_runs
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -30,8 +29,8 @@ class CachePin:
     """Keep results whatever `cache gc` deletes; without a name, list what is pinned."""
 
     what: PositionalText = None
-    """A step of the latest run (propagate, segment[0003]), the first characters of a digest, or a scene: then all of
-    its latest run."""
+    """A step (propagate, segment[0003]) of the latest run that got to it, the first characters of a digest, or a scene:
+    then all of its latest run."""
     scene: OptionalPath = None
     """The scene that the step is of; the one that ran last, when left out."""
     json: bool = False
@@ -51,11 +50,8 @@ class CachePin:
         return 0
 
     def _pin(self, store: Store, what: str) -> Pin:
-        run = None
-        with contextlib.suppress(InputError):  # there is none: then it is a digest
-            run = latest_run(store, self.scene)
-        nodes = named(run, run.nodes(), what) if run else []
-        if run and nodes:
+        run, nodes = run_with(store, self.scene, what)
+        if run:
             return _pin_results(store, what, run, nodes)
         found = store.find(what)
         if len(found) == 1:
@@ -66,7 +62,7 @@ class CachePin:
         run = next(latest_runs(store.runs, str(Path(what).resolve())), None)
         if run is None:
             raise InputError(
-                f"{what!r} is neither a step of the latest run, nor a digest, nor a scene that was run; "
+                f"{what!r} is neither a step of the latest runs, nor a digest, nor a scene that was run; "
                 "`ss-flow cache ls` lists what there is."
             )
         return _pin_results(store, run.scene, run, run.nodes())

@@ -22,8 +22,8 @@ from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model
 from ss_flow.flows.deliver import deliver, run_document
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
-from ss_flow.flows.split_splat import split_splat
-from ss_flow.graph import Flow
+from ss_flow.flows.split_splat import LEADS_TO, split_splat
+from ss_flow.graph import Flow, gather, nodes_by_step
 from ss_flow.resolution import Failure
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture.scene import open_scene
@@ -47,7 +47,7 @@ class RunOptions:
     assignments: Assignments = ()
     """Set a parameter, as in --set split.tau_label=0.8."""
     until: OptionalText = None
-    """Stop when this step's result is there."""
+    """Stop when this step's results are there: a name that `--dry-run` or `status` shows, or a result of run.json."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""
     memory: OptionalText = None
@@ -70,13 +70,18 @@ class RunOptions:
 
     @property
     def target(self) -> str | None:
-        """The step of --until; "split.propagate" is "propagate"."""
-        return self.until.rpartition(".")[2] if self.until else None
+        """The step of --until; "split.propagate" is "propagate", and so is one node of a step, "propagate[3]"."""
+        return self.until.partition("[")[0].rpartition(".")[2] if self.until else None
 
     @property
     def delivers(self) -> bool:
         """Whether a run ends with an output folder."""
         return self.until is None and not self.dry_run
+
+    @property
+    def stops_early(self) -> str:
+        """What to say of a run that writes no output folder."""
+        return f"--until {self.until} stops before the output (`ss-flow cache show {self.target}` shows the result)"
 
     def engine(self) -> dict[str, Any]:
         """These options as the engine takes them. Raises InputError for one that is out of range."""
@@ -146,11 +151,22 @@ def prepare(
                 params=params.semantics.query,
                 encoder=networks.encoder,
             )
-        if options.target is not None and options.target not in results:
-            raise InputError(f"--until {options.until!r} names no step; there are {', '.join(results)}.")
-        return results
+        target = options.target
+        return results if target in (None, *results) else results | {target: _until(target, results)}
 
     return Prepared(scene, params, networks, build)
+
+
+def _until(step: str, results: Mapping[str, Any]) -> Any:
+    """The node to stop at that is not a result itself. Raises InputError when there is no step of this name."""
+    if step in LEADS_TO:
+        return results[LEADS_TO[step]]
+    known = nodes_by_step(results.values())
+    found = [node for name, nodes in known.items() if name.rpartition(".")[2] == step for node in nodes]
+    if not found:
+        steps = sorted({name.rpartition(".")[2] for name in known} - results.keys())
+        raise InputError(f"--until {step!r} names no step; there are {', '.join([*results, *steps])}.")
+    return gather(found)
 
 
 def header(prepared: Prepared, options: RunOptions) -> dict[str, Any]:

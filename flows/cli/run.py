@@ -110,6 +110,8 @@ def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions,
         print(json.dumps(document))
     else:
         _tell(document, out if options.delivers else None, console_out)
+    if not options.delivers:
+        console_out.print(escape(f"{options.stops_early}: {out} is not written"))
     return STATUS_EXIT[document["status"]]
 
 

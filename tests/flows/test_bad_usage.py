@@ -259,7 +259,7 @@ def test_a_search_after_its_store_went_away_says_so_and_makes_no_new_one(warm):
     ("arguments", "expected"),
     [
         (["why", "nope"], "has no step 'nope'; it has .*split.propagate"),
-        (["cache", "show", "nope"], "is neither a step of the latest run nor a digest"),
+        (["cache", "show", "nope"], "is neither a step of the latest runs nor a digest"),
         (["cache", "show", "segment[0099]"], r"'segment\[0099\]' is neither"),
         (["status", "elsewhere"], "knows no run of elsewhere"),
         (["graph", "elsewhere"], "knows no run of elsewhere"),

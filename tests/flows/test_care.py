@@ -178,7 +178,7 @@ def test_pins_are_named_by_step_by_digest_or_by_scene(warm):
 
 def test_a_pin_of_what_is_not_there_is_refused(warm):
     unknown = ss_flow("cache", "pin", "nonsense", "--cache", warm.store)
-    assert unknown.code == 2 and "is neither a step of the latest run, nor a digest, nor a scene" in unknown.err
+    assert unknown.code == 2 and "is neither a step of the latest runs, nor a digest, nor a scene" in unknown.err
     for place in ("actions", "objects"):
         for folder in (warm.store / place).iterdir():
             folder.rename(warm.store / "tmp" / f"{place}{folder.name}")

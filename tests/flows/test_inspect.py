@@ -8,7 +8,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from tiny_runs import ss_flow
+from tiny_runs import run_tiny, ss_flow
 
 from ss_flow.cache.store import Store
 from ss_flow.runs import latest_runs
@@ -88,6 +88,16 @@ def test_a_result_is_found_by_the_name_that_until_takes(tiny, name):
     kind = type(Store(tiny.store).get(wanted if isinstance(wanted, str) else wanted[0])).__name__
     assert shown.out.startswith(kind)
     assert ss_flow("why", name, "--cache", tiny.store).code == 0
+
+
+def test_results_of_a_finished_run_are_found_after_one_that_stopped_before_them(warm):
+    before = ss_flow("cache", "show", "scene", "--cache", warm.store)
+    run_tiny(warm.scene, warm.store, "--until", "dense", out=warm.out)
+    assert ss_flow("cache", "show", "scene", "--cache", warm.store) == before
+    assert ss_flow("cache", "pin", "scene", "--cache", warm.store).code == 0
+    picture = warm.out.parent / "scene.png"
+    assert ss_flow("cache", "show", "scene", "--view", "1", "--png", picture, "--cache", warm.store).code == 0
+    assert cv2.imread(str(picture)).shape == (72, 96, 3)
 
 
 def test_cache_show_describes_the_items_of_a_list(tiny):

@@ -150,6 +150,10 @@ def test_words_for_people_tell_what_was_measured_and_made(warm):
     assert told.code == 0
     assert "results computed" in told.out and "reused" in told.out
     assert told.err == ""
+    assert told.out.endswith(
+        "--until masks_split stops before the output (`ss-flow cache show masks_split` shows the result): "
+        f"{warm.out} is not written\n"
+    )
 
 
 def test_until_stops_there_and_writes_no_output(tiny, tmp_path):
@@ -158,6 +162,22 @@ def test_until_stops_there_and_writes_no_output(tiny, tmp_path):
     steps = {n["step"] for n in called.document()["nodes"]}
     assert steps == {"capture.ingest", "capture.cameras", "capture.sensor_depth", "capture.unit", "split.dense"}
     assert not (tmp_path / "out").exists()
+
+
+def test_until_takes_every_name_that_status_shows(warm, tmp_path):
+    ran = tmp_path / "ran"
+    steps = json.loads(ss_flow("status", "--json", "--cache", warm.store).out)["steps"]
+    assert len(steps) > 25
+    for step in (*steps, "split.visibility[0003]", "masks_split"):
+        called = run_tiny(warm.scene, warm.store, "--until", step, out=ran)
+        assert called.code == 0, called.err
+        nodes = called.document()["nodes"]
+        assert all(node["hit"] for node in nodes)
+        of_step = [node for node in nodes if node["step"] == step.partition("[")[0]]
+        assert len(of_step) == steps.get(step, {"expected": 5 if "[" in step else 0})["expected"], step
+        if step in ("split.visibility", "split.dense"):
+            assert "split.propagate" not in {node["step"] for node in nodes}
+    assert not ran.exists()
 
 
 def test_a_dry_run_tells_what_would_run_and_runs_nothing(warm, tmp_path):
