@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 from ss_flow.cache.store import Store
 from ss_flow.flows.deliver import METRICS
 
@@ -14,6 +16,7 @@ _COUNTS = ("over_segmentation", "under_segmentation", "num_truth", "num_predicte
 NAMES: dict[str, tuple[str, ...]] = {
     "propagate": ("split.labelled",),
     "reproject": ("split.instances",),
+    "masks_split": ("split.covered",),
     "scene": ("splat.instances", "splat.gaussians"),
     "metrics_split": tuple(f"split.{name}" for name in _MASKS + _COUNTS),
     "metrics_refined": tuple(f"refined.{name}" for name in _MASKS + _COUNTS),
@@ -46,8 +49,9 @@ def measures(store: Store, document: Mapping[str, Any]) -> dict[str, float]:
     """The figures of a run, from its document run.json.
 
     Fractions are 0..1. `split.labelled` is the share of the dense points that got a label; `split.instances` counts the
-    instances after Split, `splat.instances` those with Gaussians of their own; `query.matched` the instances that the
-    text means, `query.matched_share` their share of all, and `query.best` is the best score.
+    instances after Split, and `split.covered` is the share of all pixels that their masks fill; `splat.instances`
+    counts those with Gaussians of their own; `query.matched` the instances that the text means, `query.matched_share`
+    their share of all, and `query.best` is the best score.
     """
     results = document["results"]
     found: dict[str, float] = {}
@@ -55,6 +59,9 @@ def measures(store: Store, document: Mapping[str, Any]) -> dict[str, float]:
         found["split.labelled"] = float((store.get(results["propagate"]).label > 0).mean())
     if "reproject" in results:
         found["split.instances"] = len(results["reproject"]) - 1  # the background comes first
+    if "masks_split" in results:
+        ids = [store.get(value).ids for value in results["masks_split"]]
+        found["split.covered"] = sum(np.count_nonzero(one) for one in ids) / sum(one.size for one in ids)
     if "scene" in results:
         scene = store.get(results["scene"])
         found["splat.instances"] = len({*scene.instance_id.tolist()} - {0})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import types
 import typing
@@ -15,6 +16,7 @@ from typing import Annotated, Any
 import tyro
 from rich.markup import escape
 
+from ss_flow.cache.canonical import digest
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
@@ -30,13 +32,14 @@ from ss_flow.flows.cli.prepare import (
     header,
     prepare,
 )
-from ss_flow.flows.cli.sweep_report import in_short, tell_plan, tell_rows, write_files
+from ss_flow.flows.cli.sweep_report import holds_other, in_short, tell_plan, tell_rows, write_files
 from ss_flow.flows.deliver import STATUS_EXIT
-from ss_flow.flows.measures import measures, names_of
+from ss_flow.flows.measures import NAMES, measures, names_of
 from ss_flow.flows.params import Params
 from ss_flow.runs import DONE
 from ss_flow.sweep import Row, grid, in_words, recorded_as, rows_of, values_of, zipped
 from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import check_writable
 
 
@@ -66,7 +69,8 @@ class Sweep:
     scenes: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH ...", help_behavior_hint="")]
     """Captures, as `run` takes them."""
     out: OptionalPath = None
-    """The folder for sweep.json, sweep.csv and sweep.png; by default ss-flow-out/NAME-sweep."""
+    """The folder for sweep.json, sweep.csv and sweep.png; by default ss-flow-out/NAME-sweep, with a number where
+    another sweep lies there."""
     zipped: Annotated[bool, tyro.conf.arg(name="zip")] = False
     """Take the first values together, the second together, and so on, instead of every combination."""
     metrics: Annotated[
@@ -89,7 +93,8 @@ class Sweep:
         settings_of = self._variants(settings.preset(Params(), options.preset), options.texts)
         self._check()
         scenes = [open_scene(path, self.masks, self.hints) for path in self.scenes]
-        out = self.out or Path("ss-flow-out") / (f"{scenes[0].name}-sweep" if len(scenes) == 1 else "sweep")
+        asked = self._asked(scenes, settings_of)
+        out = self._place(scenes, asked)
         check_writable(out)
         store = options.store.open_store()
         digests = file_digests(store, verify=options.verify)
@@ -128,15 +133,36 @@ class Sweep:
         if options.dry_run:
             labels = [variant.label(scene=len(scenes) > 1) for variant in variants]
             return tell_plan(labels, rows, tell, scenes=[v.prepared.name for v in variants] if options.json else None)
-        documents = _documents(variants, rows, [found[position] for position in range(len(rows))], chosen)
+        documents = [
+            {"sweep": asked, **row}
+            for row in _documents(variants, rows, [found[position] for position in range(len(rows))], chosen)
+        ]
         if options.json:
             print(json.dumps(documents))
         else:
             tell_rows(documents, tell)
+        if options.target and not names_of([options.target]):
+            tell.print(escape(f"--until {options.until} gives no figures; these steps do: {', '.join(NAMES)}"))
         written = write_files(out, documents, zipped=self.zipped)
         tell.print(escape(f"see {out}: {', '.join(written)}"))
         statuses = {document["status"] for document in documents}
         return STATUS_EXIT[statuses.pop()] if len(statuses) == 1 else STATUS_EXIT["degraded"]
+
+    def _asked(self, scenes: Sequence[SceneFiles], variants: Sequence[tuple[Params, dict[str, Any]]]) -> str:
+        """A digest of all that is asked: a sweep of the same one may take the place of another's files."""
+        given = [str(path.resolve()) for path in (*(s.root for s in scenes), self.masks, self.hints) if path]
+        values = [settings.flat(params) for params, _ in variants]
+        return digest([given, values, self.metrics, self.query, self.execution.target])
+
+    def _place(self, scenes: Sequence[SceneFiles], asked: str) -> Path:
+        """The folder to write. Raises InputError when --out holds the files of another sweep."""
+        if self.out is not None:
+            if not self.execution.dry_run and holds_other(self.out, asked):
+                raise InputError(f"{self.out} holds another sweep; name another folder with --out.")
+            return self.out
+        name = f"{scenes[0].name}-sweep" if len(scenes) == 1 else "sweep"
+        places = (Path("ss-flow-out") / (f"{name}-{n}" if n > 1 else name) for n in itertools.count(1))
+        return next(place for place in places if not holds_other(place, asked))
 
     def _variants(self, params: Params, texts: Sequence[str]) -> list[tuple[Params, dict[str, Any]]]:
         """The parameters of every variant, and those of them that are swept, by name."""

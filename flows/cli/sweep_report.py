@@ -95,6 +95,16 @@ def tell_plan(labels: Sequence[str], rows: Sequence[Row], out: Console, *, scene
     return 0
 
 
+def holds_other(folder: Path, asked: str) -> bool:
+    """Whether a folder holds the files of a sweep that asked something else. asked: what a row has as "sweep"."""
+    try:
+        return any(row.get("sweep") != asked for row in json.loads((folder / "sweep.json").read_text(encoding="utf-8")))
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except (OSError, ValueError, TypeError, AttributeError):
+        return True
+
+
 def write_files(out: Path, rows: Sequence[Document], *, zipped: bool) -> list[str]:
     """Write sweep.json, sweep.csv and, where there are figures to draw, sweep.png; return their names."""
     from ss_flow.flows.cli.sweep_plot import plot

@@ -143,7 +143,7 @@ def test_with_a_text_the_search_is_a_step_and_its_threshold_can_be_swept(warm, t
     assert rows[0]["metrics"]["query.best"] == pytest.approx(answer[0]["score"], abs=1e-3)
     assert rows[0]["metrics"]["query.matched"] == sum(row["matched"] for row in answer if row["id"])
     assert "warning" not in found.err
-    refused(sweep_tiny(warm, *options, "--query", "teapot"), '"teapot" names no colour')
+    refused(sweep_tiny(warm, *options, "--query", "teapot", out=tmp_path / "x"), '"teapot" names no colour')
 
 
 def test_a_parameter_that_no_step_depends_on_is_told_of(warm, tmp_path):
@@ -204,6 +204,38 @@ def test_words_for_people_hold_a_table_and_where_the_files_are(warm, tmp_path):
     assert ["tau_label", "pq", "reused", "computed", "seconds"] in lines
     assert [line[0] for line in lines[2:4]] == ["0.7", "0.71"]
     assert told.out.splitlines()[-1] == f"see {tmp_path / 'swept'}: sweep.json, sweep.csv, sweep.png"
+
+
+def test_no_sweep_takes_the_place_of_another(warm, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = ["--cache", warm.store, "--preset", "fast", *SHORT, "--until", "propagate", "--json"]
+
+    def swept(*more) -> Called:
+        return ss_flow("sweep", warm.scene, *options, *more)
+
+    first = swept("--set", "tau_label=0.7,0.8")
+    assert (tmp_path / "ss-flow-out/room-sweep/sweep.json").is_file(), first.err
+    kept = (tmp_path / "ss-flow-out/room-sweep/sweep.csv").read_bytes()
+    for other in (["tau_label=0.7,0.9"], ["tau_label=0.7,0.8", "--set", "tau_depth=0.03"]):
+        called = swept("--set", *other)
+        assert called.code == 0, called.err
+    assert [len(json.loads(p.read_text())) for p in sorted(tmp_path.glob("ss-flow-out/*/sweep.json"))] == [2, 2, 2]
+    assert (tmp_path / "ss-flow-out/room-sweep/sweep.csv").read_bytes() == kept
+    again = swept("--set", "tau_label=0.7,0.8")  # the same once more: nothing is lost
+    assert len(list((tmp_path / "ss-flow-out").iterdir())) == 3
+    assert "see ss-flow-out/room-sweep:" in again.err
+    refused(swept("--set", "tau_label=0.6,0.8", "--out", "ss-flow-out/room-sweep"), "holds another sweep; name another")
+
+
+def test_a_sweep_that_stops_before_all_figures_says_which_steps_give_some(warm, tmp_path):
+    options = ["--set", "tau_label=0.7,0.8", "--until"]
+    called = sweep_tiny(warm, *options, "observe", out=tmp_path / "none")
+    assert called.code == 0 and [row["metrics"] for row in called.document()] == [{}, {}]
+    assert "--until observe gives no figures; these steps do: propagate, reproject, masks_split" in called.err
+    masks = sweep_tiny(warm, *options, "masks_split", out=tmp_path / "masks")
+    assert "no figures" not in masks.err
+    for row, called in zip(masks.document(), (0.7, 0.8), strict=True):
+        assert 0 < row["metrics"]["split.covered"] < 1 and row["params"]["split.propagate.tau_label"] == called
 
 
 def test_every_figure_is_listed_under_the_step_that_gives_it(tiny):
