@@ -9,6 +9,7 @@ from typing import Any
 
 from ss_flow.errors import InputError
 from ss_flow.flows.params import CaptureParams
+from ss_flow.flows.poses import poses
 from ss_flow.graph import INDEX, each
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, Clicks, DepthMap, Frame, LabelMap, MaskSet, Registration, SceneUnit
@@ -20,7 +21,7 @@ from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.registration import calibrated, registration
 from ss_flow.tasks.capture.scene_files import SceneFiles
-from ss_flow.tasks.capture.sfm import registered, sfm
+from ss_flow.tasks.capture.sfm import registered
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.models.catalogue import Model
 
@@ -68,7 +69,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
             sparse=reference(scene.sparse) if scene.sparse else None,
         )
     else:
-        cameras = sfm(frames, params=params.sfm)
+        cameras = poses(frames, params.sfm, scene.names or None)
         frames = registered(frames, cameras)
     names = _known_names(scene)
     known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}

@@ -1,0 +1,52 @@
+"""Photos without poses -> cameras: features a photo, matches with its partners, mapping, and once more for what is left
+out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ss_flow.graph import INDEX, each, expand, gather, pick
+from ss_flow.tasks.artifacts import Cameras, Frame
+from ss_flow.tasks.capture.features import Features, features
+from ss_flow.tasks.capture.matches import Matches, match
+from ss_flow.tasks.capture.pairs import Look, look, partners
+from ss_flow.tasks.capture.sfm import SfmParams, Unregistered, accepted, sfm, unregistered
+
+
+def poses(frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] | None) -> Cameras:
+    """Add the nodes of structure from motion; names: of the frames, where they are known beforehand."""
+    found = each(frames, names=names, build=lambda frame: features(frame, params=params.features))
+    looks = each(found, names=names, build=lambda photo: look(photo, count=params.pairs.look_features))
+    matches = matched(found, looks, params, names)
+    first = sfm(found, matches, gather([]), params=params.mapping)
+    missing = unregistered(looks, first)
+
+    def complete(left: Unregistered) -> Cameras:
+        tries = [first]
+        if len(left.row) and params.guided_matching == "missing":
+            again = gather([rematched(found, looks, row, left.total, params) for row in left.row.tolist()])
+            tries.append(sfm(found, matches, again, params=params.mapping))
+        return accepted(gather(tries), missing, min_registered=params.min_registered)
+
+    return expand(missing, complete)
+
+
+def matched(
+    found: tuple[Features, ...], looks: tuple[Look, ...], params: SfmParams, names: tuple[str, ...] | None
+) -> tuple[Matches, ...]:
+    """Every photo matched with its partners among those before it."""
+
+    def of_photo(photo: Features, row: int) -> Matches:
+        chosen = partners(looks[row], pick(looks, range(row)), place=row, params=params.pairs)
+        guided = params.guided_matching == "always"
+        return expand(chosen, lambda plan: match(photo, pick(found, plan.row.tolist()), guided=guided))
+
+    return each(found, INDEX, names=names, build=of_photo)
+
+
+def rematched(found: tuple[Features, ...], looks: tuple[Look, ...], row: int, total: int, params: SfmParams) -> Matches:
+    """A photo that has no pose matched along epipolar lines, with twice the partners, before it or after."""
+    others = [other for other in range(total) if other != row]
+    wider = replace(params.pairs, partners=2 * params.pairs.partners)
+    chosen = partners(looks[row], pick(looks, others), place=row, params=wider)
+    return expand(chosen, lambda plan: match(found[row], pick(found, [others[i] for i in plan.row]), guided=True))
