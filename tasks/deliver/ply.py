@@ -1,8 +1,9 @@
 """PLY files of Gaussians and of labelled points, written and read.
 
-Gaussians are kept as 3DGS viewers expect them: binary little endian, 62 float32 a row; colour coefficients channel by
-channel, padded with zeros to degree 3. The labelled form adds three float32 columns at the end of each row, which
-viewers ignore or show as extra columns. Rows are written in blocks, so that a scene is never in memory twice.
+Gaussians are kept as 3DGS viewers expect them: binary little endian, float32; colour coefficients channel by channel,
+and none above the degree of the Gaussians: f_rest has 0, 9, 24 or 45 columns. The labelled form adds three float32
+columns at the end of each row, which viewers ignore or show as extra columns. Rows are written in blocks, so that a
+scene is never in memory twice.
 """
 
 from __future__ import annotations
@@ -16,12 +17,8 @@ from numpy.typing import NDArray
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float32, Gaussians, PointCloud, PointLabels, PointParts
 
-_REST = 45
-_STANDARD = (
-    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-    *(f"f_rest_{i}" for i in range(_REST)),
-    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
+_HEAD = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+_TAIL = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 _LABELS = ("instance_id", "instance_conf", "part_id")
 _COLORS = ("red", "green", "blue")
 _RENDER_MODE = "SplatRenderMode: default"
@@ -37,31 +34,30 @@ _NAMES = {"f4": "float", "u1": "uchar"}
 
 def write_gaussians(path: Path, gaussians: Gaussians, *, labelled: bool = False) -> None:
     """Write Gaussians as a standard 3DGS file; `labelled` adds instance_id, instance_conf and part_id."""
-    columns = (*_STANDARD, *_LABELS) if labelled else _STANDARD
-    dtype = np.dtype([(name, "<f4") for name in columns])
+    rest = (f"f_rest_{i}" for i in range(3 * (gaussians.sh.shape[1] - 1)))
+    dtype = np.dtype([(name, "<f4") for name in (*_HEAD, *rest, *_TAIL, *(_LABELS if labelled else ()))])
 
     def block(start: int, stop: int) -> NDArray[np.void]:
-        rows = _gaussian_rows(gaussians, slice(start, stop), len(columns))
+        rows = _gaussian_rows(gaussians, slice(start, stop), labelled=labelled)
         return rows.view(dtype)[:, 0]
 
     _write(path, dtype, len(gaussians), block, (_RENDER_MODE,))
 
 
-def _gaussian_rows(gaussians: Gaussians, part: slice, width: int) -> Float32:
-    means = gaussians.means[part]
-    rows = np.zeros((len(means), width), "<f4")
-    rows[:, 0:3] = means
-    rows[:, 6:9] = gaussians.sh[part, 0]
-    higher = gaussians.sh[part, 1:16].transpose(0, 2, 1)
-    rows[:, 9 : 9 + _REST].reshape(-1, 3, 15)[:, :, : higher.shape[2]] = higher
-    rows[:, 54] = gaussians.opacity_logits[part]
-    rows[:, 55:58] = gaussians.log_scales[part]
-    rows[:, 58:62] = gaussians.quaternions[part]
-    if width > len(_STANDARD):
-        rows[:, 62] = gaussians.instance_id[part]
-        rows[:, 63] = gaussians.instance_conf[part]
-        rows[:, 64] = gaussians.part_id[part]
-    return rows
+def _gaussian_rows(gaussians: Gaussians, part: slice, *, labelled: bool) -> Float32:
+    means, sh = gaussians.means[part], gaussians.sh[part]
+    columns = [
+        means,
+        np.zeros_like(means),
+        sh[:, 0],
+        sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1),
+        gaussians.opacity_logits[part, None],
+        gaussians.log_scales[part],
+        gaussians.quaternions[part],
+    ]
+    if labelled:
+        columns += [a[part, None] for a in (gaussians.instance_id, gaussians.instance_conf, gaussians.part_id)]
+    return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
 
 
 def write_cloud(path: Path, cloud: PointCloud, labels: PointLabels, parts: PointParts) -> None:
@@ -143,13 +139,13 @@ def read_columns(path: Path) -> NDArray[np.void]:
 def read_gaussians(path: Path) -> Gaussians:
     """Gaussians of a standard or labelled 3DGS file; ids are 0 and confidences 0 where the file has no labels.
 
-    The degree is that of the file: one with 45 f_rest columns gives degree 3, whatever was padded when it was written.
+    The degree is that of the file: one with 45 f_rest columns gives degree 3, also where they are 0.
     Raises InputError when columns are missing.
     """
     rows = read_columns(path)
     names = set(rows.dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in names)
-    missing = [name for name in _STANDARD if name not in names and name[0] != "n" and not name.startswith("f_rest_")]
+    missing = [name for name in (*_HEAD, *_TAIL) if name not in names and name[0] != "n"]
     if missing or rest not in (0, 9, 24, 45):
         what = f"lacks {', '.join(missing)}" if missing else f"has {rest} f_rest columns instead of 0, 9, 24 or 45"
         raise InputError(f"{path.name} {what}; a file of 3D Gaussians is needed.")
