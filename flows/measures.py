@@ -21,7 +21,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "metrics_split": tuple(f"split.{name}" for name in _MASKS + _COUNTS),
     "metrics_refined": tuple(f"refined.{name}" for name in _MASKS + _COUNTS),
     "metrics_splat": tuple(f"splat.{name}" for name in _MASKS + _COUNTS),
-    "novel_view": ("novel_view.psnr", "novel_view.ssim"),
+    "novel_view": ("novel_view.psnr", "novel_view.ssim", "novel_view.psnr_colour_fitted"),
     "query": ("query.matched", "query.matched_share", "query.best"),
 }
 """Which figures each step gives."""

@@ -32,6 +32,7 @@ _METRIC_NAMES = {
     "sq": "SQ",
     "rq": "RQ",
     "psnr": "PSNR",
+    "psnr_colour_fitted": "PSNR, colours fitted to each view",
     "ssim": "SSIM",
     "ap": "AP",
     "ap50": "AP @ 0.5",
@@ -176,7 +177,7 @@ def _figure(name: str, value: object) -> str:
         return "–" if value is None else str(value)
     if name.startswith("num_") or isinstance(value, int):
         return f"{value:.0f}"
-    return f"{value:.2f} dB" if name == "psnr" else f"{value:.3f}"
+    return f"{value:.2f} dB" if name.startswith("psnr") else f"{value:.3f}"
 
 
 def _steps(nodes: list[Mapping[str, Any]]) -> list[dict[str, Any]]:

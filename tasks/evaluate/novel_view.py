@@ -33,8 +33,9 @@ def novel_view(
     """Render the scene from the held-out cameras and compare with the photos, as 8-bit images.
 
     background: colour where nothing is, 0..1. Pixels that a frame's `valid` mask excludes count in neither measure.
-    Returns psnr (dB) and ssim, each the mean over the views. Raises InputError when there is no view, when frames
-    and cameras do not belong together, or when a view has no valid pixel.
+    Returns psnr (dB) and ssim, and psnr_colour_fitted, the PSNR after `colour_fitted`, each the mean over the views.
+    Raises InputError when there is no view, when frames and cameras do not belong together, or when a view has no valid
+    pixel.
     """
     from ss_flow.tasks.gaussians.render import render
 
@@ -49,12 +50,24 @@ def novel_view(
         if not valid.any():
             raise InputError(f"The mask of held-out view {frame.name} leaves no pixel to compare; drop the view.")
         camera = camera_of(cameras_held_out, view).scaled(frame.width, frame.height)
-        image = to_8bit(render(scene, camera, background=background).rgb)
-        photo = decode_rgb(frame)
-        values.append((psnr(image, photo, valid), ssim(image, photo, valid)))
+        rgb, photo = render(scene, camera, background=background).rgb, decode_rgb(frame)
+        image, fitted = to_8bit(rgb), to_8bit(colour_fitted(np.clip(rgb, 0, 1), photo, valid))
+        values.append((psnr(image, photo, valid), ssim(image, photo, valid), psnr(fitted, photo, valid)))
         progress(view + 1, len(names), frame.name)
     mean = np.mean(values, axis=0)
-    return Metrics({"psnr": float(mean[0]), "ssim": float(mean[1])})
+    return Metrics(dict(zip(("psnr", "ssim", "psnr_colour_fitted"), map(float, mean), strict=True)))
+
+
+def colour_fitted(image: Float32, photo: UInt8, valid: Bool) -> Float32:
+    """An image with the colours of its photo: the affine map of RGB that brings it nearest (least squares).
+
+    A scene cannot know the exposure and white balance of a view that was kept back. Where these change, a PSNR measures
+    them as well, and is told after such a fit too (RawNeRF, Mildenhall et al. 2022; gsplat's cc_psnr).
+    image: [H, W, 3] float, 0..1; photo: [H, W, 3]; valid: [H, W] the pixels that are fitted.
+    """
+    seen = np.concatenate([image[valid], np.ones((int(valid.sum()), 1), np.float32)], axis=1).astype(np.float64)
+    fit = np.linalg.lstsq(seen, photo[valid] / 255, rcond=None)[0]
+    return (image @ fit[:3] + fit[3]).astype(np.float32)
 
 
 def to_8bit(image: Float32) -> UInt8:

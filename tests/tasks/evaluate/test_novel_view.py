@@ -11,7 +11,7 @@ import pytest
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, Frame, Gaussians
-from ss_flow.tasks.evaluate.novel_view import novel_view, psnr, ssim, to_8bit
+from ss_flow.tasks.evaluate.novel_view import colour_fitted, novel_view, psnr, ssim, to_8bit
 from ss_flow.tasks.geometry.images import encode_png
 
 _RNG = np.random.default_rng(0)
@@ -126,6 +126,21 @@ def test_the_valid_mask_of_a_frame_counts(rendered: list[Any]) -> None:
     image = to_8bit(np.float32(PHOTO * 0.9) / 255)
     assert values["psnr"] == pytest.approx(psnr(image, PHOTO, valid))
     assert values["psnr"] > psnr(image, PHOTO) + 1
+
+
+def test_an_affine_change_of_colours_is_fitted_away(rendered: list[Any]) -> None:
+    values = novel_view((_frame("a"), _frame("b")), _cameras("a", "b"), _gaussians()).values
+    assert values["psnr"] < 40 < 55 < values["psnr_colour_fitted"]  # what is left is rounding
+
+
+def test_colours_are_fitted_to_the_valid_pixels_alone() -> None:
+    rng = np.random.default_rng(2)
+    image, valid = rng.random((20, 24, 3)).astype(np.float32), np.arange(24) < 12
+    mixed = np.array([[0.7, 0.1, 0.0], [0.0, 0.5, 0.2], [0.1, 0.0, 0.6]], np.float32)
+    photo = to_8bit(np.where(valid[:, None], image @ mixed + 0.05, rng.random((20, 24, 3))).astype(np.float32))
+    fitted = colour_fitted(image, photo, np.broadcast_to(valid, (20, 24)))
+    np.testing.assert_allclose(fitted[:, :12], photo[:, :12] / 255, atol=0.004)
+    np.testing.assert_allclose(fitted, image @ mixed + 0.05, atol=0.004)
 
 
 def test_views_that_cannot_be_compared_are_refused(rendered: list[Any]) -> None:
