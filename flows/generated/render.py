@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -56,9 +57,11 @@ class Renderer:
         self._ids = np.array([t.instance_id for t in things], np.uint16)
         self._parts = np.array([t.part_id for t in things], np.uint8)
         vertices = np.concatenate([t.mesh.vertices for t in things]).astype(np.float32)
+        self._vertices = vertices
         self._scene = _scene(o3d, vertices, self._triangles)
         # The sun shines through the walls and the ceiling.
         self._blockers = _scene(o3d, vertices, self._triangles[self._ids[self._thing] > 0])
+        self._o3d = o3d
         self._to_tensor = o3d.core.Tensor
         self._pattern = np.array([_PATTERNS.index(t.material.pattern) for t in things])
         self._scale = np.array([t.material.scale for t in things])
@@ -85,14 +88,44 @@ class Renderer:
         thing = hits.thing.reshape(h, w)
         return rgb, hits.depth.reshape(h, w), self._ids[thing], self._parts[thing]
 
-    def _cast(self, camera: Camera, u: Float64, v: Float64) -> _Hits:
-        local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=1)
-        direction = local @ camera.world_to_camera[:3, :3]
-        rays = np.concatenate([np.broadcast_to(camera.center, direction.shape), direction], axis=1)
-        answer = self._scene.cast_rays(self._to_tensor(rays.astype(np.float32)))
+    def alone(self, camera: Camera, instance_id: int) -> tuple[Float32, Float32, Float32]:
+        """One instance without the rest of the room, in the light that it has there: the others' shadows stay.
+
+        Returns rgb [H, W, 3] 0..1 before black and alpha [H, W], both averaged over nine rays a pixel, and z-depth
+        [H, W] of the ray through the centre, 0 where it misses.
+        """
+        h, w = camera.height, camera.width
+        row, column = (n.ravel() for n in np.mgrid[:h, :w])
+        own = np.flatnonzero(self._ids[self._thing] == instance_id)
+        scene = _scene(self._o3d, self._vertices, self._triangles[own])
+        light, hits, depth = np.zeros((h * w, 3)), np.zeros(h * w), np.zeros(h * w, np.float32)
+        for du, dv in itertools.product((0.5, 1 / 6, 5 / 6), repeat=2):
+            met = self._reached(scene, camera, column + du, row + dv)
+            found = self._cast(camera, column[met] + du, row[met] + dv, scene, own)
+            light[met] += found.color
+            hits[met] += 1
+            if du == dv == 0.5:
+                depth[met] = found.depth
+        alpha = hits / 9
+        rgb = np.clip(light / np.maximum(hits, 1)[:, None], 0, 1) ** (1 / _GAMMA) * alpha[:, None]
+        return rgb.reshape(h, w, 3).astype(np.float32), alpha.reshape(h, w).astype(np.float32), depth.reshape(h, w)
+
+    def _reached(self, scene: Any, camera: Camera, u: Float64, v: Float64) -> NDArray[np.intp]:
+        """Which of the rays through image points meet anything of a scene."""
+        rays = self._to_tensor(_rays(camera, u, v).astype(np.float32))
+        return np.flatnonzero(np.isfinite(scene.cast_rays(rays)["t_hit"].numpy()))
+
+    def _cast(
+        self, camera: Camera, u: Float64, v: Float64, scene: Any = None, own: NDArray[np.intp] | None = None
+    ) -> _Hits:
+        """Where the rays through image points [N] meet the room, or a scene of the triangles `own` alone: all do."""
+        rays = _rays(camera, u, v)
+        direction = rays[:, 3:]
+        answer = (scene or self._scene).cast_rays(self._to_tensor(rays.astype(np.float32)))
         # The rays' directions have z = 1 in the camera, so the distance along them is the z-depth.
         depth = answer["t_hit"].numpy()
         triangle = answer["primitive_ids"].numpy().astype(np.intp)
+        triangle = triangle if own is None else own[triangle]
         second, third = answer["primitive_uvs"].numpy().T
         weights = np.stack([1 - second - third, second, third], axis=1)
         corners = self._triangles[triangle]
@@ -162,6 +195,13 @@ class Renderer:
                 near, far = flat[row + low[:, 2]], flat[row + high[:, 2]]
                 value += wx[:, 0] * wy[:, 1] * (near + (far - near) * f[:, 2])
         return value.astype(np.float64)
+
+
+def _rays(camera: Camera, u: Float64, v: Float64) -> Float64:
+    """[N, 6] origin and direction, of z = 1 in the camera, of the rays through image points."""
+    local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=1)
+    direction = local @ camera.world_to_camera[:3, :3]
+    return np.concatenate([np.broadcast_to(camera.center, direction.shape), direction], axis=1)
 
 
 def _scene(o3d: Any, vertices: Float32, triangles: Int32) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
-from ss_flow.flows.generated.composite_room import GAZE, close_up, furnish_composites, gripper
+from ss_flow.flows.generated.composite_room import GAZE, Station, close_up, furnish_composites, gripper
 from ss_flow.flows.generated.layout import Thing, furnish
 from ss_flow.flows.generated.masks import DegradeParams, degrade
 from ss_flow.flows.generated.render import Renderer
@@ -120,7 +120,7 @@ def generate(params: RoomParams) -> Room:
     if params.views < 2 or params.held_out < 0 or min(params.width, params.height) < 16:
         raise InputError("A generated room needs at least 2 views, 0 held-out views and 16 x 16 pixels.")
     rng = np.random.default_rng(params.seed)
-    things, stations = furnish_composites(rng) if params.composite else (furnish(params.objects, rng), ())
+    things, stations = _furnished(params, rng)
     gaze = GAZE if params.composite else _GAZE
     renderer = Renderer(things, params.seed)
     phase, jitter = rng.uniform(0, 2 * np.pi, 3), rng.uniform(-1, 1, (params.views, 2))
@@ -139,6 +139,11 @@ def generate(params: RoomParams) -> Room:
         views, held_out = _gripped(views, params, rng), _gripped(held_out, params, rng)
     structure, *objects = _objects(things)
     return Room(**vars(views), held_out=held_out, objects=tuple(objects), structure=structure, **_points(views))
+
+
+def renderer_of(params: RoomParams) -> Renderer:
+    """What photographs a room from anywhere, the room or one thing of it."""
+    return Renderer(_furnished(params, np.random.default_rng(params.seed))[0], params.seed)
 
 
 def write_scene(
@@ -177,6 +182,11 @@ def write_scene(
         ids = room.ids if masks == "truth" else degrade(room.ids, degradation, seed=seed)
         for name, image in zip(room.cameras.names, ids, strict=True):
             _write_bytes(folder / "instance_masks" / f"{name}.png", encode_png(image))
+
+
+def _furnished(params: RoomParams, rng: np.random.Generator) -> tuple[tuple[Thing, ...], tuple[Station, ...]]:
+    """Everything in the room, and the stations of its close views."""
+    return furnish_composites(rng) if params.composite else (furnish(params.objects, rng), ())
 
 
 def _pose(turn: float, phase: Float64, jitter: Float64, gaze: float) -> Float64:

@@ -1,13 +1,17 @@
-"""How clean reconstructed objects are: dark fringes, floaters, and what taking one away changes elsewhere.
+"""How clean reconstructed objects are, and whether they hold from where no photo was taken.
 
-None of these needs ground truth; each is a share or a difference that is 0 for a perfect object.
+Dark fringes, floaters, needles, and what taking an object away changes elsewhere need no ground truth; each is a share
+or a difference that is 0 for a perfect object. `Likeness` compares with the true object.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, Gaussians
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera
@@ -22,6 +26,10 @@ _REACH = 8
 """Pixels over which the inside lends its darkest tone to the rim."""
 _DARKER = 0.5
 """A fringe has less than this share of that tone."""
+_NEEDLE = 10.0
+"""A needle is longer than so many times its second axis."""
+_DIRECTIONS = 4000
+"""Directions that new views are chosen from: 3 degrees from one to the next."""
 
 
 def dark_fringe(rgb: Float32, alpha: Float32) -> Bool:
@@ -74,3 +82,95 @@ def change_elsewhere(scene: Gaussians, instance_id: int, camera: Camera, mask: B
         return 0.0
     before, after = (np.clip(render(some, camera).rgb, 0, 1) for some in (scene, rest))
     return float(np.abs(before - after)[elsewhere].mean())
+
+
+def needles(gaussians: Gaussians) -> Bool:
+    """[N] which Gaussians are more than ten times as long as they are wide; discs are none."""
+    _, second, longest = np.sort(gaussians.log_scales, axis=1).T
+    return np.asarray(longest - second > np.log(_NEEDLE))
+
+
+def cameras_beside(
+    cameras: Sequence[Camera], centre: Float64, radius: float, *, degrees: float = 35.0, count: int = 8
+) -> list[Camera]:
+    """Views of an object from directions that are so far off all directions it was seen from.
+
+    cameras: those that see the object, at least one. centre: [3] of the object, radius: of a sphere around it that
+    shows whole, world units. The new views stand at the median distance of the cameras, upright like these and with
+    their focal length. They are spread as far as the directions allow: each is the one farthest from those before,
+    the first the nearest to the mean direction. None where no direction is that far off.
+    """
+    seen = np.stack([camera.center - centre for camera in cameras])
+    distances = np.linalg.norm(seen, axis=1)
+    seen /= distances[:, None]
+    step = np.arange(_DIRECTIONS) + 0.5
+    polar, turn = np.arccos(1 - 2 * step / _DIRECTIONS), np.pi * (1 + np.sqrt(5)) * step
+    directions = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
+    off = np.degrees(np.arccos(np.clip((directions @ seen.T).max(axis=1), -1, 1)))
+    ring = directions[np.abs(off - degrees) < 2]
+    if not len(ring):
+        return []
+    chosen = [int((ring @ seen.mean(axis=0)).argmax())]
+    while len(chosen) < min(count, len(ring)):
+        chosen.append(int((ring @ ring[chosen].T).max(axis=1).argmin()))
+    up = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+    distance = max(float(np.median(distances)), 1.5 * radius)
+    focal = float(np.median([camera.fx for camera in cameras]))
+    return [_looking(centre, distance * ring[i], up, radius, focal) for i in chosen]
+
+
+def _looking(centre: Float64, offset: Float64, up: Float64, radius: float, focal: float) -> Camera:
+    """The camera at centre + offset that shows a sphere around `centre` whole."""
+    distance = float(np.linalg.norm(offset))
+    forward = -offset / distance
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:  # straight from above or below
+        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ (centre + offset)
+    half = int(np.ceil(focal * radius / np.sqrt(distance**2 - radius**2))) + 2
+    return Camera(2 * half, 2 * half, focal, focal, half, half, pose)
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How like the true object a reconstructed one looks; likenesses of several views are added up."""
+
+    error: float = 0.0
+    """Sum of the squared differences of colour, 0..1 a channel, where either of them is."""
+    channels: int = 0
+    """Number of such pixels times 3."""
+    both: int = 0
+    """Pixels that both cover by more than half."""
+    either: int = 0
+    """Pixels that at least one covers by more than half."""
+
+    @classmethod
+    def of(cls, rgb: Float32, alpha: Float32, true_rgb: Float32, true_alpha: Float32, counted: Bool) -> Likeness:
+        """One view. rgb, true_rgb: [H, W, 3] before black; alpha, true_alpha: [H, W]; counted: [H, W] pixels that
+        count. Colours are compared before white, in which a hole shows and so does a dark fringe."""
+        shown, real = alpha > 0.5, true_alpha > 0.5
+        union = (shown | real) & counted
+        before_white = np.clip(rgb + 1 - alpha[..., None], 0, 1) - (true_rgb + 1 - true_alpha[..., None])
+        error = float(np.square(before_white[union], dtype=np.float64).sum())
+        return cls(error, 3 * int(union.sum()), int((shown & real & counted).sum()), int(union.sum()))
+
+    def __add__(self, other: Likeness) -> Likeness:
+        return Likeness(
+            self.error + other.error,
+            self.channels + other.channels,
+            self.both + other.both,
+            self.either + other.either,
+        )
+
+    @property
+    def psnr(self) -> float:
+        """dB; 100 at most."""
+        return -10 * float(np.log10(max(self.error / max(self.channels, 1), 1e-10)))
+
+    @property
+    def iou(self) -> float:
+        """Of the two outlines; 1 where there is nothing to see."""
+        return self.both / self.either if self.either else 1.0

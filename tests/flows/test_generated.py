@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.errors import InputError
-from ss_flow.flows.generated import Room, RoomParams, generate, write_scene
+from ss_flow.flows.generated import Room, RoomParams, generate, renderer_of, write_scene
 from ss_flow.flows.generated.layout import MAX_OBJECTS, furnish
 from ss_flow.flows.generated.masks import DegradeParams, _touching, degrade
 from ss_flow.flows.generated.shapes import SHAPES, ball, box, can, turned_profile
@@ -46,6 +46,22 @@ def test_arrays_have_the_declared_shapes_and_types(room: Room) -> None:
     assert len(room.cameras) == 12 and len(room.held_out) == 3
     assert len(room.points) == len(room.point_colors) == len(room.point_ids)
     assert np.isfinite(room.depth).all() and room.depth.min() > 0.3 and room.depth.max() < 6
+
+
+def test_a_thing_alone_looks_as_it_does_in_the_room(room: Room) -> None:
+    renderer = renderer_of(SMALL)
+    ids = room.ids[0]
+    for instance in np.unique(ids[ids > 0]):
+        rgb, alpha, depth = renderer.alone(camera_of(room.cameras, 0), int(instance))
+        shown = ids == instance
+        np.testing.assert_array_equal(depth[shown], room.depth[0][shown])
+        np.testing.assert_array_equal(alpha[depth > 0] > 0, True)
+        # Where it does not show in the room something hides it, or it is not there.
+        assert ((depth == 0) | (depth >= room.depth[0]))[~shown].all()
+        solid = shown & (alpha == 1)
+        if solid.sum() > 50:
+            assert np.abs(255 * rgb - room.rgb[0])[solid].mean() < 4  # the sensor's noise, and edges of shadows
+        assert (rgb[alpha == 0] == 0).all() and (rgb <= alpha[..., None] + 1e-6).all()
 
 
 def test_depth_seen_from_one_view_agrees_with_depth_and_ids_of_the_others(room: Room) -> None:
