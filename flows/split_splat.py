@@ -35,6 +35,7 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         **({"registration": capture.registration} if capture.registration is not None else {}),
         "depth": capture.depths,
         "dense": found.points,
+        "visibility": found.visibility,
         "segment": found.masks,
         "propagate": found.pieces,
         "hierarchy": found.tree,
@@ -45,6 +46,7 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
     }
     void = params.evaluate.zero_is_void is not False
     if capture.truth is not None:
+        results["truth"] = capture.truth
         with labelled("split"):
             results["metrics_split"] = evaluate_masks(masks_split, capture.truth, found.tree, zero_is_void=void)
     results |= splat(capture, found, networks, params)

@@ -144,8 +144,8 @@ def _tell(document: dict[str, Any], out_folder: Path | None, out: Console) -> No
         out.print(table)
         if views := document["metrics"].get("novel_view"):
             out.print(
-                f"views that were kept back: PSNR {views['psnr']:.2f} dB, {views['psnr_colour_fitted']:.2f} with colours "
-                f"fitted to each view, SSIM {views['ssim']:.3f}"
+                f"views that were kept back: PSNR {views['psnr']:.2f} dB, {views['psnr_colour_fitted']:.2f} with "
+                f"colours fitted to each view, SSIM {views['ssim']:.3f}"
             )
     hits = sum(node["hit"] for node in document["nodes"])
     made = len(document["nodes"]) - hits

@@ -1,4 +1,4 @@
-"""Class-agnostic instance segmentation against ground truth: on the views' masks, and on points (spec 2.1).
+"""Class-agnostic instance segmentation against ground truth, on the masks of the views.
 
 Values are fractions. A match at 25 or 50 means an IoU strictly above 0.25 or 0.50.
 """
@@ -9,17 +9,7 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import (
-    Float32,
-    Float64,
-    Gaussians,
-    Hierarchy,
-    Int32,
-    LabelMap,
-    Metrics,
-    PointCloud,
-    PointLabels,
-)
+from ss_flow.tasks.artifacts import Float64, Hierarchy, Int32, LabelMap, Metrics
 from ss_flow.tasks.evaluate.contingency import Labels, contingency
 from ss_flow.tasks.evaluate.panoptic import (
     hungarian_miou,
@@ -28,79 +18,6 @@ from ss_flow.tasks.evaluate.panoptic import (
     under_segmentation,
     whole,
 )
-
-
-def ig_metrics(truth: Labels, predicted: Labels, *, compat_gap_bug: bool = False) -> dict[str, float]:
-    """The "IG protocol" (InstanceGaussian's evaluation; spec 2.1): best IoU of each true instance, not one-to-one.
-
-    truth: [N] instance of each point, negative = not annotated (such points are dropped for both sides).
-    predicted: [N] any integers; an "unlabelled" value is one more segment, as in the protocol.
-    compat_gap_bug: score the ids 0 .. (number of ids) - 1 instead of those that occur, as the published script does:
-        where ids have gaps, a missing one scores 0 and the highest are never looked at.
-    Returns miou, macc25, macc50. Raises InputError when no point is annotated.
-    """
-    annotated = truth >= 0
-    if not annotated.any():
-        raise InputError("The ground truth holds no annotated point; at least one instance is needed to evaluate.")
-    table = contingency(truth[annotated], predicted[annotated])
-    best = table.best_iou()
-    if compat_gap_bug:
-        by_id = dict(zip(table.truth_ids.tolist(), best.tolist(), strict=True))
-        best = np.array([by_id.get(i, 0.0) for i in range(len(best))])
-    return _summary(best)
-
-
-def transfer_nearest(
-    points: Float32, labels: Int32, targets: Float32, *, radius: float = 0.0, unlabelled: int = 0
-) -> Int32:
-    """Give every target the label of the point nearest to it (Euclidean).
-
-    points: [N, 3]; labels: [N]; targets: [M, 3], all in world units. radius: with a positive value, targets farther
-    than this from every point become `unlabelled`; 0 = no limit, as in the protocol. Returns [M].
-    Raises InputError when there is no point.
-    """
-    from scipy.spatial import cKDTree
-
-    if not len(points):
-        raise InputError("There is no labelled point to take labels from; a scene with at least one is needed.")
-    distance, nearest = cKDTree(points).query(targets)
-    result = labels[nearest].astype(np.int32)
-    if radius > 0:
-        result[distance > radius] = unlabelled
-    return result
-
-
-@task()
-def evaluate_points(
-    points: PointCloud,
-    labels: PointLabels,
-    truth_points: PointCloud,
-    truth: PointLabels,
-    *,
-    transfer_radius: float = 0.0,
-    compat_gap_bug: bool = False,
-) -> Metrics:
-    """Score labelled points (P_labeled) on the points of the ground truth, IG protocol (spec 2.1).
-
-    truth: label 0 = not annotated; the protocol's id i is label i + 1. transfer_radius: see `transfer_nearest`.
-    Returns miou, macc25, macc50. Raises InputError when nothing is annotated, or there is no point.
-    """
-    predicted = transfer_nearest(points.points, labels.label, truth_points.points, radius=transfer_radius)
-    return Metrics(ig_metrics(truth.label - 1, predicted, compat_gap_bug=compat_gap_bug))
-
-
-@task()
-def evaluate_gaussians(
-    scene: Gaussians,
-    truth_points: PointCloud,
-    truth: PointLabels,
-    *,
-    transfer_radius: float = 0.0,
-    compat_gap_bug: bool = False,
-) -> Metrics:
-    """Score labelled Gaussians, by their centres, as `evaluate_points` does points; no opacity counts (spec 2.1)."""
-    predicted = transfer_nearest(scene.means, scene.instance_id, truth_points.points, radius=transfer_radius)
-    return Metrics(ig_metrics(truth.label - 1, predicted, compat_gap_bug=compat_gap_bug))
 
 
 @task()
@@ -127,6 +44,17 @@ def evaluate_masks(
     Raises InputError when a view lacks its prediction, sizes differ, or nothing is annotated.
     """
     true_ids, ids = pooled(predicted, truth)
+    stuff = tree.node[tree.stuff] if tree is not None else None
+    return Metrics(segmentation_metrics(true_ids, ids, zero_is_void=zero_is_void, stuff=stuff))
+
+
+def segmentation_metrics(
+    true_ids: Labels, ids: Labels, *, zero_is_void: bool, stuff: Int32 | None = None
+) -> dict[str, float]:
+    """The measures of `evaluate_masks` on any elements: true and predicted id of each [N], 0 = none.
+
+    stuff: predicted ids that are stuff. Raises InputError when nothing is annotated.
+    """
     everything = contingency(true_ids, ids)
     ignored = None
     if zero_is_void:
@@ -138,27 +66,25 @@ def evaluate_masks(
     else:
         table = everything.without(truth=0, predicted=0)
     if not len(table.truth_ids):
-        raise InputError("The ground truth masks hold no instance; at least one view with one is needed to evaluate.")
+        raise InputError("The ground truth holds no instance; at least one is needed to evaluate.")
     quality = panoptic_quality(table, ignored)
     of_things = {}
-    if tree is not None:
-        stuff = np.isin(table.predicted_ids, tree.node[tree.stuff])
-        of_things["pq_things"] = panoptic_quality(table, stuff if ignored is None else stuff | ignored).pq
-    return Metrics(
-        {
-            **_summary(table.best_iou()),
-            "pq": quality.pq,
-            "sq": quality.sq,
-            "rq": quality.rq,
-            **of_things,
-            "hungarian_miou": hungarian_miou(table),
-            "whole": float(whole(table).mean()),
-            "over_segmentation": over_segmentation(table),
-            "under_segmentation": under_segmentation(table),
-            "num_truth": float(len(table.truth_ids)),
-            "num_predicted": float((everything.predicted_ids > 0).sum()),
-        }
-    )
+    if stuff is not None:
+        is_stuff = np.isin(table.predicted_ids, stuff)
+        of_things["pq_things"] = panoptic_quality(table, is_stuff if ignored is None else is_stuff | ignored).pq
+    return {
+        **summary(table.best_iou()),
+        "pq": quality.pq,
+        "sq": quality.sq,
+        "rq": quality.rq,
+        **of_things,
+        "hungarian_miou": hungarian_miou(table),
+        "whole": float(whole(table).mean()),
+        "over_segmentation": over_segmentation(table),
+        "under_segmentation": under_segmentation(table),
+        "num_truth": float(len(table.truth_ids)),
+        "num_predicted": float((everything.predicted_ids > 0).sum()),
+    }
 
 
 def pooled(predicted: tuple[LabelMap, ...], truth: tuple[LabelMap, ...]) -> tuple[Labels, Labels]:
@@ -181,7 +107,8 @@ def pooled(predicted: tuple[LabelMap, ...], truth: tuple[LabelMap, ...]) -> tupl
     return true_ids, np.concatenate([empty, *(by_name[m.name].ids.ravel() for m in truth)])
 
 
-def _summary(best: Float64) -> dict[str, float]:
+def summary(best: Float64) -> dict[str, float]:
+    """miou, macc25 and macc50 of the best IoU of each true instance [G]."""
     return {
         "miou": float(best.mean()),
         "macc25": float((best > 0.25).mean()),

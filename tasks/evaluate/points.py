@@ -1,0 +1,194 @@
+"""Class-agnostic instance segmentation against annotated points, as ScanNet is evaluated (spec 2.1).
+
+Two labellings are scored: the dense points after Split (P_labeled), and the Gaussians of the finished scene, by their
+centres. Each annotated point takes the label of the nearest of them. Values are fractions; a match at 25 or 50 means an
+IoU strictly above 0.25 or 0.50.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import (
+    Float32,
+    Gaussians,
+    InstanceMasks,
+    Int32,
+    LabelMap,
+    Metrics,
+    PointCloud,
+    PointLabels,
+    Visibility,
+)
+from ss_flow.tasks.evaluate.contingency import Contingency, Labels, contingency
+from ss_flow.tasks.evaluate.instances import segmentation_metrics, summary
+from ss_flow.tasks.evaluate.panoptic import average_precision
+
+_LEAST_POINTS = 100
+"""Instances and predictions with fewer points are left out of the average precision, as ScanNet's evaluation does."""
+_OVERLAPS = tuple(np.arange(50, 95, 5) / 100)
+"""IoU thresholds whose mean is AP in ScanNet's evaluation: 0.50 to 0.90."""
+
+
+@dataclass(frozen=True)
+class TruePoints:
+    """Annotated points of a scene."""
+
+    points: Float32
+    """[N, 3] world."""
+    instance: Int32
+    """[N] the instance of each, negative = not annotated."""
+
+
+@task(name="evaluate.lifted")
+def lifted(points: PointCloud, seen: Sequence[Visibility], truth: Sequence[LabelMap]) -> TruePoints:
+    """The ground truth of the views carried to the dense points: each view that sees a point votes for the id there.
+
+    seen: of every view. truth: ids of the annotated views, 0 = none. The most frequent id wins, the lowest of equals;
+    a point that no annotated view sees on an instance is not annotated. No mesh is needed, and so the points are those
+    of the capture, not of a scan.
+    """
+    by_name = {ids.name: ids for ids in truth}
+    pairs = [np.zeros((0, 2), np.int64)]
+    for view in range(len(seen)):
+        ids = by_name.get(seen[view].name)
+        if ids is not None:
+            at = ids.ids.ravel()[seen[view].pixel]
+            pairs.append(np.stack([seen[view].point_index, at], axis=1)[at > 0])
+    voted, votes = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
+    instance = np.full(len(points.points), -1, np.int32)
+    order = np.lexsort((-voted[:, 1], votes))  # the last one that is written stays
+    instance[voted[order, 0]] = voted[order, 1]
+    return TruePoints(points.points, instance)
+
+
+@task(name="evaluate.points")
+def evaluate_points(
+    points: PointCloud,
+    labels: PointLabels,
+    instances: Sequence[InstanceMasks],
+    truth: TruePoints,
+    *,
+    transfer_radius: float = 0.0,
+    compat_gap_bug: bool = False,
+) -> Metrics:
+    """Score the labelled points after Split on annotated ones; see `point_metrics`.
+
+    transfer_radius: see `transfer_nearest`. Raises InputError when nothing is annotated, or there is no point.
+    """
+    predicted = transfer_nearest(points.points, labels.label, truth.points, radius=transfer_radius)
+    return Metrics(point_metrics(truth.instance, predicted, _scores(instances), compat_gap_bug=compat_gap_bug))
+
+
+@task(name="evaluate.gaussians")
+def evaluate_gaussians(
+    scene: Gaussians,
+    instances: Sequence[InstanceMasks],
+    truth: TruePoints,
+    *,
+    transfer_radius: float = 0.0,
+    compat_gap_bug: bool = False,
+) -> Metrics:
+    """Score labelled Gaussians, by their centres, as `evaluate_points` does points; no opacity counts (spec 2.1)."""
+    predicted = transfer_nearest(scene.means, scene.instance_id, truth.points, radius=transfer_radius)
+    return Metrics(point_metrics(truth.instance, predicted, _scores(instances), compat_gap_bug=compat_gap_bug))
+
+
+def _scores(instances: Sequence[InstanceMasks]) -> dict[int, float]:
+    """How sure each instance is, for the average precision: mean confidence of its labels times the root of its views
+    (spec 2.1 a)."""
+    return {
+        one.instance_id: one.confidence * len(one.views) ** 0.5 for one in (instances[i] for i in range(len(instances)))
+    }
+
+
+def point_metrics(
+    truth: Labels, predicted: Labels, score: Mapping[int, float], *, compat_gap_bug: bool = False
+) -> dict[str, float]:
+    """All measures on points.
+
+    truth: [N] instance of each point, negative = not annotated. predicted: [N], 0 = unlabelled. score: how sure each
+    predicted instance is. compat_gap_bug: see `ig_metrics`.
+    Returns those of `ig_metrics`, ap, ap50, ap25, those of `segmentation_metrics` on the annotated points, annotated
+    (the share of the points that are), and id_gaps, 1 where the ids of the ground truth have gaps and so the published
+    script scores other instances. Raises InputError when no point is annotated.
+    """
+    together = ig_metrics(truth, predicted, compat_gap_bug=compat_gap_bug)
+    table = contingency(truth, predicted).without(predicted=0)
+    known = np.unique(truth[truth >= 0])
+    return {
+        **segmentation_metrics(np.maximum(truth + 1, 0), predicted, zero_is_void=True),
+        **together,
+        "ap": float(np.mean([scannet_ap(table, score, overlap) for overlap in _OVERLAPS])),
+        "ap50": scannet_ap(table, score, 0.5),
+        "ap25": scannet_ap(table, score, 0.25),
+        "annotated": float((truth >= 0).mean()),
+        "id_gaps": float(len(known) != known.max() + 1),
+    }
+
+
+def ig_metrics(truth: Labels, predicted: Labels, *, compat_gap_bug: bool = False) -> dict[str, float]:
+    """The "IG protocol" (InstanceGaussian's evaluation; spec 2.1): best IoU of each true instance, not one-to-one.
+
+    truth: [N] instance of each point, negative = not annotated (such points are dropped for both sides).
+    predicted: [N] any integers; an "unlabelled" value is one more segment, as in the protocol.
+    compat_gap_bug: score the ids 0 .. (number of ids) - 1 instead of those that occur, as the published script does:
+        where ids have gaps, a missing one scores 0 and the highest are never looked at.
+    Returns miou, macc25, macc50. Raises InputError when no point is annotated.
+    """
+    annotated = truth >= 0
+    if not annotated.any():
+        raise InputError("The ground truth holds no annotated point; at least one instance is needed to evaluate.")
+    table = contingency(truth[annotated], predicted[annotated])
+    best = table.best_iou()
+    if compat_gap_bug:
+        by_id = dict(zip(table.truth_ids.tolist(), best.tolist(), strict=True))
+        best = np.array([by_id.get(i, 0.0) for i in range(len(best))])
+    return summary(best)
+
+
+def scannet_ap(table: Contingency, score: Mapping[int, float], overlap: float) -> float:
+    """Class-agnostic average precision by ScanNet's rules (spec 2.1 a).
+
+    table: of all points, with the true label -1 where nothing is annotated, without predicted 0. Instances and
+    predictions of fewer than 100 points are left out. A prediction that meets no instance with an IoU above `overlap`
+    is no false positive when more than this share of it lies on what is not annotated or left out.
+    """
+    counted = (table.truth_ids >= 0) & (table.truth_area >= _LEAST_POINTS)
+    large = table.predicted_area >= _LEAST_POINTS
+    free = table.intersection[~counted].sum(axis=0) / np.maximum(table.predicted_area, 1)
+    kept = large & ((table.iou[counted] > overlap).any(axis=0) | (free <= overlap))
+    of_kept = Contingency(
+        table.truth_ids[counted],
+        table.predicted_ids[kept],
+        table.intersection[np.ix_(counted, kept)],
+        table.truth_area[counted],
+        table.predicted_area[kept],
+    )
+    confidence = np.array([score.get(int(i), 0.0) for i in of_kept.predicted_ids], np.float64)
+    return average_precision(of_kept, confidence, overlap)
+
+
+def transfer_nearest(
+    points: Float32, labels: Int32, targets: Float32, *, radius: float = 0.0, unlabelled: int = 0
+) -> Int32:
+    """Give every target the label of the point nearest to it (Euclidean).
+
+    points: [N, 3]; labels: [N]; targets: [M, 3], all in world units. radius: with a positive value, targets farther
+    than this from every point become `unlabelled`; 0 = no limit, as in the protocol. Returns [M].
+    Raises InputError when there is no point.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(points):
+        raise InputError("There is no labelled point to take labels from; a scene with at least one is needed.")
+    distance, nearest = cKDTree(points).query(targets)
+    result = labels[nearest].astype(np.int32)
+    if radius > 0:
+        result[distance > radius] = unlabelled
+    return result

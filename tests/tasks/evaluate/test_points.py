@@ -1,0 +1,191 @@
+"""Instances on annotated points: golden values, ScanNet's rules, ground truth lifted from views and read from files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from ss_flow.errors import InputError
+from ss_flow.running import Surroundings, running
+from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Gaussians, LabelMap, PointCloud, PointLabels, Visibility
+from ss_flow.tasks.evaluate.contingency import contingency
+from ss_flow.tasks.evaluate.points import (
+    TruePoints,
+    evaluate_gaussians,
+    evaluate_points,
+    ig_metrics,
+    lifted,
+    point_metrics,
+    scannet_ap,
+    transfer_nearest,
+)
+from ss_flow.tasks.evaluate.scannet import scannet_truth
+
+TRUTH = np.array([0, 0, 0, 0, 1, 1, 2, -1])
+PREDICTED = np.array([5, 5, 5, 7, 7, 7, 5, 9])
+
+
+def _cloud(points: np.ndarray) -> PointCloud:
+    return PointCloud(points.astype(np.float32), np.zeros((len(points), 3), np.uint8), 1.0, 0.1)
+
+
+def _labels(label: list[int]) -> PointLabels:
+    none = np.zeros(0, np.int32)
+    array = np.array(label, np.int32)
+    return PointLabels(array, np.ones(len(label), np.float32), 9, none, none, none, np.zeros(0, np.float32))
+
+
+def test_ig_protocol_gives_the_golden_values_e3() -> None:
+    values = ig_metrics(TRUTH, PREDICTED)
+    assert values["miou"] == pytest.approx((3 / 5 + 2 / 3 + 1 / 4) / 3)
+    assert values["miou"] == pytest.approx(0.50556, abs=1e-5)
+    assert values["macc25"] == pytest.approx(2 / 3), "an IoU of exactly 0.25 is no hit"
+    assert values["macc50"] == pytest.approx(2 / 3)
+
+
+def test_the_gap_bug_scores_the_missing_id_and_overlooks_the_highest() -> None:
+    truth = np.array([0, 0, 2, 2])
+    predicted = np.array([1, 1, 4, 4])
+    assert ig_metrics(truth, predicted)["miou"] == 1
+    assert ig_metrics(truth, predicted, compat_gap_bug=True)["miou"] == 0.5
+    assert ig_metrics(TRUTH, PREDICTED, compat_gap_bug=True) == ig_metrics(TRUTH, PREDICTED), "no gap, no difference"
+
+
+@given(
+    hnp.arrays(np.int64, 30, elements=st.integers(-1, 4)).filter(lambda x: (x >= 0).any()),
+    hnp.arrays(np.int64, 30, elements=st.integers(-1, 4)),
+    st.permutations(range(6)),
+)
+def test_renaming_predictions_and_shuffling_points_changes_nothing(
+    truth: np.ndarray, predicted: np.ndarray, names: list[int]
+) -> None:
+    expected = ig_metrics(truth, predicted)
+    assert ig_metrics(truth, np.array(names)[predicted + 1]) == pytest.approx(expected)
+    order = np.random.default_rng(0).permutation(30)
+    assert ig_metrics(truth[order], predicted[order]) == pytest.approx(expected)
+    assert 0 <= expected["macc50"] <= expected["macc25"] <= 1
+    assert ig_metrics(truth, truth)["miou"] == 1
+
+
+def test_points_without_annotation_are_refused() -> None:
+    with pytest.raises(InputError, match="no annotated point"):
+        ig_metrics(np.array([-1, -1]), np.array([0, 1]))
+
+
+def test_labels_go_to_the_nearest_target_and_no_farther_than_the_radius() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
+    targets = np.array([[0.4, 0, 0], [0.6, 0, 0], [9, 0, 0]], np.float32)
+    labels = np.array([3, 4], np.int32)
+    assert transfer_nearest(points, labels, targets).tolist() == [3, 4, 4]
+    assert transfer_nearest(points, labels, targets, radius=0.5).tolist() == [3, 4, 0]
+    with pytest.raises(InputError, match="no labelled point"):
+        transfer_nearest(points[:0], labels[:0], targets)
+
+
+def test_points_and_gaussians_are_scored_on_the_points_of_the_ground_truth() -> None:
+    place = np.arange(8)[:, None] * np.array([1.0, 0, 0])
+    shown = _cloud(place + np.array([0.01, 0, 0]))
+    truth = TruePoints(place.astype(np.float32), TRUTH.astype(np.int32))
+    expected = point_metrics(TRUTH, PREDICTED, {})
+    assert expected["miou"] == ig_metrics(TRUTH, PREDICTED)["miou"]
+    assert evaluate_points(shown, _labels(PREDICTED.tolist()), (), truth).values == expected
+    n = len(place)
+    scene = Gaussians(
+        shown.points,
+        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.zeros((n, 3), np.float32),
+        np.full(n, -9, np.float32),
+        np.zeros((n, 1, 3), np.float32),
+        PREDICTED.astype(np.int32),
+        np.ones(n, np.float32),
+        np.zeros(n, np.int32),
+    )
+    assert evaluate_gaussians(scene, (), truth).values == expected
+
+
+def test_the_annotated_share_and_gaps_of_the_ids_are_told() -> None:
+    assert point_metrics(TRUTH, PREDICTED, {})["annotated"] == 7 / 8
+    assert point_metrics(TRUTH, PREDICTED, {})["id_gaps"] == 0
+    assert point_metrics(np.array([0, 2]), np.array([1, 1]), {})["id_gaps"] == 1
+
+
+def _ap(truth: list[tuple[int, int, int]], score: dict[int, float], overlap: float) -> float:
+    """truth: (true id, predicted id, number of such points)."""
+    true, predicted, count = (np.array(column) for column in zip(*truth, strict=True))
+    table = contingency(np.repeat(true, count), np.repeat(predicted, count)).without(predicted=0)
+    return scannet_ap(table, score, overlap)
+
+
+def test_average_precision_follows_scannets_rules() -> None:
+    both = [(0, 5, 200), (1, 6, 200)]
+    assert _ap(both, {5: 1.0, 6: 0.5}, 0.5) == 1.0
+    # A false positive that is surer than one of two hits: precision 1, 1/2, 2/3 at recall 1/2, 1/2, 1.
+    wrong = [*both, (-1, 7, 40), (2, 7, 160), (2, 0, 300)]
+    assert _ap(wrong, {5: 1.0, 7: 0.8, 6: 0.5}, 0.5) == pytest.approx((1 + 2 / 3) / 3)
+    # What lies for more than the threshold on points without annotation is no false positive.
+    assert _ap([*both, (-1, 7, 160), (1, 7, 40)], {5: 1.0, 7: 2.0, 6: 0.5}, 0.5) == 1.0
+    # Instances and predictions of fewer than 100 points do not count; what lies on such an instance is ignored.
+    assert _ap([*both, (2, 8, 99), (0, 9, 30)], {5: 1.0, 6: 0.5, 8: 3.0, 9: 3.0}, 0.5) == 1.0
+    assert _ap([*both, (2, 8, 90), (-1, 8, 30)], {5: 1.0, 6: 0.5, 8: 3.0}, 0.5) == 1.0
+
+
+def test_points_take_the_id_that_most_of_the_views_give_them() -> None:
+    def seen(name: str, rows: list[int], pixels: list[int]) -> Visibility:
+        return Visibility(name, np.int32(rows), np.int32(pixels), np.ones(len(rows), np.float32), 1, 4)
+
+    views = [seen("a", [0, 1, 2], [0, 1, 3]), seen("b", [0, 1, 2], [0, 1, 2]), seen("c", [1], [0]), seen("d", [3], [0])]
+    truth = [
+        LabelMap(name, np.uint16([ids]))
+        for name, ids in (("a", [5, 6, 0, 0]), ("b", [5, 7, 0, 0]), ("c", [7, 0, 0, 0]))
+    ]
+    # Point 1: 6, 7, 7. Point 2: seen where nothing is annotated. Point 3: seen by a view without ground truth.
+    assert lifted(_cloud(np.zeros((4, 3))), views, truth).instance.tolist() == [5, 7, -1, -1]
+
+
+def _scan(folder: Path, groups: list[list[int]], finer: list[list[int]] | None = None) -> dict[str, FileRef]:
+    """Six vertices of segments 0, 0, 1, 1, 2, 3 in files as ScanNet has them."""
+    rows = "".join(f"{i} {2 * i} 0 1 2 3 255\n" for i in range(6))
+    (folder / "mesh.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 6\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nproperty uchar alpha\n"
+        f"element face 1\nproperty list uchar int vertex_indices\nend_header\n{rows}3 0 1 2\n"
+    )
+    (folder / "segs.json").write_text(json.dumps({"segIndices": [0, 0, 1, 1, 2, 3]}))
+    files = {"mesh": "mesh.ply", "segments": "segs.json", "aggregation": "own.json"}
+    for name, held in (("own.json", groups), ("finer.json", finer)):
+        if held is not None:
+            (folder / name).write_text(json.dumps({"segGroups": [{"id": 9, "segments": s} for s in held]}))
+    if finer is not None:
+        files["other"] = "finer.json"
+    return {name: FileRef(folder / file, file) for name, file in files.items()}
+
+
+def test_a_scans_annotation_is_read_by_groups_and_the_later_one_wins(tmp_path: Path) -> None:
+    truth = scannet_truth(**{"other": None, **_scan(tmp_path, [[0, 1], [1, 2]])})
+    assert truth.points.tolist() == [[i, 2 * i, 0] for i in range(6)]
+    assert truth.instance.tolist() == [0, 0, 1, 1, 1, -1]
+
+
+def test_annotations_that_disagree_are_told(tmp_path: Path) -> None:
+    heard: list[str] = []
+    with running(Surroundings(warned=heard)):
+        scannet_truth(**_scan(tmp_path, [[0, 1], [2]], finer=[[0], [2]]))
+    assert len(heard) == 1 and "33.3%" in heard[0]
+
+
+def test_damaged_annotations_are_named(tmp_path: Path) -> None:
+    files = {"other": None, **_scan(tmp_path, [[0]])}
+    files["segments"].path.write_text('{"segIndices": [0, 1]}')
+    with pytest.raises(InputError, match=r"2 segment indices .* 6 vertices"):
+        scannet_truth(**files)
+    files["aggregation"].path.write_text("{")
+    files["segments"].path.write_text('{"segIndices": [0, 0, 1, 1, 2, 3]}')
+    with pytest.raises(InputError, match="segGroups is expected"):
+        scannet_truth(**files)
