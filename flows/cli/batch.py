@@ -36,6 +36,7 @@ from ss_flow.flows.cli.prepare import (
     first_failure,
     header,
     prepare,
+    tell_remarks,
 )
 from ss_flow.flows.cli.telling import hits_of, plan_in_words, print_table, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
@@ -89,6 +90,7 @@ class Batch:
             if errors and not scenes and not ended:
                 first = next(iter(errors.values()))
                 raise InputError(first if len(errors) == 1 else f"no scene can be opened; of the first: {first}")
+            tell_remarks(scenes.values(), tell)
             with display(tell) as screen:
                 requests = [
                     Request(

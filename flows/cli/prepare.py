@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.store import Store
@@ -19,7 +20,7 @@ from ss_flow.events import Reporter
 from ss_flow.flows import settings
 from ss_flow.flows.capture import Capture, capture
 from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model
-from ss_flow.flows.deliver import deliver, run_document
+from ss_flow.flows.deliver import deliver, run_document, weight_free
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
 from ss_flow.flows.split_splat import LEADS_TO, split_splat
@@ -155,6 +156,13 @@ def prepare(
         return results if target in (None, *results) else results | {target: _until(target, results)}
 
     return Prepared(scene, params, networks, build)
+
+
+def tell_remarks(scenes: Iterable[Prepared], out: Console) -> None:
+    """Print what is to be said of runs before they begin, once."""
+    for remark in {weight_free(one.scene, one.params, one.networks): None for one in scenes}:
+        if remark is not None:
+            out.print(f"[yellow]warning[/] {escape(remark)}")
 
 
 def _until(step: str, results: Mapping[str, Any]) -> Any:

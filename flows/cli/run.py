@@ -15,7 +15,7 @@ from rich.table import Table
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import OptionalPath, console, file_digests
-from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare
+from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare, tell_remarks
 from ss_flow.flows.cli.telling import hits_of, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
@@ -97,6 +97,7 @@ def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions,
             place = out if options.delivers else None
             documents.append(finish(prepared, report, store, place, undistorted=undistorted))
 
+    tell_remarks([prepared], console_out)
     try:
         with display(console_out) as screen:
             request = Request(prepared.build, prepared.name, header(prepared, options), options.target, screen, done)
@@ -134,19 +135,17 @@ def _tell_plan(report: Report, out: Console, *, json_wanted: bool) -> int:
 def _tell(document: dict[str, Any], out_folder: Path | None, out: Console) -> None:
     for failure in document["failures"]:
         out.print(f"[red]failed[/] {escape(failure['label'])}: {escape(failure['error'])}")
-    if document["metrics"]:
+    if rows := [(stage, row) for stage in ("split", "splat") if (row := document["metrics"].get(stage))]:
         table = Table("measured against the ground truth", "mIoU", "mAcc(25)", "mAcc(50)", "PQ", box=None)
-        for stage in ("split", "splat"):
-            if row := document["metrics"].get(stage):
-                table.add_row(
-                    f"after {stage.title()}", *(f"{100 * row[k]:.1f}" for k in ("miou", "macc25", "macc50", "pq"))
-                )
+        for stage, row in rows:
+            figures = (f"{100 * row[name]:.1f}" for name in ("miou", "macc25", "macc50", "pq"))
+            table.add_row(f"after {stage.title()}", *figures)
         out.print(table)
-        if views := document["metrics"].get("novel_view"):
-            out.print(
-                f"views that were kept back: PSNR {views['psnr']:.2f} dB, {views['psnr_colour_fitted']:.2f} with "
-                f"colours fitted to each view, SSIM {views['ssim']:.3f}"
-            )
+    if views := document["metrics"].get("novel_view"):
+        out.print(
+            f"views that were kept back: PSNR {views['psnr']:.2f} dB, {views['psnr_colour_fitted']:.2f} with "
+            f"colours fitted to each view, SSIM {views['ssim']:.3f}"
+        )
     hits = sum(node["hit"] for node in document["nodes"])
     made = len(document["nodes"]) - hits
     place = f"; see {out_folder}" if out_folder else ""

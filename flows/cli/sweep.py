@@ -31,6 +31,7 @@ from ss_flow.flows.cli.prepare import (
     first_failure,
     header,
     prepare,
+    tell_remarks,
 )
 from ss_flow.flows.cli.sweep_report import holds_other, in_short, tell_plan, tell_rows, write_files
 from ss_flow.flows.deliver import STATUS_EXIT
@@ -112,6 +113,7 @@ class Sweep:
                 if not options.dry_run:
                     found[position] = _found(variants[position].prepared, report, store)
 
+            tell_remarks((variant.prepared for variant in variants), tell)
             with display(tell) as screen:
                 requests = [
                     Request(

@@ -53,10 +53,10 @@ def report_html(
 ) -> str:
     """The report of a run.
 
-    run: the document of run.json ("status", "scene", "params", "models", "metrics", "nodes", "failures"; any may be
-    missing). pictures: each [H, W, 3] RGB or the bytes of a PNG or JPEG, under "view/kind" with the kinds photo,
-    masks_split, masks, render, depth, which are shown in one row a view; any other name is the picture's caption.
-    instances: the document of instances.json.
+    run: the document of run.json ("status", "scene", "params", "models", "metrics", "nodes", "warnings", "failures";
+    any may be missing). pictures: each [H, W, 3] RGB or the bytes of a PNG or JPEG, under "view/kind" with the kinds
+    photo, masks_split, masks, render, depth, which are shown in one row a view; any other name is the picture's
+    caption. instances: the document of instances.json.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -73,7 +73,7 @@ def report_html(
         metrics=_metrics(run.get("metrics") or {}),
         params=_flat(run.get("params") or {}),
         failures=[_failure(failure) for failure in run.get("failures") or ()],
-        warnings=list(dict.fromkeys(text for node in nodes for text in node.get("warnings") or ())),
+        warnings=run.get("warnings") or (),
         steps=_steps(nodes),
         hits=sum(bool(node.get("hit")) for node in nodes),
         misses=sum(not node.get("hit") for node in nodes),

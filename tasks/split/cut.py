@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Hierarchy, Int32, PointLabels, PointParts
 
 _WEAKEST = 2 / 3
 """Share of the granularity that each union below an instance must exceed: views that see all of an instance make up for
 those that doubt some of its unions, but not for those that deny them."""
+_MOST = 0.5
+"""Share of the labelled points above which a single instance is warned of."""
 
 
 @task(name="split.cut")
@@ -21,9 +24,11 @@ def cut(labels: PointLabels, tree: Hierarchy, *, granularity: float) -> PointLab
     labels: those that are the leaves of the tree. granularity: pieces on which the views agree more than this are one
     instance (0..1); the highest such node counts, as long as no union in it has less than two thirds of that. So 1
     leaves the labels as they are, and lower values give things, then groups of things. Ids are those of the nodes.
+    Warns of an instance that gets more than half of the labelled points.
     """
     instance = instances_of(tree, labels.num_labels, granularity)
     highest = max(labels.num_labels, int(tree.node.max(initial=0)))
+    _warn_of_largest(instance[labels.label])
     return replace(labels, label=instance[labels.label], match_label=instance[labels.match_label], num_labels=highest)
 
 
@@ -42,6 +47,17 @@ def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) ->
         rows = np.flatnonzero(found[:, 0] == name)
         number[rows[np.argsort(-size[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
     return PointParts(number[row].astype(np.int32))
+
+
+def _warn_of_largest(label: Int32) -> None:
+    size = np.bincount(label[label > 0], minlength=1)
+    largest = int(size.argmax())
+    if size[largest] > _MOST * size.sum():
+        warn(
+            f"Instance {largest} holds {size[largest] / size.sum():.0%} of the labelled points. Unless it is one thing "
+            "that fills the scene, its masks show several things as one: raise split.granularity "
+            "(--set split.granularity=0.7), or give masks (--masks) or clicked points (--hints)."
+        )
 
 
 def instances_of(tree: Hierarchy, num_labels: int, granularity: float) -> Int32:

@@ -1,11 +1,12 @@
 """Whether Splat makes the masks of a capture better or worse, object by object.
 
     python tests/bench/bench_masks.py CAPTURE [--labels FOLDER] [--preset fast] [--set STEP.PARAM=VALUE] [--store DIR]
+                                      [--split]
 
 Prints, for each object of the labels, the best IoU of any mask with it, mean over the labelled views: of the view's own
 masks (raw), then of the instances' after Split, after refinement, and in the end; and the most that a view loses from
-Split to the end. Labels are one-channel PNG files named like the
-frames, 0 where nothing is said; the capture's `instance` folder if not told otherwise.
+Split to the end. Labels are one-channel PNG files named like the frames, 0 where nothing is said; the capture's
+`instance` folder if not told otherwise. --split stops after Split.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,16 +31,18 @@ from ss_flow.tasks.capture.scene import open_scene
 STAGES = ("segment", "masks_split", "masks_refined", "masks")
 
 
-def masks_of(folder: Path, params: Params, store: Store) -> list[list[MaskSet | LabelMap]]:
+def masks_of(
+    folder: Path, params: Params, store: Store, stages: Sequence[str] = STAGES
+) -> list[list[MaskSet | LabelMap]]:
     """The masks of all views, at each stage."""
     prepared = prepare(open_scene(folder), params, RunOptions(), file_digests(store))
 
     def build() -> dict[str, object]:
         results = prepared.build()
-        return {stage: results[stage] for stage in STAGES}
+        return {stage: results[stage] for stage in stages}
 
     values = run_flow(build, store, scene=prepared.name, header={}).values
-    return [[store.get(digest) for digest in values[stage]] for stage in STAGES]
+    return [[store.get(digest) for digest in values[stage]] for stage in stages]
 
 
 def best_iou(masks: MaskSet | LabelMap, truth: np.ndarray) -> float:
@@ -73,12 +77,15 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--store", type=Path, help="a store to keep")
+    parser.add_argument("--split", action="store_true", help="stop after Split")
     args = parser.parse_args()
     params = settings.apply(settings.preset(Params(), args.preset), args.set)
     with tempfile.TemporaryDirectory() as temporary:
-        stages = masks_of(args.capture, params, Store(args.store or Path(temporary)))
+        asked = STAGES[:2] if args.split else STAGES
+        stages = masks_of(args.capture, params, Store(args.store or Path(temporary)), asked)
         table = by_object(stages, args.labels or args.capture / "instance")
-    print("| object | views | raw | Split | refined | final | worst view |\n" + "|---" * 7 + "|")
+    columns = ("object", "views", *("raw", "Split", "refined", "final")[: len(asked)], "worst view")
+    print(f"| {' | '.join(columns)} |\n" + "|---" * len(columns) + "|")
     for name, rows in table.items():
         mean = " | ".join(f"{100 * value:.1f}" for value in rows.mean(axis=0))
         print(f"| {name} | {len(rows)} | {mean} | {100 * (rows[:, -1] - rows[:, 1]).min():+.1f} |")

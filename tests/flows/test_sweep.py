@@ -201,8 +201,8 @@ def test_words_for_people_hold_a_table_and_where_the_files_are(warm, tmp_path):
     told = ss_flow("sweep", warm.scene, *options, *SHORT, "--set", "tau_label=0.7,0.71", "--metric", "splat.pq")
     assert told.code == 0, told.err
     lines = [line.split() for line in told.out.splitlines()]
-    assert ["tau_label", "pq", "reused", "computed", "seconds"] in lines
-    assert [line[0] for line in lines[2:4]] == ["0.7", "0.71"]
+    head = lines.index(["tau_label", "pq", "reused", "computed", "seconds"])
+    assert [line[0] for line in lines[head + 1 : head + 3]] == ["0.7", "0.71"]
     assert told.out.splitlines()[-1] == f"see {tmp_path / 'swept'}: sweep.json, sweep.csv, sweep.png"
 
 

@@ -101,9 +101,10 @@ def test_of_a_scenes_place_only_its_name_is_shown():
 
 
 def test_warnings_are_told_once():
-    nodes = [{"step": "capture.registration", "warnings": ["Depth <does> not fit."]}] * 2
-    assert report_html({"nodes": nodes}, pictures={}).count("Depth &lt;does&gt; not fit.") == 1
-    assert "Warnings" not in report_html({"nodes": [{"step": "capture.registration", "warnings": []}]}, pictures={})
+    warnings = [{"label": "capture.registration", "text": "Depth <does> not fit."}]
+    html = report_html({"warnings": warnings}, pictures={})
+    assert html.count("Depth &lt;does&gt; not fit.") == 1 and "(capture.registration)" in html
+    assert "Warnings" not in report_html({"warnings": []}, pictures={})
 
 
 def test_failures_by_label_are_told():
