@@ -73,7 +73,7 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
     return {
         "status": status,
         "warnings": [{"label": label, "text": text} for text, label in warnings.items()],
-        "scene": str(scene.root),
+        "scene": str(scene.place),
         "params": settings.flat(params),
         "models": models,
         "metrics": {

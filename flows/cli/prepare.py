@@ -110,7 +110,7 @@ class Prepared:
     @property
     def name(self) -> str:
         """What its runs are recorded as."""
-        return str(self.scene.root.resolve())
+        return str(self.scene.place.resolve())
 
     def steps(self) -> list[str]:
         """The names of the DAG's results. Raises InputError as `build` does."""

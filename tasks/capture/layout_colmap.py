@@ -16,6 +16,7 @@ from ss_flow.tasks.capture.scene_files import (
     SceneFiles,
     check_lens,
     check_rigid,
+    files_in,
     natural_key,
     read_text,
 )
@@ -64,6 +65,8 @@ def open_colmap(root: Path) -> SceneFiles:
     for view in views:
         if view.camera not in lenses:
             raise InputError(f"{folder} has no camera {view.camera}, which its image {view.file_name} refers to.")
+    registered = set(photos)
+    unregistered = [p for place in sorted({p.parent for p in photos}) for p in files_in(place) if p not in registered]
     sparse = next((p for p in (folder / "points3D.bin", folder / "points3D.txt") if p.is_file()), None)
     return SceneFiles(
         kind="colmap",
@@ -74,6 +77,7 @@ def open_colmap(root: Path) -> SceneFiles:
         lenses=tuple(lenses[v.camera] for v in views),
         poses=tuple(v.pose for v in views),
         sparse=sparse,
+        skipped=tuple(p.stem for p in unregistered),
     )
 
 

@@ -34,7 +34,7 @@ def open_scene(path: Path, masks: Path | None = None, hints: Path | None = None)
     Raises InputError when nothing is recognised, or a file that the layout needs is missing or makes no sense, or masks
     are given in two ways.
     """
-    scene = _open_layout(path)
+    scene = replace(_open_layout(path), opened=path)
     if scene.kind != "video":
         _check_files(scene)
     in_folder = path.is_dir() and scene.kind != "video"

@@ -57,6 +57,8 @@ class SceneFiles:
     root: Path
     name: str
     """Name of the folder, or the file's stem."""
+    opened: Path | None = None
+    """What the user named: the folder, or the video or JSON file in it."""
     names: tuple[str, ...] = ()
     """Name of each view; unique. Empty for a video, whose frames are chosen later."""
     photos: tuple[Path, ...] = ()
@@ -90,6 +92,11 @@ class SceneFiles:
     """Whether 0 in them means "not annotated"; otherwise it is background."""
     skipped: tuple[str, ...] = ()
     """Views of the capture that are left out, for lack of a photo, a pose or a depth map."""
+
+    @property
+    def place(self) -> Path:
+        """What its runs are recorded under."""
+        return self.opened or self.root
 
     @property
     def has_masks(self) -> bool:

@@ -189,3 +189,19 @@ def test_frames_of_a_transforms_json_whose_photo_is_missing_are_left_out_with_a_
     files = tuple(FileRef(photo, "") for photo in scene.photos)
     with pytest.warns(UserWarning, match="1 view is left out, without a photo, a pose or a depth map: 10."):
         ingest.frames(names=scene.names, photos=files, lenses=scene.lenses, skipped=scene.skipped)
+
+
+def test_photos_that_a_colmap_model_did_not_register_are_skipped_by_name(tmp_path):
+    assert open_scene(made.colmap(tmp_path / "all")).skipped == ()
+    scene = open_scene(made.colmap(tmp_path / "some", registered=2))
+    assert scene.names == tuple(made.NAMES[:2])
+    assert scene.skipped == tuple(made.NAMES[2:])
+
+
+def test_runs_of_a_file_are_recorded_under_it_and_those_of_a_folder_under_the_folder(tmp_path):
+    video = made.video(tmp_path / "a.avi", count=4)
+    assert open_scene(video).place == video
+    assert open_scene(tmp_path).place == tmp_path
+    folder = made.nerfstudio(tmp_path / "posed")
+    assert open_scene(folder / "transforms.json").place == folder / "transforms.json"
+    assert open_scene(folder).place == folder
