@@ -1,0 +1,124 @@
+"""`ss-flow export`: a finished run in other formats."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.markup import escape
+
+from ss_flow.cache.files import write_atomically
+from ss_flow.engine import Report, Request, run_flows
+from ss_flow.errors import InputError
+from ss_flow.flows import export as formats
+from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.finished import FinishedRun, open_run
+from ss_flow.flows.cli.prepare import display
+from ss_flow.flows.deliver import STATUS_EXIT
+from ss_flow.resolution import Failure
+from ss_flow.tasks.deliver.output import check_writable, replacing
+
+MANIFEST = "export.json"
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a result, or some of its instances, in another format."""
+
+    result: Annotated[Path, tyro.conf.Positional]
+    """The output folder of a run."""
+    format: formats.Format
+    """What to write; docs/export.md tells what each format carries and what it loses."""
+    instance: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An instance by id or name, 0 = the background; may be given several times. All when left out."""
+    each: bool = False
+    """A file for each instance, in a folder with export.json; so are mesh-ply and mesh-obj at all times."""
+    holes: Literal["open", "closed"] = "open"
+    """For meshes: "closed" closes by a guess what no view shows."""
+    out: Path | None = None
+    """The file or folder to write; by default ss-flow-export/NAME of the result, with the format's suffix."""
+    jobs: int = 0
+    """How many tasks may run at once; 0 = one a core."""
+    json: bool = False
+    """Print one JSON document."""
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        run = open_run(self.result, self.store, ("scene", "cameras"))
+        several = self.each or self.format in formats.MESHES
+        surfaces = self.format.startswith("mesh-")
+        if self.holes != "open" and not surfaces:
+            raise InputError(f"--holes {self.holes} is for meshes; {self.format} holds Gaussians.")
+        if self.jobs < 0:
+            raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
+        ids = run.ids(self.instance) if self.instance else run.all_ids() if several or surfaces else None
+        out = self.out or Path("ss-flow-export") / (run.name + ("" if several else formats.suffix_of(self.format)))
+        _check_place(out, folder=several)
+
+        def build() -> dict[str, Any]:
+            source = formats.Source(run.node("scene"), run.node("cameras"), run.names, ids)
+            if several:
+                return formats.a_file_each(source, self.format, self.holes)
+            return {"file": formats.one_file(source, self.format, self.holes)}
+
+        written: list[dict[str, Any]] = []
+
+        def done(report: Report) -> None:
+            written[:] = self._write(out, run, report, ids)
+
+        with display(console(json=self.json)) as screen:
+            request = Request(build, run.document["scene"], reporter=screen, done=done)
+            (report,) = run_flows([request], run.store, jobs=self.jobs, recorded=False)
+        return self._tell(out, report, written)
+
+    def _write(self, out: Path, run: FinishedRun, report: Report, ids: tuple[int, ...] | None) -> list[dict[str, Any]]:
+        """Write what came out; returns what each file is."""
+        good = {name: value for name, value in report.values.items() if isinstance(value, str)}
+        if not good and report.failures:
+            raise report.failures[0].error
+        if "file" in good:
+            content = run.store.get(good["file"]).content.tobytes()
+            write_atomically(out, content)
+            return [{"file": out.name, "instances": None if ids is None else list(ids), "bytes": len(content)}]
+        files = []
+        with replacing(out) as filling:
+            for name, value in good.items():
+                content = run.store.get(value).content.tobytes()
+                file = f"{int(name):04d}{formats.suffix_of(self.format)}"
+                (filling / file).write_bytes(content)
+                called = run.names.get(name, "background")
+                files.append({"file": file, "instances": [int(name)], "name": called, "bytes": len(content)})
+            manifest = {"result": str(run.folder), "format": self.format, "files": files}
+            (filling / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        return files
+
+    def _tell(self, out: Path, report: Report, files: list[dict[str, Any]]) -> int:
+        status = "degraded" if any(isinstance(value, Failure) for value in report.values.values()) else "ok"
+        failures = [{"label": f.label, "error": f"{type(f.error).__name__}: {f.error}"} for f in report.failures]
+        warnings = sorted({w for node in report.nodes for w in node.get("warnings") or ()})
+        if self.json:
+            document = {"status": status, "format": self.format, "out": str(out), "files": files}
+            print(json.dumps({**document, "warnings": warnings, "failures": failures}))
+            return STATUS_EXIT[status]
+        words = console(json=False)
+        for failure in failures:
+            words.print(f"[red]failed[/] {escape(failure['label'])}: {escape(failure['error'])}")
+        size = sum(file["bytes"] for file in files) / 1e6
+        words.print(escape(f"{status}: {out} ({self.format}, {len(files)} files, {size:.1f} MB)"))
+        return STATUS_EXIT[status]
+
+
+def _check_place(out: Path, *, folder: bool) -> None:
+    """Raises InputError unless the export can be written here: a new place, or that of an earlier export."""
+    if folder and out.exists():
+        if not out.is_dir():
+            raise InputError(f"{out} is a file; this export is a folder, so --out must name one.")
+        if any(out.iterdir()) and not (out / MANIFEST).is_file():
+            raise InputError(f"{out} holds something else than an earlier export; name another folder with --out.")
+    if not folder and out.is_dir():
+        raise InputError(f"{out} is a folder; this export is a file, so --out must name one.")
+    check_writable(out.parent)

@@ -1,0 +1,153 @@
+"""The surface of an instance as triangles: its rendered depth, fused (Curless and Levoy 1996) and cut at zero."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ss_flow.running import progress, warn
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Cameras, Float32, Gaussians, Int32, UInt8
+from ss_flow.tasks.gaussians.rasterize import backend_identity
+from ss_flow.tasks.gaussians.render import Rendering, render
+from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, project
+from ss_flow.tasks.geometry.open3d import load_open3d
+
+_CELLS = 128
+"""Cells along the longest side of an instance's box."""
+_TRUNCATION = 4
+"""Cells on either side of a surface that hold its distance."""
+_SOLID = 0.5
+"""Alpha from which a pixel has a depth."""
+_PICTURE = 320
+"""Longest side of a rendering, pixels."""
+_MARGIN = 0.06
+_STRAY = 0.005
+"""Share of the Gaussians at each end of each axis that may lie outside the box."""
+_SMALLEST_PIECE = 0.05
+"""Share of the largest piece's triangles below which another piece is taken for floating debris."""
+_POISSON_DEPTH = 7
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Coloured triangles."""
+
+    instance_id: int
+    vertices: Float32
+    """[V, 3] world."""
+    colors: UInt8
+    """[V, 3] RGB."""
+    triangles: Int32
+    """[T, 3] rows of `vertices`, anticlockwise from outside."""
+    watertight: bool
+    """Whether it is closed, has no edge of three triangles and does not cut itself."""
+
+
+@task(
+    name="deliver.export.mesh",
+    resources=Resources(cores=1, memory_mb=700),
+    environment=backend_identity,
+)
+def mesh(own: Gaussians, cameras: Cameras, *, instance_id: int, holes: Literal["open", "closed"]) -> TriangleMesh:
+    """The surface of one instance as the input views would see it if it stood alone.
+
+    own: its Gaussians only.
+    holes: "open" leaves open what no view shows; "closed" puts a Poisson surface (Kazhdan and Hoppe 2013) through the
+    fused one, which closes it by a guess. Colours are those that the views see, averaged.
+    """
+    views = [view for view in (_framed(own, camera) for camera in cameras_by_view(cameras)) if view is not None]
+    if not views:
+        warn(f"instance {instance_id} has no Gaussian that an input view sees; its mesh is empty")
+        return _empty(instance_id)
+    o3d = load_open3d()
+    low, high = np.quantile(own.means.astype(np.float64), (_STRAY, 1 - _STRAY), axis=0)
+    side = max(float((high - low).max()) * (1 + 2 * _MARGIN), 1e-6)
+    volume = o3d.pipelines.integration.UniformTSDFVolume(
+        length=side,
+        resolution=_CELLS,
+        sdf_trunc=_TRUNCATION * side / _CELLS,
+        color_type=o3d.pipelines.integration.TSDFVolumeColorType.RGB8,
+        origin=((low + high) / 2 - side / 2)[:, None],
+    )
+    for done, view in enumerate(views):
+        progress(done, len(views), f"instance {instance_id}")
+        _fuse(o3d, volume, render(own, view), view)
+    surface = volume.extract_triangle_mesh()
+    _drop_debris(surface)
+    if not len(surface.triangles):
+        warn(f"instance {instance_id} is nowhere solid enough for a surface; its mesh is empty")
+        return _empty(instance_id)
+    if holes == "closed":
+        surface = _closed(o3d, surface)
+    return TriangleMesh(
+        instance_id,
+        np.asarray(surface.vertices, np.float32),
+        np.rint(255 * np.clip(np.asarray(surface.vertex_colors), 0, 1)).astype(np.uint8),
+        np.asarray(surface.triangles, np.int32),
+        bool(surface.is_watertight()),
+    )
+
+
+def _empty(instance_id: int) -> TriangleMesh:
+    none = np.zeros((0, 3))
+    return TriangleMesh(
+        instance_id, none.astype(np.float32), none.astype(np.uint8), none.astype(np.int32), watertight=False
+    )
+
+
+def _framed(own: Gaussians, camera: Camera) -> Camera | None:
+    """A view that the instance fills; None where most of it is behind the camera."""
+    if not len(own):
+        return None
+    uv, depth = project(own.means, camera)
+    before = depth > 0
+    if before.mean() < 0.5:
+        return None
+    low, high = np.quantile(uv[before], (_STRAY, 1 - _STRAY), axis=0)
+    border = 0.08 * max(float((high - low).max()), 1.0)
+    scale = _PICTURE / (float((high - low).max()) + 2 * border)
+    larger = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    x0, y0 = np.floor((low - border) * scale).astype(int).tolist()
+    x1, y1 = np.ceil((high + border) * scale).astype(int).tolist()
+    return larger.cropped(x0, y0, x1, y1)
+
+
+def _fuse(o3d: Any, volume: Any, seen: Rendering, view: Camera) -> None:
+    """Add a rendering's expected depth and colours to the volume."""
+    alpha = np.maximum(seen.alpha, 1e-6)
+    depth = np.where(seen.alpha > _SOLID, seen.depth / alpha, 0).astype(np.float32)
+    colors = np.rint(255 * (seen.rgb / alpha[..., None]).clip(0, 1)).astype(np.uint8)
+    image = o3d.geometry.RGBDImage.create_from_color_and_depth(
+        o3d.geometry.Image(np.ascontiguousarray(colors)),
+        o3d.geometry.Image(np.ascontiguousarray(depth)),
+        depth_scale=1.0,
+        depth_trunc=float(depth.max()) + 1,
+        convert_rgb_to_intensity=False,
+    )
+    # Open3D's pixel centres are whole numbers.
+    lens = (view.width, view.height, view.fx, view.fy, view.cx - 0.5, view.cy - 0.5)
+    volume.integrate(
+        image,
+        o3d.camera.PinholeCameraIntrinsic(*lens),
+        np.ascontiguousarray(view.world_to_camera),
+    )
+
+
+def _drop_debris(surface: Any) -> None:
+    pieces, sizes, _ = surface.cluster_connected_triangles()
+    counts = np.asarray(sizes)
+    if len(counts):
+        small = counts < _SMALLEST_PIECE * counts.max()
+        surface.remove_triangles_by_mask(small[np.asarray(pieces)])
+        surface.remove_unreferenced_vertices()
+
+
+def _closed(o3d: Any, surface: Any) -> Any:
+    surface.compute_vertex_normals()
+    points = o3d.geometry.PointCloud(surface.vertices)
+    points.normals, points.colors = surface.vertex_normals, surface.vertex_colors
+    whole, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(points, depth=_POISSON_DEPTH, n_threads=1)
+    return whole

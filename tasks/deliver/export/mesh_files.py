@@ -1,0 +1,76 @@
+"""Meshes as files: PLY and OBJ with an object each, glTF with a node for each object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Cameras
+from ss_flow.tasks.deliver.export.content import FileContent
+from ss_flow.tasks.deliver.export.gltf import Buffer, glb, node_of, scene_of
+from ss_flow.tasks.deliver.export.mesh import TriangleMesh
+
+_VERTEX_DATA, _INDICES = 34962, 34963
+_FLOAT, _UNSIGNED = 5126, 5125
+
+
+@task(name="deliver.export.mesh_ply")
+def mesh_ply(mesh: TriangleMesh) -> FileContent:
+    """A binary PLY file: x y z, red green blue, triangles."""
+    vertices = np.zeros(len(mesh.vertices), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertices["xyz"], vertices["rgb"] = mesh.vertices, mesh.colors
+    faces = np.zeros(len(mesh.triangles), [("corners", "u1"), ("rows", "<i4", 3)])
+    faces["corners"], faces["rows"] = 3, mesh.triangles
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment instance_id {mesh.instance_id}",
+        f"element vertex {len(vertices)}",
+        *(f"property float {name}" for name in "xyz"),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
+    return FileContent.of("\n".join(header).encode("ascii"), vertices.tobytes(), faces.tobytes())
+
+
+@task(name="deliver.export.mesh_obj")
+def mesh_obj(mesh: TriangleMesh, *, name: str) -> FileContent:
+    """An OBJ file; colours stand behind the coordinates (0..1), where most readers find them."""
+    lines = [f"o {name}"]
+    colors = np.round(mesh.colors / 255, 4)
+    lines += [
+        "v %.7g %.7g %.7g %g %g %g" % row for row in zip(*mesh.vertices.T.tolist(), *colors.T.tolist(), strict=True)
+    ]
+    lines += ["f %d %d %d" % tuple(row) for row in (mesh.triangles + 1).tolist()]
+    return FileContent.of("\n".join(lines).encode(), b"\n")
+
+
+@task(name="deliver.export.mesh_glb")
+def mesh_glb(meshes: tuple[TriangleMesh, ...], cameras: Cameras, *, names: Mapping[str, str]) -> FileContent:
+    """A .glb file with a node for each mesh that has triangles; names: of the instances, by their ids as text."""
+    buffer, nodes, entries = Buffer(), [], []
+    # Colours are those of the photos: the material is not to be lit, and glTF's colours are linear.
+    for mesh in (mesh for mesh in meshes if len(mesh.triangles)):
+        display = mesh.colors / 255
+        linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+        attributes = {
+            "POSITION": buffer.add(mesh.vertices.astype("<f4"), _VERTEX_DATA, ends=True),
+            "COLOR_0": buffer.add(linear.astype("<f4"), _VERTEX_DATA),
+        }
+        indices = buffer.add(mesh.triangles.astype("<u4").ravel(), _INDICES, _UNSIGNED)
+        entries.append({"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]})
+        nodes.append(node_of(mesh.instance_id, names, len(entries) - 1))
+    if not entries:
+        return glb(scene_of([], cameras), buffer)
+    material = {
+        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+        "doubleSided": True,
+        "extensions": {"KHR_materials_unlit": {}},
+    }
+    document = {"extensionsUsed": ["KHR_materials_unlit"], "meshes": entries, "materials": [material]}
+    return glb({**document, **scene_of(nodes, cameras)}, buffer)

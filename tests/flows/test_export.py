@@ -1,0 +1,106 @@
+"""A finished run in other formats."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from tiny_runs import bytes_of, ss_flow
+
+from ss_flow.tasks.deliver.ply import read_columns, read_gaussians
+
+
+def ids_of(tiny) -> list[int]:
+    entries = json.loads((tiny.out / "instances.json").read_text())["instances"]
+    return [entry["id"] for entry in entries if entry["file"]]
+
+
+def export(tiny, *more):
+    return ss_flow("export", tiny.out, "--cache", tiny.store, *more)
+
+
+def test_the_labelled_scene_is_that_of_the_output_folder(tiny, tmp_path):
+    answer = export(tiny, "--format", "labelled-ply", "--out", tmp_path / "a.ply")
+    assert answer.code == 0, answer.err
+    assert (tmp_path / "a.ply").read_bytes() == (tiny.out / "scene_labeled.ply").read_bytes()
+
+
+def test_chosen_instances_by_id_and_by_name_are_all_that_the_file_holds(tiny, tmp_path):
+    entries = json.loads((tiny.out / "instances.json").read_text())["instances"]
+    first, second = [entry for entry in entries if entry["num_gaussians"]][:2]
+    chosen = ["--instance", str(first["id"]), "--instance", second["name"]]
+    answer = export(tiny, "--format", "labelled-ply", *chosen, "--out", tmp_path / "a.ply", "--json")
+    assert answer.document()["files"][0]["instances"] == sorted([first["id"], second["id"]])
+    found = read_gaussians(tmp_path / "a.ply").instance_id
+    assert set(found.tolist()) == {first["id"], second["id"]}
+    assert len(found) == first["num_gaussians"] + second["num_gaussians"]
+
+
+@pytest.mark.parametrize("format", ["compressed-ply", "splat", "spz", "gltf", "usda"])
+def test_every_format_writes_one_file_and_the_same_bytes_again(tiny, tmp_path, format):
+    answers = [export(tiny, "--format", format, "--out", tmp_path / f"{i}", "--json") for i in range(2)]
+    assert [answer.code for answer in answers] == [0, 0]
+    assert answers[0].document()["files"][0]["bytes"] == (tmp_path / "0").stat().st_size > 0
+    assert (tmp_path / "0").read_bytes() == (tmp_path / "1").read_bytes()
+
+
+def test_each_gives_a_folder_with_a_file_an_instance_and_a_list_of_them(tiny, tmp_path):
+    out = tmp_path / "objects"
+    assert export(tiny, "--format", "spz", "--each", "--out", out).code == 0
+    listed = json.loads((out / "export.json").read_text())["files"]
+    assert [file["instances"] for file in listed] == [[i] for i in ids_of(tiny)]
+    assert sorted(bytes_of(out)) == sorted(["export.json", *(file["file"] for file in listed)])
+    assert export(tiny, "--format", "splat", "--each", "--out", out).code == 0  # in the place of the earlier one
+    assert {file.suffix for file in out.iterdir()} == {".json", ".splat"}
+
+
+def test_meshes_come_as_a_folder_of_objects_and_as_one_scene(tiny, tmp_path):
+    answer = export(tiny, "--format", "mesh-ply", "--out", tmp_path / "meshes", "--json")
+    assert answer.code == 0, answer.err
+    assert [file["instances"][0] for file in answer.document()["files"]] == ids_of(tiny)
+    assert all((tmp_path / "meshes" / f["file"]).read_bytes().startswith(b"ply\n") for f in answer.document()["files"])
+    assert export(tiny, "--format", "mesh-glb", "--out", tmp_path / "a.glb").code == 0
+    assert (tmp_path / "a.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_a_second_export_computes_nothing(tiny, tmp_path):
+    one = str(ids_of(tiny)[0])
+    export(tiny, "--format", "mesh-obj", "--instance", one, "--out", tmp_path / "a")
+    again = export(tiny, "--format", "mesh-obj", "--instance", one, "--out", tmp_path / "b")
+    assert "done" not in again.out + again.err
+    assert bytes_of(tmp_path / "a") | bytes_of(tmp_path / "b") == bytes_of(tmp_path / "a")
+
+
+def test_the_background_is_an_instance_when_it_is_asked_for(tiny, tmp_path):
+    answer = export(tiny, "--format", "ply", "--instance", "0", "--out", tmp_path / "a.ply")
+    assert answer.code == 0, answer.err
+    rows = read_columns(tiny.out / "scene_labeled.ply")
+    assert len(read_columns(tmp_path / "a.ply")) == np.count_nonzero(rows["instance_id"] == 0)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--format", "ply", "--instance", "no such"], "is no instance of"),
+        (["--format", "ply", "--holes", "closed"], "is for meshes"),
+        (["--format", "ply", "--jobs", "-1"], "out of range"),
+    ],
+)
+def test_bad_usage_gets_one_sentence(tiny, tmp_path, more, said):
+    answer = export(tiny, *more, "--out", tmp_path / "a.ply")
+    assert answer.code == 2 and said in answer.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_something_else_stays_as_it_is(tiny, tmp_path):
+    (tmp_path / "photo.jpg").write_bytes(b"x")
+    answer = export(tiny, "--format", "mesh-ply", "--out", tmp_path)
+    assert answer.code == 2 and "holds something else than an earlier export" in answer.err
+    assert export(tiny, "--format", "ply", "--out", tmp_path).code == 2
+    assert [file.name for file in tmp_path.iterdir()] == ["photo.jpg"]
+
+
+def test_a_folder_that_is_no_result_is_said_to_be_none(tmp_path):
+    answer = ss_flow("export", tmp_path, "--format", "ply")
+    assert answer.code == 2 and "is not the output folder of a run" in answer.err
