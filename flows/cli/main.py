@@ -34,6 +34,7 @@ from ss_flow.flows.cli.inspect import CacheList, CacheShow, Graph, Status, Why  
 from ss_flow.flows.cli.pins import CachePin, CacheUnpin  # noqa: E402
 from ss_flow.flows.cli.query import Query  # noqa: E402
 from ss_flow.flows.cli.report import WriteReport  # noqa: E402
+from ss_flow.flows.cli.render import Render  # noqa: E402
 from ss_flow.flows.cli.run import Demo, Run  # noqa: E402
 from ss_flow.flows.cli.setup import Doctor, ModelsFetch, ModelsList, ModelsVerify  # noqa: E402
 from ss_flow.flows.cli.sweep import Sweep  # noqa: E402
@@ -89,6 +90,7 @@ Command = tyro.conf.OmitSubcommandPrefixes[
         | Annotated[Evaluate, _sub("eval")]
         | Annotated[Query, _sub("query")]
         | Annotated[Export, _sub("export")]
+        | Annotated[Render, _sub("render")]
         | Annotated[Cache, _sub("cache")]
         | Annotated[Models, _sub("models")]
         | Annotated[Doctor, _sub("doctor")]

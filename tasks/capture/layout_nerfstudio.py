@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_files import header_size
-from ss_flow.tasks.capture.scene_files import SceneFiles, check_lens, natural_key, read_text, rigid_inverse
+from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, check_lens, natural_key, read_text, rigid_inverse
+from ss_flow.tasks.geometry.cameras import Camera
 
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
@@ -40,16 +42,7 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     if with_depth and len(with_depth) < len(frames):
         lacking = next(f["file_path"] for f in frames if not f.get("depth_file_path"))
         raise InputError(f"{path} gives no depth_file_path for {lacking}; give one for every frame, or for none.")
-    poses = []
-    for frame in frames:
-        where = f"{path} for {frame['file_path']}"
-        try:
-            matrix = np.array(frame["transform_matrix"], np.float64)
-        except (KeyError, ValueError, TypeError) as error:
-            raise InputError(f"{where} has no transform_matrix of numbers; a 4x4 matrix is expected.") from error
-        if matrix.shape != (4, 4):
-            raise InputError(f"{where} has a transform_matrix of shape {matrix.shape}; a 4x4 matrix is expected.")
-        poses.append(rigid_inverse(matrix @ _OPENGL_TO_OPENCV, where))
+    poses = tuple(_pose(frame, path) for frame in frames)
     return SceneFiles(
         kind="nerfstudio",
         root=root,
@@ -60,10 +53,47 @@ def open_nerfstudio(path: Path) -> SceneFiles:
         depths=tuple(root / f["depth_file_path"] for f in frames) if with_depth else None,
         depth_scale=_number(document.get("depth_unit_scale_factor", 1e-3), "depth_unit_scale_factor", path),
         lenses=tuple(_lens({**document, **f}, p, path) for f, p in zip(frames, photos, strict=True)),
-        poses=tuple(poses),
+        poses=poses,
         metric=bool(with_depth),
         skipped=missing,
     )
+
+
+def read_cameras(path: Path) -> tuple[Camera, ...]:
+    """The cameras of a `transforms.json` in the order of its frames, without their distortion; photos need not exist
+    where it gives sizes.
+
+    Raises InputError when the file is missing or makes no sense.
+    """
+    document = _document(path)
+    cameras = []
+    for frame in document["frames"]:
+        lens = _lens({**document, **frame}, path.parent / frame["file_path"], path)
+        pose = np.array(_pose(frame, path)).reshape(4, 4)
+        cameras.append(Camera(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, pose))
+    return tuple(cameras)
+
+
+def transforms_document(cameras: Sequence[Camera], files: Sequence[str]) -> dict[str, Any]:
+    """The content of a `transforms.json` of pinhole cameras; files: the photo of each, relative to it."""
+    frames = []
+    for camera, file in zip(cameras, files, strict=True):
+        matrix = np.linalg.inv(camera.world_to_camera) @ _OPENGL_TO_OPENCV
+        lens = {"w": camera.width, "h": camera.height}
+        lens |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        frames.append({"file_path": file, **lens, "transform_matrix": matrix.tolist()})
+    return {"camera_model": "OPENCV", "frames": frames}
+
+
+def _pose(frame: dict[str, Any], path: Path) -> Pose:
+    where = f"{path} for {frame['file_path']}"
+    try:
+        matrix = np.array(frame["transform_matrix"], np.float64)
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{where} has no transform_matrix of numbers; a 4x4 matrix is expected.") from error
+    if matrix.shape != (4, 4):
+        raise InputError(f"{where} has a transform_matrix of shape {matrix.shape}; a 4x4 matrix is expected.")
+    return rigid_inverse(matrix @ _OPENGL_TO_OPENCV, where)
 
 
 def _document(path: Path) -> dict[str, Any]:

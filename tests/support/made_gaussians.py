@@ -26,11 +26,12 @@ def made_gaussians(count: int, degree: int, seed: int = 0) -> Gaussians:
 def made_cameras(
     eyes: tuple[tuple[float, float, float], ...] = ((0, -3.2, 0), (0, 0, -3.2)), size: int = 96
 ) -> Cameras:
-    """Cameras that look at the origin; the world's x is level in all of them."""
+    """Cameras that look at the origin, with the world's z upwards in their pictures."""
     poses = []
     for eye in eyes:
         forward = -np.array(eye, float) / np.linalg.norm(eye)
-        right = np.array([1.0, 0.0, 0.0]) if abs(forward[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
+        right = np.cross(forward, (0.0, 0.0, 1.0)) if abs(forward[2]) < 0.99 else np.array([1.0, 0.0, 0.0])
+        right /= np.linalg.norm(right)
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
         pose[:3, 3] = -pose[:3, :3] @ np.array(eye, float)

@@ -41,12 +41,10 @@ def mesh_ply(mesh: TriangleMesh) -> FileContent:
 @task(name="deliver.export.mesh_obj")
 def mesh_obj(mesh: TriangleMesh, *, name: str) -> FileContent:
     """An OBJ file; colours stand behind the coordinates (0..1), where most readers find them."""
+    rows = zip(*mesh.vertices.T.tolist(), *np.round(mesh.colors / 255, 4).T.tolist(), strict=True)
     lines = [f"o {name}"]
-    colors = np.round(mesh.colors / 255, 4)
-    lines += [
-        "v %.7g %.7g %.7g %g %g %g" % row for row in zip(*mesh.vertices.T.tolist(), *colors.T.tolist(), strict=True)
-    ]
-    lines += ["f %d %d %d" % tuple(row) for row in (mesh.triangles + 1).tolist()]
+    lines += [f"v {x:.7g} {y:.7g} {z:.7g} {red:g} {green:g} {blue:g}" for x, y, z, red, green, blue in rows]
+    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.triangles + 1).tolist()]
     return FileContent.of("\n".join(lines).encode(), b"\n")
 
 

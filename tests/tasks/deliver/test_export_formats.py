@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
 import struct
 
@@ -158,7 +159,7 @@ def test_spz_decodes_within_its_steps_in_its_own_axes(count, degree):
     sizes = np.cumsum([16, 9 * count, count, 3 * count, 3 * count, 4 * count, 3 * coefficients * count])
     assert len(data) == sizes[-1]
     places, alphas, colors, scales, turns, harmonics = (
-        np.frombuffer(data[a:b], "u1") for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+        np.frombuffer(data[a:b], "u1") for a, b in itertools.pairwise(sizes)
     )
     raw = places.reshape(-1, 3).astype(np.int64) @ [1, 256, 65536]
     means = (np.where(raw >= 1 << 23, raw - (1 << 24), raw) / (1 << bits)).reshape(-1, 3) * (1, -1, -1)

@@ -1,0 +1,153 @@
+"""`ss-flow render`: pictures and films of a finished run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.markup import escape
+
+from ss_flow.cache.files import write_atomically
+from ss_flow.cache.store import Store
+from ss_flow.engine import Report, Request, run_flows
+from ss_flow.errors import InputError
+from ss_flow.flows.cli.context import StoreOptions, console, file_digests
+from ss_flow.flows.cli.finished import FinishedRun, open_run
+from ss_flow.flows.cli.prepare import display
+from ss_flow.flows.render import CameraPath, Shot, shoot
+from ss_flow.resolution import Failure
+from ss_flow.task import FileRef
+from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
+from ss_flow.tasks.deliver.output import check_writable, replacing
+from ss_flow.tasks.deliver.pictures import What
+
+CAMERAS_FILE = "transforms.json"
+_LEAST, _MOST = 8, 8192
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a result along a path of cameras, as PNG files or an MP4 film."""
+
+    result: Annotated[Path, tyro.conf.Positional]
+    """The output folder of a run."""
+    path: str = "input"
+    """input (through the input views), orbit (round the scene, or round the instances of --instance), or a
+    transforms.json with cameras."""
+    what: What = "colour"
+    """What to render; PNG files of labels hold ids, those of depth thousandths of a metre or of the scene's unit."""
+    instance: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An instance by id or name, 0 = the background; may be given several times. Only these are rendered."""
+    surroundings: bool = False
+    """Render the whole scene all the same; --instance then says only what an orbit goes round."""
+    frames: int = 120
+    """How many; with --path input, 0 = the input views as they are. Cameras of a file are all taken."""
+    width: int = 0
+    """Of the pictures, pixels; 0 = that of the cameras."""
+    elevation: float = 25.0
+    """How many degrees above an instance an orbit stands."""
+    fps: int = 24
+    """Frames a second of a film."""
+    out: Path | None = None
+    """A file that ends in .mp4, or a folder of PNG files and their cameras; by default ss-flow-render/NAME.mp4."""
+    jobs: int = 0
+    """How many tasks may run at once; 0 = one a core."""
+    json: bool = False
+    """Print one JSON document."""
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        self._check_numbers()
+        run = open_run(self.result, self.store, ("scene", "cameras", "dense"))
+        out = self.out or Path("ss-flow-render") / f"{run.name}.mp4"
+        is_film = out.suffix.lower() == ".mp4"
+        _check_place(out, is_film=is_film)
+        ids = run.ids(self.instance) if self.instance else None
+        unit = float(run.load("dense").unit) / 1000
+        shot = Shot(self._path(run.store), self.frames, self.elevation, self.what, self.width, unit, self.fps)
+        written = 0
+
+        def build() -> dict[str, Any]:
+            scene, cameras = run.node("scene"), run.node("cameras")
+            return shoot(scene, cameras, ids, shot, whole=self.surroundings or ids is None, is_film=is_film)
+
+        def done(report: Report) -> None:
+            nonlocal written
+            written = _write(out, run, report, is_film=is_film, depth_unit=unit if self.what == "depth" else None)
+
+        with display(console(json=self.json)) as screen:
+            request = Request(build, run.document["scene"], reporter=screen, done=done)
+            run_flows([request], run.store, jobs=self.jobs, recorded=False)
+        if self.json:
+            print(json.dumps({"status": "ok", "what": self.what, "out": str(out), "frames": written}))
+        else:
+            console(json=False).print(escape(f"ok: {out} ({self.what}, {written} frames)"))
+        return 0
+
+    def _check_numbers(self) -> None:
+        least = 0 if self.path == "input" else 1
+        for name, value, low, high in (
+            ("frames", self.frames, least, 100_000),
+            ("width", self.width, 0, _MOST),
+            ("elevation", self.elevation, -85, 85),
+            ("fps", self.fps, 1, 240),
+            ("jobs", self.jobs, 0, 100_000),
+        ):
+            if not low <= value <= high:
+                raise InputError(f"--{name} {value:g} is out of range; it must be from {low} to {high}.")
+        if 0 < self.width < _LEAST:
+            raise InputError(f"--width {self.width} is out of range; it must be 0 or from {_LEAST} to {_MOST}.")
+
+    def _path(self, store: Store) -> CameraPath:
+        if self.path in ("input", "orbit"):
+            return "input" if self.path == "input" else "orbit"
+        file = Path(self.path)
+        if not file.is_file():
+            raise InputError(f"--path {self.path} is neither input nor orbit, nor a file of cameras (transforms.json).")
+        digests = file_digests(store)
+        reference = FileRef(file.absolute(), digests(file))
+        digests.save()
+        return reference
+
+
+def _write(out: Path, run: FinishedRun, report: Report, *, is_film: bool, depth_unit: float | None) -> int:
+    """Write what came out; returns how many frames there are."""
+    for value in report.values.values():
+        if isinstance(value, Failure):
+            raise value.error
+    paths, pictures = report.values["cameras"], report.values["pictures"]
+    assert not isinstance(paths, str | Failure) and not isinstance(pictures, str | Failure)
+    if is_film:
+        film = report.values["film"]
+        assert isinstance(film, str)
+        write_atomically(out, run.store.get(film).content.tobytes())
+        return len(pictures)
+    sizes = []
+    with replacing(out) as filling:
+        files = [f"{number:05d}.png" for number in range(len(pictures))]
+        for file, value in zip(files, pictures, strict=True):
+            content = run.store.get(value).content.tobytes()
+            (filling / file).write_bytes(content)
+            sizes.append((int.from_bytes(content[16:20]), int.from_bytes(content[20:24])))  # PNG's header
+        cameras = [run.store.get(value).scaled(*size) for value, size in zip(paths, sizes, strict=True)]
+        document = transforms_document(cameras, files)
+        if depth_unit is not None:
+            document["depth_unit_scale_factor"] = depth_unit
+        (filling / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
+    return len(files)
+
+
+def _check_place(out: Path, *, is_film: bool) -> None:
+    """Raises InputError unless the pictures can be written here: a new place, or that of earlier ones."""
+    if is_film and out.is_dir():
+        raise InputError(f"{out} is a folder; a film is a file, so --out must name one.")
+    if not is_film and out.exists():
+        if not out.is_dir():
+            raise InputError(f"{out} is a file that does not end in .mp4; --out must name a film or a folder.")
+        if any(out.iterdir()) and not (out / CAMERAS_FILE).is_file():
+            raise InputError(f"{out} holds something else than earlier pictures; name another folder with --out.")
+    check_writable(out.parent)

@@ -1,0 +1,76 @@
+"""The cameras of films."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_gaussians import made_cameras, made_gaussians
+
+from ss_flow.tasks.deliver.camera_paths import along, round_instance, round_scene
+from ss_flow.tasks.geometry.cameras import project
+
+CIRCLE = made_cameras(tuple((3 * np.cos(a), 3 * np.sin(a), 1.0) for a in np.linspace(0, 5, 8)))
+
+
+def is_rigid(pose: np.ndarray) -> bool:
+    rotation = pose[:3, :3]
+    return np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
+
+
+def test_a_path_of_no_count_is_the_input_views():
+    path = along(CIRCLE, frames=0)
+    for view, camera in enumerate(path):
+        np.testing.assert_array_equal(camera.world_to_camera, CIRCLE.world_to_camera[view])
+
+
+def test_a_path_goes_through_the_input_views_and_is_smooth_between():
+    cameras = CIRCLE
+    path = along(cameras, frames=10 * (len(cameras) - 1) + 1)
+    assert all(is_rigid(camera.world_to_camera) for camera in path)
+    for view in range(len(cameras)):
+        np.testing.assert_allclose(path[10 * view].world_to_camera, cameras.world_to_camera[view], atol=1e-9)
+    steps = np.diff([camera.center for camera in path], axis=0)
+    turns = np.linalg.norm(np.diff(steps, axis=0), axis=1)
+    assert turns.max() < 0.2 * np.linalg.norm(steps, axis=1).mean()
+
+
+def test_a_single_view_is_its_own_path():
+    one = made_cameras(((0, -3, 0),))
+    assert len(along(one, frames=30)) == 1
+
+
+@pytest.mark.parametrize("elevation", [-30.0, 0.0, 60.0])
+def test_an_orbit_round_an_instance_shows_all_of_it_from_that_height(elevation):
+    own = made_gaussians(400, 0)
+    cameras = CIRCLE
+    path = round_instance(own, cameras, frames=7, elevation_deg=elevation)
+    up = -cameras.world_to_camera[:, 1, :3].mean(axis=0)
+    up /= np.linalg.norm(up)
+    for camera in path:
+        uv, depth = project(own.means, camera)
+        assert (depth > 0).all() and (uv > 0).all() and (uv < (camera.width, camera.height)).all()
+        outwards = camera.center / np.linalg.norm(camera.center)
+        assert abs(np.degrees(np.arcsin(outwards @ up)) - elevation) < 6
+    assert len({tuple(np.round(camera.center, 6)) for camera in path}) == 7
+
+
+def test_an_orbit_of_the_scene_keeps_the_height_and_distance_of_the_input_views_and_looks_where_they_look():
+    scene, cameras = made_gaussians(400, 0), CIRCLE
+    path = round_scene(scene, cameras, frames=12)
+    assert all(is_rigid(camera.world_to_camera) for camera in path)
+    for camera in path:
+        assert abs(np.linalg.norm(camera.center[:2]) - 3) < 0.15 and abs(camera.center[2] - 1) < 0.15
+        uv, depth = project(np.zeros((1, 3)), camera)
+        assert depth[0] > 2 and np.abs(uv[0] - (camera.cx, camera.cy)).max() < 10
+
+
+def test_views_side_by_side_still_have_something_to_go_round():
+    eyes = [(x, 0.0, -4.0) for x in np.linspace(-1, 1, 5)]
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 3] = -np.array(eyes)
+    parallel = replace(made_cameras(tuple(eyes)), world_to_camera=poses)
+    path = round_scene(made_gaussians(400, 0), parallel, frames=4)
+    uv, depth = project(np.zeros((1, 3)), path[0])
+    assert depth[0] > 1 and np.isfinite(uv).all()
