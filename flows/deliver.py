@@ -81,24 +81,8 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
             for name, value in wanted.items()
             if name in METRICS and isinstance(value, str)
         },
-        "nodes": [
-            {
-                "step": node["step"],
-                "item": node["item"],
-                "key": node["key"],
-                "outputs": node["outputs"],
-                "hit": node["event"] == "hit",
-                "seconds": node["seconds"],
-                "peak_rss_mb": node["peak_rss_mb"],
-                "warnings": node["warnings"],
-            }
-            for node in report.nodes
-            if node["event"] in ("hit", "finished")
-        ],
-        "failures": [
-            {"label": failure.label, "error": f"{type(failure.error).__name__}: {failure.error}"}
-            for failure in report.failures
-        ],
+        "nodes": node_records(report),
+        "failures": failure_records(report),
         "results": {name: value if isinstance(value, str) else list(value) for name, value in wanted.items()},
         "store": store.location,
     }
@@ -109,6 +93,32 @@ def weight_free(scene: SceneFiles, params: Params, networks: Networks) -> str | 
     if networks.segmenter is not None or scene.has_masks or params.split.segmenter != "auto":
         return None
     return WEIGHT_FREE
+
+
+def node_records(report: Report) -> list[dict[str, Any]]:
+    """What run.json says of each result."""
+    return [
+        {
+            "step": node["step"],
+            "item": node["item"],
+            "key": node["key"],
+            "outputs": node["outputs"],
+            "hit": node["event"] == "hit",
+            "seconds": node["seconds"],
+            "peak_rss_mb": node["peak_rss_mb"],
+            "warnings": node["warnings"],
+        }
+        for node in report.nodes
+        if node["event"] in ("hit", "finished")
+    ]
+
+
+def failure_records(report: Report) -> list[dict[str, Any]]:
+    """What run.json says of each failure."""
+    return [
+        {"label": failure.label, "error": f"{type(failure.error).__name__}: {failure.error}"}
+        for failure in report.failures
+    ]
 
 
 def deliver(folder: Path, store: Store, document: dict[str, Any], scene: SceneFiles, *, undistorted: bool) -> None:

@@ -356,6 +356,14 @@ class Gaussians:
 
 
 @dataclass(frozen=True)
+class EditedScene(Gaussians):
+    """A scene that was edited after it was made."""
+
+    filled: UInt8
+    """[N] 1 for Gaussians that fill a hole: guessed from what lies around it, measured by no view."""
+
+
+@dataclass(frozen=True)
 class Descriptors:
     """The semantic descriptor of one instance (Split&Splat, Sec. 4.2: f_obj)."""
 

@@ -19,6 +19,7 @@ ROOMS = (
     {"splat"},
     {"semantics"},
     {"evaluate", "deliver"},
+    {"edit"},
 )
 """The folders of `tasks`, in the order in which they may know of each other; those of one line know nothing of it."""
 LATE = {f"ss_flow.tasks.gaussians.{name}" for name in ("autograd", "cuda", "torch_backend")}

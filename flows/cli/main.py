@@ -30,6 +30,7 @@ from ss_flow.flows.cli.care import CacheCollect, CacheUsage, CacheVerify  # noqa
 from ss_flow.flows.cli.diff import Diff  # noqa: E402
 from ss_flow.flows.cli.evaluate import Evaluate  # noqa: E402
 from ss_flow.flows.cli.export import Export  # noqa: E402
+from ss_flow.flows.cli.edit import EditRun  # noqa: E402
 from ss_flow.flows.cli.inspect import CacheList, CacheShow, Graph, Status, Why  # noqa: E402
 from ss_flow.flows.cli.pins import CachePin, CacheUnpin  # noqa: E402
 from ss_flow.flows.cli.query import Query  # noqa: E402
@@ -91,6 +92,7 @@ Command = tyro.conf.OmitSubcommandPrefixes[
         | Annotated[Query, _sub("query")]
         | Annotated[Export, _sub("export")]
         | Annotated[Render, _sub("render")]
+        | Annotated[EditRun, _sub("edit")]
         | Annotated[Cache, _sub("cache")]
         | Annotated[Models, _sub("models")]
         | Annotated[Doctor, _sub("doctor")]

@@ -54,7 +54,7 @@ def instances_document(
             "color": list(instance_color(instance.instance_id)),
             "parent": parents.get(instance.instance_id),
             "parts": _parts(instance),
-            **_place(places),
+            **placed(places),
             "views": list(instance.views),
             "confidence": round(float(instance.confidence), 4),
             "num_parts": int(instance.point_part.max(initial=0)),
@@ -112,7 +112,7 @@ def _parts(instance: InstanceMasks) -> list[dict[str, Any]]:
     found = []
     for part in range(1, int(instance.point_part.max(initial=0)) + 1):
         own = instance.points[instance.point_part == part]
-        found.append({"part_id": part, "num_points": len(own), **_place(own)})
+        found.append({"part_id": part, "num_points": len(own), **placed(own)})
     return found
 
 
@@ -144,7 +144,8 @@ def _unique_names(ids: Sequence[int], names: InstanceNames | None) -> dict[int, 
     return called
 
 
-def _place(points: Float32) -> dict[str, Any]:
+def placed(points: Float32) -> dict[str, Any]:
+    """The box and the mean of points [N, 3] as instances.json gives them; null without points."""
     if not len(points):
         return {"bbox": None, "centroid": None}
     corners = {"min": _rounded(points.min(axis=0)), "max": _rounded(points.max(axis=0))}

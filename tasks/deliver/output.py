@@ -8,6 +8,7 @@ import shutil
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +79,10 @@ def write_scene(folder: Path, scene: Gaussians, instances: Mapping[str, Any]) ->
     ply.write_gaussians(folder / "scene_labeled.ply", scene, labelled=True)
     (folder / "instances.json").write_text(json.dumps(instances, indent=1), encoding="utf-8")
     (folder / "instances").mkdir()
-    from ss_flow.tasks.gaussians.initialise import select
-
     for entry in instances["instances"]:
         if entry["file"]:
-            one = select(scene, scene.instance_id == entry["id"])
+            own = scene.instance_id == entry["id"]
+            one = replace(scene, **{f.name: getattr(scene, f.name)[own] for f in fields(scene)})
             ply.write_gaussians(folder / entry["file"], one, labelled=True)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Float32, Gaussians, PointCloud, PointLabels, PointParts
+from ss_flow.tasks.artifacts import EditedScene, Float32, Gaussians, PointCloud, PointLabels, PointParts
 
 _HEAD = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
 _TAIL = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
@@ -33,18 +33,21 @@ _NAMES = {"f4": "float", "u1": "uchar"}
 
 
 def write_gaussians(path: Path, gaussians: Gaussians, *, labelled: bool = False) -> None:
-    """Write Gaussians as a standard 3DGS file; `labelled` adds instance_id, instance_conf and part_id."""
+    """Write Gaussians as a standard 3DGS file; `labelled` adds instance_id, instance_conf and part_id, and where an
+    edit has filled holes, `filled` (0 or 1)."""
+    filled = isinstance(gaussians, EditedScene) and gaussians.filled.any()
+    labels = (*_LABELS, *(("filled",) if filled else ())) if labelled else ()
     rest = (f"f_rest_{i}" for i in range(3 * (gaussians.sh.shape[1] - 1)))
-    dtype = np.dtype([(name, "<f4") for name in (*_HEAD, *rest, *_TAIL, *(_LABELS if labelled else ()))])
+    dtype = np.dtype([(name, "<f4") for name in (*_HEAD, *rest, *_TAIL, *labels)])
 
     def block(start: int, stop: int) -> NDArray[np.void]:
-        rows = _gaussian_rows(gaussians, slice(start, stop), labelled=labelled)
+        rows = _gaussian_rows(gaussians, slice(start, stop), labels)
         return rows.view(dtype)[:, 0]
 
     _write(path, dtype, len(gaussians), block, (_RENDER_MODE,))
 
 
-def _gaussian_rows(gaussians: Gaussians, part: slice, *, labelled: bool) -> Float32:
+def _gaussian_rows(gaussians: Gaussians, part: slice, labels: tuple[str, ...]) -> Float32:
     means, sh = gaussians.means[part], gaussians.sh[part]
     columns = [
         means,
@@ -55,8 +58,7 @@ def _gaussian_rows(gaussians: Gaussians, part: slice, *, labelled: bool) -> Floa
         gaussians.log_scales[part],
         gaussians.quaternions[part],
     ]
-    if labelled:
-        columns += [a[part, None] for a in (gaussians.instance_id, gaussians.instance_conf, gaussians.part_id)]
+    columns += [getattr(gaussians, name)[part, None] for name in labels]
     return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
 
 

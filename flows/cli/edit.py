@@ -1,0 +1,81 @@
+"""`ss-flow edit`: change a finished scene by a script."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from ss_flow.errors import InputError
+from ss_flow.flows.cli.context import StoreOptions, console, file_digests
+from ss_flow.flows.cli.prepare import display
+from ss_flow.flows.cli.query import read_run
+from ss_flow.task import FileRef
+
+
+@dataclass(frozen=True)
+class EditRun:
+    """Change a finished scene by a script: remove, move, recolour, replace its objects."""
+
+    result: Annotated[Path, tyro.conf.Positional]
+    """The output folder of a run."""
+    script: Annotated[Path, tyro.conf.Positional]
+    """The operations (.json), see docs/editing.md."""
+    out: Path
+    """The folder to write."""
+    jobs: int = 0
+    """How many tasks may run at once; 0 = one a core."""
+    json: bool = False
+    """Print one JSON document on stdout, and nothing else there."""
+    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        from ss_flow.flows.edit import prepare_edit, run_edit
+
+        if self.jobs < 0:
+            raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
+        own_store = self.store if self.store.cache else StoreOptions(read_run(self.result)["store"])
+        store = own_store.existing_store()
+        digests = file_digests(store)
+        script = _read_script(self.script)
+        try:
+            edit = prepare_edit(
+                self.result, script, store, lambda path: FileRef(path.absolute(), digests(path)), self.script.parent
+            )
+        finally:
+            digests.save()
+        out = console(json=self.json)
+        with display(out) as screen:
+            document = run_edit(edit, store, self.out, reporter=screen, jobs=self.jobs)
+        if self.json:
+            print(json.dumps(document))
+        else:
+            _tell(document, self.out, out)
+        return 0
+
+
+def _read_script(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"the edit script {file} cannot be read: {error.strerror}.") from None
+    except ValueError as error:
+        raise InputError(f"the edit script {file} is not JSON: {error}.") from None
+
+
+def _tell(document: dict[str, Any], folder: Path, out: Console) -> None:
+    for hole in document["edit"]["holes"]:
+        after = hole.get("open_after_filling")
+        filled = f"; after filling {after} are still open" if after is not None else ""
+        out.print(
+            f"operation {hole['operation']}: of {hole['pixels']} pixels in {hole['views']} views, "
+            f"{hole['unmeasured']} have nothing measured behind them, {hole['empty']} are empty{filled}"
+        )
+    hits = sum(node["hit"] for node in document["nodes"])
+    out.print(escape(f"ok: {len(document['nodes']) - hits} results computed, {hits} reused; see {folder}"))

@@ -1,0 +1,173 @@
+"""Editing a finished run: a script of operations -> a chain of cached tasks -> an output folder of the same kind."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ss_flow.cache.canonical import digest
+from ss_flow.cache.store import Store
+from ss_flow.closure import code_closure
+from ss_flow.engine import Report, Request, run_flows
+from ss_flow.errors import InputError
+from ss_flow.events import Reporter
+from ss_flow.flows.deliver import failure_records, node_records
+from ss_flow.flows.edit_objects import Objects
+from ss_flow.flows.edit_script import Reference, Step, check
+from ss_flow.graph import labelled, stored
+from ss_flow.resolution import Failure
+from ss_flow.tasks.artifacts import EditedScene, Gaussians
+from ss_flow.tasks.deliver.output import RUN_FILE, check_place, replacing, write_scene
+from ss_flow.tasks.edit.fill import fill
+from ss_flow.tasks.edit.holes import Holes, Measured, holes
+from ss_flow.tasks.edit.operations import begin
+
+_NEEDED = ("scene", "cameras", "depth", "dense", "cut")
+_CAPTURE = ("ingest", "cameras", "depth", "dense")
+"""Results of the source run that an edit leaves true."""
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A checked script, ready to run."""
+
+    source: Path
+    """The output folder of the run that is edited."""
+    run: Mapping[str, Any]
+    """Its run.json."""
+    instances: Mapping[str, Any]
+    """Its instances.json."""
+    script: Mapping[str, Any]
+    steps: list[Step]
+    objects: Objects
+    """Those of the edited scene."""
+
+    def build(self) -> dict[str, Any]:
+        """Add the script's nodes to a flow: "scene", and for each operation N after which something has left its place
+        "holes_N", and "unfilled_N" where its holes are filled."""
+        results = self.run["results"]
+        measured = Measured(*(stored(name, results[name]) for name in _NEEDED[1:]))
+        scene = begin(stored("scene", results["scene"]))
+        outputs: dict[str, Any] = {}
+        for step in self.steps:
+            with labelled(str(step.number)):
+                after, left = step.apply(scene), {"instances": step.leaving, "gone": step.gone}
+                if step.leaving:
+                    outputs[f"holes_{step.number}"] = holes(scene, after, measured, **left)
+                if step.leaving and step.fill:
+                    after = fill(scene, after, measured, **left)
+                    outputs[f"unfilled_{step.number}"] = holes(scene, after, measured, **left)
+            scene = after
+        return outputs | {"scene": scene}
+
+
+def prepare_edit(source: Path, script: Mapping[str, Any], store: Store, reference: Reference, folder: Path) -> Edit:
+    """Check a script whole against a finished run.
+
+    source: the run's output folder. script: the document. store: where the run's results are. reference: makes the
+    FileRef of a file that the script names. folder: what relative paths in the script start from.
+    Raises InputError when the run cannot be edited, and for the script's first fault.
+    """
+    run, instances = _read(source / RUN_FILE), _read(source / "instances.json")
+    if "edit" in run:
+        raise InputError(
+            f"{source} is an edited run; add the operations to its script (edit.script in its {RUN_FILE}) and edit its "
+            f"source, {run['edit']['source']}."
+        )
+    results = run.get("results", {})
+    needed = [results.get(name, "") for name in _NEEDED]
+    if not all(digest in store for value in needed for digest in ([value] if isinstance(value, str) else value)):
+        raise InputError(f"the store {store.location} no longer holds the scene of {source}; run it again.")
+    scene: Gaussians = store.get(results["scene"])
+    steps, objects = check(script, Objects.of(instances, scene), reference, folder)
+    return Edit(source, run, instances, script, steps, objects)
+
+
+def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None = None, jobs: int = 0) -> dict[str, Any]:
+    """Run an edit and write its output folder; return the document run.json.
+
+    Raises InputError when `out` cannot be written, and what a task raised when one failed.
+    """
+    check_place(out)
+    if out.resolve() == edit.source.resolve():
+        raise InputError(f"--out {out} is the run that is edited; name another folder.")
+    documents: list[dict[str, Any]] = []
+
+    def done(report: Report) -> None:
+        failed = next((failure for failure in report.values.values() if isinstance(failure, Failure)), None)
+        if failed is not None:
+            raise failed.error
+        documents.append(_deliver(edit, store, out, report))
+
+    request = Request(edit.build, str(out.resolve()), {"edited": str(edit.source.resolve())}, None, reporter, done)
+    run_flows([request], store, jobs=jobs)
+    return documents[-1]
+
+
+def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, Any]:
+    from ss_flow.tasks.deliver.report import report_html
+    from ss_flow.tasks.edit.pictures import before_and_after
+
+    results = edit.run["results"]
+    scene: EditedScene = store.get(report.values["scene"])  # type: ignore[arg-type]
+    instances = edit.objects.document(edit.instances, scene)
+    found: dict[str, Holes] = {n: store.get(value) for n, value in report.values.items() if n != "scene"}  # type: ignore[arg-type]
+    document = {
+        "status": "ok",
+        "scene": edit.run["scene"],
+        "params": edit.run["params"],
+        "models": edit.run["models"],
+        "metrics": {},
+        "nodes": node_records(report),
+        "failures": failure_records(report),
+        "results": {name: results[name] for name in _CAPTURE} | report.values,
+        "store": store.location,
+        "edit": {
+            "source": str(edit.source.resolve()),
+            "script": edit.script,
+            "holes": [_told(step, found) for step in edit.steps if step.leaving],
+            "num_filled": int(scene.filled.sum()),
+        },
+    }
+    document["content"] = digest({"results": report.values, "instances": instances, "code": code_closure(_deliver)})
+    pictures = before_and_after(store.get(results["scene"]), scene, store.get(results["cameras"]))
+    with replacing(out) as filling:
+        write_scene(filling, scene, instances)
+        html = report_html(document, pictures=pictures, instances=instances)
+        (filling / "report.html").write_text(html, encoding="utf-8")
+        document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
+    return document
+
+
+def _told(step: Step, found: Mapping[str, Holes]) -> dict[str, Any]:
+    """What run.json says of the holes that an operation left."""
+    hole = found[f"holes_{step.number}"]
+    told = {
+        "operation": step.number,
+        "instances": list(step.leaving),
+        "views": len(hole.names),
+        "pixels": int(hole.left.sum()),
+        "unmeasured": int(hole.unmeasured.sum()),
+        "empty": int(hole.empty.sum()),
+        "largest_area": round(float(hole.area.max(initial=0)), 6),
+    }
+    if step.fill:
+        told["open_after_filling"] = int(found[f"unfilled_{step.number}"].unmeasured.sum())
+    return told
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{file.parent} is not the output folder of a run: it has no {file.name}.") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} is damaged ({error}); run the scene again.") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{file} is damaged: it should hold a JSON object; run the scene again.")
+    return document

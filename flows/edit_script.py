@@ -1,0 +1,363 @@
+"""Edit scripts: a list of operations as data, checked whole against the objects of a scene before anything runs."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from ss_flow.errors import InputError
+from ss_flow.flows.edit_objects import Objects, object_of_run
+from ss_flow.tasks.artifacts import EditedScene
+from ss_flow.tasks.edit import operations
+from ss_flow.tasks.edit.operations import Motion, Vector
+
+T = TypeVar("T")
+Reference = Callable[[Path], Any]
+"""Makes the FileRef of a file."""
+_REQUIRED = cast(Any, object())
+_VERSION = 1
+_MOVING = ("duplicate", "transform", "recolour", "replace", "split")
+"""Operations that need Gaussians to work on."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """An operation that changes Gaussians, ready to run."""
+
+    number: int
+    """Its place in the script, from 1 on."""
+    op: str
+    apply: Callable[[EditedScene], EditedScene]
+    """In a flow: adds the operation's nodes."""
+    leaving: tuple[int, ...] = ()
+    """Ids of the instances that leave their place, where a hole may stay behind."""
+    gone: tuple[int, ...] = ()
+    """Ids whose dense points are no longer there after it."""
+    fill: bool = False
+
+
+def check(script: object, objects: Objects, reference: Reference, folder: Path) -> tuple[list[Step], Objects]:
+    """What a script comes to: the steps to run, and the objects afterwards.
+
+    script: the document, {"version": 1, "operations": [...]}. objects: those of the scene; they stay as they are.
+    reference: for the files of other objects. folder: what relative paths in the script start from.
+    Raises InputError for the first fault, naming the operation, the field and what would be right.
+    """
+    if not isinstance(script, Mapping) or not isinstance(script.get("operations"), list):
+        raise InputError('an edit script is a JSON object such as {"version": 1, "operations": [...]}.')
+    if script.get("version", _VERSION) != _VERSION or isinstance(script.get("version"), bool):
+        raise InputError(f"the edit script has the version {script['version']!r}; this program reads version 1.")
+    if odd := sorted(script.keys() - {"version", "operations", "comment"}):
+        raise InputError(f"the edit script has the field {odd[0]!r}; it takes version, operations and comment.")
+    objects = copy.deepcopy(objects)
+    steps = []
+    for number, raw in enumerate(script["operations"], 1):
+        step = _step(number, raw, objects, reference, folder)
+        steps += [step] if step is not None else []
+    return steps, objects
+
+
+def _step(number: int, raw: object, objects: Objects, reference: Reference, folder: Path) -> Step | None:
+    if not isinstance(raw, Mapping):
+        raise InputError(f'operation {number} must be an object such as {{"op": "remove", "instances": [3]}}.')
+    op = raw.get("op")
+    if not isinstance(op, str) or op not in _OPERATIONS:
+        raise InputError(
+            f"operation {number}: op is {op!r}; it must be one of {', '.join(_OPERATIONS)}{_hint(op, _OPERATIONS)}."
+        )
+    call = _Call(number, op, dict(raw), objects, reference, folder)
+    call.take("op", str)
+    call.take("comment", _text, "")
+    step = _OPERATIONS[op](call)
+    call.finish()
+    return step
+
+
+def _hint(word: object, known: Sequence[str] | Mapping[str, Any]) -> str:
+    close = difflib.get_close_matches(str(word), list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+class _Call:
+    """One operation while its fields are read; what is wrong is said with its number and the field's name."""
+
+    def __init__(
+        self, number: int, op: str, raw: dict[str, Any], objects: Objects, reference: Reference, folder: Path
+    ) -> None:
+        self.number, self.op, self.objects, self.reference, self.folder = number, op, objects, reference, folder
+        self._raw, self._known = raw, list[str]()
+
+    def take(self, name: str, parse: Callable[[Any], T], default: T = _REQUIRED) -> T:
+        """One field. parse: raises ValueError that says what would be right."""
+        self._known.append(name)
+        if name not in self._raw:
+            if default is _REQUIRED:
+                raise InputError(f"operation {self.number} ({self.op}): {name} is missing; {_wanted(parse)}.")
+            return default
+        value = self._raw.pop(name)
+        try:
+            return parse(value)
+        except ValueError as error:
+            raise self.fault(name, value, error) from None
+
+    def fault(self, name: str, value: object, error: Exception) -> InputError:
+        """What is wrong with a field."""
+        return InputError(f"operation {self.number} ({self.op}): {name} is {value!r}; {str(error).rstrip('.')}.")
+
+    def step(
+        self, apply: Callable[[EditedScene], EditedScene], leaving: tuple[int, ...] = (), *, fill: bool = False
+    ) -> Step:
+        """The operation, ready to run."""
+        return Step(self.number, self.op, apply, leaving, tuple(sorted(self.objects.gone)), fill)
+
+    def finish(self) -> None:
+        """Refuse what is left over."""
+        for name in self._raw:
+            raise InputError(
+                f"operation {self.number} ({self.op}): the field {name!r} is unknown; it takes "
+                f"{', '.join(self._known)}{_hint(name, self._known)}."
+            )
+
+    def instance(self, field: str = "instance") -> int:
+        """The one instance that the field names."""
+        return self.take(field, self._one)
+
+    def instances(self, *, background: bool = False, least: int = 1) -> tuple[int, ...]:
+        """The instances that the field `instances` names, each once, in its order."""
+
+        def parse(value: Any) -> tuple[int, ...]:
+            """it must name instances by id or by name, as in [3, "red mug"]"""
+            named = value if isinstance(value, list) else [value]
+            ids = tuple(dict.fromkeys(self._one(item, background=background) for item in named))
+            if len(ids) < least:
+                raise ValueError(f"it must name at least {'one instance' if least == 1 else f'{least} instances'}")
+            return ids
+
+        return self.take("instances", parse)
+
+    def new_name(self, like: str) -> str:
+        """A name that no object has yet; by default one like this."""
+        return self.take("name", self._free_name, self.objects.unique(like))
+
+    def name_of(self, instance: int) -> str:
+        """Its new name; by default it keeps its own."""
+        own = self.objects.name(instance)
+        return self.take("name", lambda value: own if value == own else self._free_name(value), own)
+
+    def _free_name(self, value: Any) -> str:
+        if _text(value) in self.objects.names():
+            raise ValueError("there is an object of this name; give it another one")
+        return str(value)
+
+    def motion(self) -> Motion:
+        """move, rotate, scale and pivot."""
+        turn = self.take("rotate", _turn, ((0.0, 0.0, 1.0), 0.0))
+        return Motion(
+            move=self.take("move", _vector, (0.0, 0.0, 0.0)),
+            axis=turn[0],
+            degrees=turn[1],
+            scale=self.take("scale", _positive, 1.0),
+            pivot=self.take("pivot", _pivot, None),
+        )
+
+    def _one(self, value: Any, *, background: bool = False) -> int:
+        """it must name an instance by id or by name"""
+        if background and value in (0, "background") and not isinstance(value, bool):
+            return 0
+        found = self.objects.find(value) if isinstance(value, int | str) and not isinstance(value, bool) else None
+        if found is None:
+            names = self.objects.names()
+            close = _hint(value, names) if isinstance(value, str) else ""
+            raise ValueError(f"no instance goes by it at this point; instances.json lists ids and names{close}")
+        if self.op in _MOVING and not self.objects.solid(found):
+            raise ValueError(f"{found} has no Gaussians (too few views show it); name one that has")
+        return found
+
+
+def _remove(call: _Call) -> Step:
+    ids, fill = call.instances(background=True), call.take("fill", _flag, False)
+    call.objects.remove(ids)
+    leaving = tuple(i for i in ids if i)
+    return call.step(lambda scene: operations.remove(scene, instances=ids), leaving, fill=fill)
+
+
+def _keep(call: _Call) -> Step:
+    ids = call.instances(background=True)
+    call.objects.keep(ids)
+    return call.step(lambda scene: operations.keep(scene, instances=ids))
+
+
+def _duplicate(call: _Call) -> Step:
+    instance, motion = call.instance(), call.motion()
+    new_id = call.objects.copy(instance, call.new_name(call.objects.name(instance)))
+    return call.step(lambda scene: operations.duplicate(scene, instance=instance, new_id=new_id, motion=motion))
+
+
+def _transform(call: _Call) -> Step:
+    ids, motion, fill = call.instances(), call.motion(), call.take("fill", _flag, False)
+    call.objects.move(ids)
+    return call.step(lambda scene: operations.transform(scene, instances=ids, motion=motion), ids, fill=fill)
+
+
+def _recolour(call: _Call) -> Step:
+    ids, color = call.instances(), call.take("color", _color)
+    return call.step(lambda scene: operations.recolour(scene, instances=ids, color=color))
+
+
+def _replace(call: _Call) -> Step:
+    instance, fill = call.instance(), call.take("fill", _flag, False)
+    run, wanted = call.take("run", _text), call.take("by", _id_or_name)
+    scale = call.take("scale", _scale_or_fit, None)
+    try:
+        entry, parts, file = object_of_run(call.folder / run, wanted)
+    except ValueError as error:
+        raise call.fault("by", wanted, error) from None
+    except InputError as error:
+        raise call.fault("run", run, error) from None
+    call.objects.remove((instance,))
+    new_id = call.objects.put_in(entry, parts, call.new_name(entry["name"]))
+    ref = call.reference(file)
+
+    def apply(scene: EditedScene) -> EditedScene:
+        other = operations.read_object(file=ref)
+        return operations.put_in_place(scene, other, instance=instance, new_id=new_id, scale=scale)
+
+    return call.step(apply, (instance,), fill=fill)
+
+
+def _relabel(call: _Call) -> None:
+    """Names and kinds are no matter of the Gaussians: nothing is to be computed."""
+    instance = call.instance()
+    call.objects.rename(instance, call.name_of(instance), call.take("kind", _kind, call.objects.kind(instance)))
+
+
+def _merge(call: _Call) -> Step:
+    ids = call.instances(least=2)
+    rows = call.objects.merge(ids)
+    call.objects.rename(ids[0], call.name_of(ids[0]), call.objects.kind(ids[0]))
+    return call.step(lambda scene: operations.relabel(scene, rows=rows))
+
+
+def _split(call: _Call) -> Step:
+    instance = call.instance()
+    try:
+        rows = call.objects.split(instance)
+    except ValueError as error:
+        raise call.fault("instance", instance, error) from None
+    return call.step(lambda scene: operations.relabel(scene, rows=rows))
+
+
+_OPERATIONS: dict[str, Callable[[_Call], Step | None]] = {
+    "remove": _remove,
+    "keep": _keep,
+    "duplicate": _duplicate,
+    "transform": _transform,
+    "recolour": _recolour,
+    "replace": _replace,
+    "relabel": _relabel,
+    "merge": _merge,
+    "split": _split,
+}
+
+
+def _wanted(parse: Callable[[Any], Any]) -> str:
+    return (parse.__doc__ or "it is needed").strip()
+
+
+def _text(value: Any) -> str:
+    """it must be a text that is not empty"""
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(_wanted(_text))
+    return value
+
+
+def _flag(value: Any) -> bool:
+    """it must be true or false"""
+    if not isinstance(value, bool):
+        raise ValueError(_wanted(_flag))
+    return value
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError("no number")
+    return float(value)
+
+
+def _positive(value: Any) -> float:
+    """it must be a number above 0"""
+    try:
+        number = _number(value)
+    except ValueError:
+        number = 0.0
+    if number <= 0:
+        raise ValueError(_wanted(_positive))
+    return number
+
+
+def _vector(value: Any) -> Vector:
+    """it must be three numbers in world units, as in [0, 0, 0.5]"""
+    try:
+        x, y, z = (_number(item) for item in value)
+    except (TypeError, ValueError):
+        raise ValueError(_wanted(_vector)) from None
+    return x, y, z
+
+
+def _pivot(value: Any) -> Vector | None:
+    """it must be "centre", or three numbers in world units"""
+    try:
+        return None if value == "centre" else _vector(value)
+    except ValueError:
+        raise ValueError(_wanted(_pivot)) from None
+
+
+def _turn(value: Any) -> tuple[Vector, float]:
+    """it must be such as {"axis": [0, 0, 1], "degrees": 90}, with an axis that is not 0"""
+    try:
+        axis, degrees = _vector(value["axis"]), _number(value["degrees"])
+        fits = len(value) == 2 and any(axis)
+    except (TypeError, KeyError, ValueError):
+        fits = False
+    if not fits:
+        raise ValueError(_wanted(_turn))
+    return axis, degrees
+
+
+def _color(value: Any) -> tuple[int, int, int]:
+    """it must be "#rrggbb", or red, green and blue as whole numbers of 0 to 255"""
+    try:
+        if isinstance(value, str) and len(value) == 7 and value[0] == "#":
+            value = list(bytes.fromhex(value[1:]))
+        r, g, b = value
+        if not all(isinstance(c, int) and not isinstance(c, bool) and 0 <= c <= 255 for c in (r, g, b)):
+            raise ValueError
+    except (TypeError, ValueError):
+        raise ValueError(_wanted(_color)) from None
+    return r, g, b
+
+
+def _scale_or_fit(value: Any) -> float | None:
+    """it must be "fit" (the size of what is replaced), or a number above 0"""
+    try:
+        return None if value == "fit" else _positive(value)
+    except ValueError:
+        raise ValueError(_wanted(_scale_or_fit)) from None
+
+
+def _kind(value: Any) -> str:
+    if value not in ("thing", "stuff"):
+        raise ValueError('it must be "thing" or "stuff"')
+    return str(value)
+
+
+def _id_or_name(value: Any) -> int | str:
+    """it must be the id or the name of an object of that run"""
+    if isinstance(value, bool) or not isinstance(value, int | str):
+        raise ValueError(_wanted(_id_or_name))
+    return value

@@ -1,0 +1,271 @@
+"""Holes closed with the surfaces around them: a guess, and flagged as one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import (
+    Bool,
+    Cameras,
+    DepthMap,
+    EditedScene,
+    Float32,
+    Float64,
+    Int32,
+    PointCloud,
+    UInt8,
+)
+from ss_flow.tasks.edit.holes import Measured, Remains, Uncovered, uncovered
+from ss_flow.tasks.edit.operations import edited, joined, some_rows
+from ss_flow.tasks.gaussians.initialise import initialise, select
+from ss_flow.tasks.gaussians.rasterize import backend_identity
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
+from ss_flow.tasks.geometry.shape import plane_through
+
+_NEARBY = 0.5
+"""How far around the box of what has left the surfaces are looked for, as a share of its diagonal."""
+_THICK = 1.5
+"""Half the thickness of a plane, in spacings of the dense points."""
+_UNSEEN = 1.5
+"""How far from all points of a plane it was not seen, in spacings."""
+_NEAR = 4.0
+"""How far from filled places Gaussians may hide that no view has shaped, in spacings."""
+_COVERED = 0.5
+"""Share of the convex hull of a plane's points that must hold points; what has less is no surface."""
+_DEPTH_ERROR = 0.02
+"""Of a depth map, as a share of the depth."""
+_MOST_PLANES = 4
+_TRIALS = 300
+_FEWEST = 30
+"""Points below which nothing is called a plane."""
+_LENDERS = 32
+"""Points that lend a filled place their colour."""
+_OPACITY = 0.95
+_LARGEST_BLOCK = 20_000
+
+
+@task(name="edit.fill", resources=Resources(cores=1, memory_mb=1500), environment=backend_identity)
+def fill(
+    before: EditedScene,
+    after: EditedScene,
+    measured: Measured,
+    *,
+    instances: tuple[int, ...],
+    gone: tuple[int, ...],
+) -> EditedScene:
+    """Close the holes that instances leave with the surfaces around them, flagged as filled.
+
+    The dense points near the instances that are still there are cut into planes (at most four, by RANSAC). The ray of
+    every pixel that showed the instances is followed to the first plane behind them. It counts where it meets the plane
+    inside the convex hull of its points, so that nothing is continued beyond what was seen; further than 1.5 spacings
+    from any of them; where nothing that is still there hides it; and where no view looked through it, by its depth map.
+    One such place in each cube of the points' spacing becomes a Gaussian, with the median colour of the 32 nearest
+    points of the plane and the ids of the scene's nearest Gaussian. Small Gaussians near filled places that only
+    came to light when the instances left are taken away.
+
+    gone: labels of the dense points that are no longer there, those of the instances among them.
+    """
+    points, cameras = measured.points, measured.cameras
+    spacing = points.spacing
+    views = list(uncovered(before, after, cameras, instances))
+    own = np.isin(before.instance_id, instances)
+    if not views or not own.any():
+        return after
+    around = _around(Remains.of(measured, gone), before.means[own])
+    planes = _planes(points.points[around].astype(np.float64), spacing)
+    places, plane_of = _behind(views, planes, spacing)
+    solid = ~_seen_through(places, cameras, measured.depths, _THICK * spacing)
+    places, plane_of = places[solid], plane_of[solid]
+    chosen = _one_a_cube(places, spacing)
+    places, plane_of = places[chosen], plane_of[chosen]
+    if not len(places):
+        return after
+    colors = np.zeros((len(places), 3), np.uint8)
+    for number in np.unique(plane_of).tolist():
+        of_plane = plane_of == number
+        colors[of_plane] = _colors(places[of_plane], points, around[planes[number].rows])
+    shaped = some_rows(after, ~_came_to_light(before, after, instances, views, places, _NEAR * spacing))
+    return joined([shaped, _with_ids_of(shaped, _flat(places, colors, plane_of, planes))])
+
+
+@dataclass(frozen=True)
+class _Plane:
+    centre: Float64
+    normal: Float64
+    axes: Float64
+    """[2, 3] unit, in the plane."""
+    rows: Int32
+    """[I] its points, as rows of the points that were cut into planes."""
+    flat: Float64
+    """[I, 2] where these lie in the plane."""
+
+    def flattened(self, places: Float64) -> Float64:
+        """[M, 2] where points [M, 3] fall on the plane."""
+        return (places - self.centre) @ self.axes.T
+
+
+def _around(remains: Remains, means: Float32) -> Int32:
+    """Rows of the dense points near what has left its place."""
+    low, high = np.quantile(means.astype(np.float64), (0.005, 0.995), axis=0)
+    margin = max(_NEARBY * float(np.linalg.norm(high - low)), 10 * remains.points.spacing)
+    places = remains.points.points[remains.rows]
+    return remains.rows[((places >= low - margin) & (places <= high + margin)).all(axis=1)]
+
+
+def _planes(places: Float64, spacing: float) -> list[_Plane]:
+    """The planes that points [N, 3] lie on, the largest first; each point on one of them at most."""
+    thickness = _THICK * spacing
+    rng = np.random.default_rng(0)
+    rest = np.arange(len(places), dtype=np.int32)
+    least = max(_FEWEST, len(places) // 20)
+    found: list[_Plane] = []
+    for _ in range(_MOST_PLANES):
+        if len(rest) < least:
+            break
+        own = places[rest]
+        sample = own[:: max(1, len(own) // _LARGEST_BLOCK)]
+        best, support = None, 0
+        for triple in rng.integers(0, len(own), (_TRIALS, 3)):
+            a, b, c = own[triple]
+            normal = np.cross(b - a, c - a)
+            length = float(np.linalg.norm(normal))
+            if length == 0:
+                continue
+            count = int((np.abs((sample - a) @ (normal / length)) <= thickness).sum())
+            if count > support:
+                best, support = (a, normal / length), count
+        if best is None:
+            break
+        for _ in range(2):
+            near = np.abs((own - best[0]) @ best[1]) <= thickness
+            best = plane_through(own[near])
+        near = np.abs((own - best[0]) @ best[1]) <= thickness
+        if near.sum() < least:
+            break
+        centre, normal = best
+        axes = np.linalg.svd(own[near] - centre, full_matrices=False)[2][:2]
+        flat = (own[near] - centre) @ axes.T
+        if flat[:, 1].std() > thickness and _coverage(flat, spacing) >= _COVERED:
+            found.append(_Plane(centre, normal, axes, rest[near], flat))
+        rest = rest[~near]
+    return found
+
+
+def _coverage(flat: Float64, spacing: float) -> float:
+    """The share of the convex hull of points [I, 2] that is less than about two spacings from one."""
+    from scipy.spatial import ConvexHull
+
+    cells = np.unique(np.floor(flat / (2 * spacing)), axis=0)
+    return len(cells) * (2 * spacing) ** 2 / float(ConvexHull(flat).volume)
+
+
+def _behind(views: list[Uncovered], planes: list[_Plane], spacing: float) -> tuple[Float64, Int32]:
+    """Where the rays of pixels first meet a plane behind what was there, and it was not seen: [M, 3] world, and [M]
+    which plane; one of the places of each view in each cube of the spacing."""
+    from scipy.spatial import Delaunay, cKDTree
+
+    hulls = [Delaunay(plane.flat) for plane in planes]
+    trees = [cKDTree(plane.flat) for plane in planes]
+    places, plane_of = [np.zeros((0, 3))], [np.zeros(0, np.int32)]
+    for view in views:
+        v, u = np.nonzero(view.left)
+        camera = view.camera
+        local = np.stack([(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(len(u))], 1)
+        rays = local @ camera.world_to_camera[:3, :3]
+        nearest, which = np.full(len(u), np.inf), np.full(len(u), -1, np.int32)
+        for number, (plane, hull) in enumerate(zip(planes, hulls, strict=True)):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                z = ((plane.centre - camera.center) @ plane.normal) / (rays @ plane.normal)
+            fits = np.isfinite(z) & (z > view.depth[v, u] - _THICK * spacing) & (z < nearest)
+            fits[fits] = hull.find_simplex(plane.flattened(camera.center + rays[fits] * z[fits, None])) >= 0
+            nearest[fits], which[fits] = z[fits], number
+        met = np.flatnonzero((which >= 0) & (nearest < view.depth_now[v, u] + 2 * _THICK * spacing))
+        at = camera.center + rays[met] * nearest[met, None]
+        unseen = np.zeros(len(met), bool)
+        for number, (plane, tree) in enumerate(zip(planes, trees, strict=True)):
+            own = which[met] == number
+            unseen[own] = tree.query(plane.flattened(at[own]), workers=1)[0] > _UNSEEN * spacing
+        kept = np.flatnonzero(unseen)[_one_a_cube(at[unseen], spacing)]
+        places.append(at[kept])
+        plane_of.append(which[met[kept]])
+    return np.concatenate(places), np.concatenate(plane_of)
+
+
+def _seen_through(places: Float64, cameras: Cameras, depths: Sequence[DepthMap], tolerance: float) -> Bool:
+    """[M] places that a view of the capture looked through: it measured something further behind."""
+    free = np.zeros(len(places), bool)
+    for view, measured in enumerate(depths):
+        height, width = measured.depth.shape
+        rows, column, row, z = pixels_in_view(places, camera_of(cameras, view).scaled(width, height))
+        free[rows[measured.depth[row, column] > z + np.maximum(tolerance, _DEPTH_ERROR * z)]] = True
+    return free
+
+
+def _came_to_light(
+    before: EditedScene,
+    after: EditedScene,
+    instances: tuple[int, ...],
+    views: list[Uncovered],
+    places: Float64,
+    reach: float,
+) -> Bool:
+    """[N] small Gaussians of `after` near filled places that what has left had hidden: they weigh twice as much now.
+
+    No view has shaped them; they often carry the colours of what hid them. Large ones show elsewhere too, and stay.
+    """
+    from scipy.spatial import cKDTree
+
+    own = np.isin(before.instance_id, instances)
+    rest = some_rows(before, ~own)
+    with_it, without = np.zeros(len(before), np.float32), np.zeros(len(rest), np.float32)
+    for view in views:
+        np.maximum(with_it, render(before, view.camera).max_contribution, out=with_it)
+        np.maximum(without, render(rest, view.camera).max_contribution, out=without)
+    near = cKDTree(places).query(rest.means, distance_upper_bound=reach, workers=1)[0] <= reach
+    came = np.zeros(len(after), bool)
+    stayed = np.flatnonzero(~np.isin(after.instance_id, instances))[: len(rest)]  # what is new comes last
+    small = rest.log_scales.max(axis=1, initial=-np.inf) < np.log(reach)
+    came[stayed] = near & small & (without > 2 * with_it[~own])
+    return came
+
+
+def _one_a_cube(places: Float64, side: float) -> Int32:
+    """Rows of the first place in every cube, ascending."""
+    _, first = np.unique(np.floor(places / side).astype(np.int64), axis=0, return_index=True)
+    return np.sort(first).astype(np.int32)
+
+
+def _colors(places: Float64, points: PointCloud, rows: Int32) -> UInt8:
+    """The median of the nearest points: those next to what has left often carry some of its colour."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(points.points[rows]).query(places, k=min(_LENDERS, len(rows)), workers=1)[1]
+    return np.median(points.colors[rows[near]], axis=1).astype(np.uint8)
+
+
+def _flat(places: Float64, colors: UInt8, plane_of: Int32, planes: list[_Plane]) -> EditedScene:
+    """Gaussians that lie in their planes, a fifth as thick as they are wide."""
+    from scipy.spatial.transform import Rotation
+
+    made = initialise(places.astype(np.float32), colors, 0, 0.0, opacity=_OPACITY)
+    turns = [np.stack([*plane.axes, np.cross(*plane.axes)], axis=1) for plane in planes]
+    quaternions = np.array([Rotation.from_matrix(turn).as_quat(scalar_first=True) for turn in turns], np.float32)
+    log_scales = made.log_scales.copy()
+    log_scales[:, 2] -= np.float32(np.log(5))
+    return edited(replace(made, quaternions=quaternions[plane_of], log_scales=log_scales), filled=1)
+
+
+def _with_ids_of(scene: EditedScene, filling: EditedScene) -> EditedScene:
+    """The filling with the ids of the scene's nearest Gaussian that is not faint; of the background without any."""
+    from scipy.spatial import cKDTree
+
+    solid = select(scene, scene.opacities >= 0.1)
+    if not len(solid):
+        return filling
+    _, near = cKDTree(solid.means).query(filling.means, workers=1)
+    return replace(filling, instance_id=solid.instance_id[near], part_id=solid.part_id[near])
