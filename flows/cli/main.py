@@ -28,14 +28,14 @@ from ss_flow.executors import ExecutorLost  # noqa: E402
 from ss_flow.flows.cli.batch import Batch  # noqa: E402
 from ss_flow.flows.cli.care import CacheCollect, CacheUsage, CacheVerify  # noqa: E402
 from ss_flow.flows.cli.diff import Diff  # noqa: E402
+from ss_flow.flows.cli.edit import EditRun  # noqa: E402
 from ss_flow.flows.cli.evaluate import Evaluate  # noqa: E402
 from ss_flow.flows.cli.export import Export  # noqa: E402
-from ss_flow.flows.cli.edit import EditRun  # noqa: E402
 from ss_flow.flows.cli.inspect import CacheList, CacheShow, Graph, Status, Why  # noqa: E402
 from ss_flow.flows.cli.pins import CachePin, CacheUnpin  # noqa: E402
 from ss_flow.flows.cli.query import Query  # noqa: E402
-from ss_flow.flows.cli.report import WriteReport  # noqa: E402
 from ss_flow.flows.cli.render import Render  # noqa: E402
+from ss_flow.flows.cli.report import WriteReport  # noqa: E402
 from ss_flow.flows.cli.run import Demo, Run  # noqa: E402
 from ss_flow.flows.cli.setup import Doctor, ModelsFetch, ModelsList, ModelsVerify  # noqa: E402
 from ss_flow.flows.cli.sweep import Sweep  # noqa: E402
