@@ -17,7 +17,7 @@ from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows.deliver import failure_records, node_records
 from ss_flow.flows.edit_objects import Objects
-from ss_flow.flows.edit_script import Reference, Step, check
+from ss_flow.flows.edit_script import Step, check
 from ss_flow.graph import labelled, stored
 from ss_flow.resolution import Failure
 from ss_flow.tasks.artifacts import EditedScene, Gaussians
@@ -65,11 +65,11 @@ class Edit:
         return outputs | {"scene": scene}
 
 
-def prepare_edit(source: Path, script: Mapping[str, Any], store: Store, reference: Reference, folder: Path) -> Edit:
+def open_edit(source: Path, script: Mapping[str, Any], store: Store, folder: Path = Path()) -> Edit:
     """Check a script whole against a finished run.
 
-    source: the run's output folder. script: the document. store: where the run's results are. reference: makes the
-    FileRef of a file that the script names. folder: what relative paths in the script start from.
+    source: the run's output folder. script: the document. store: where the run's results are. folder: what relative
+    paths in the script start from.
     Raises InputError when the run cannot be edited, and for the script's first fault.
     """
     run, instances = _read(source / RUN_FILE), _read(source / "instances.json")
@@ -83,7 +83,7 @@ def prepare_edit(source: Path, script: Mapping[str, Any], store: Store, referenc
     if not all(digest in store for value in needed for digest in ([value] if isinstance(value, str) else value)):
         raise InputError(f"the store {store.location} no longer holds the scene of {source}; run it again.")
     scene: Gaussians = store.get(results["scene"])
-    steps, objects = check(script, Objects.of(instances, scene), reference, folder)
+    steps, objects = check(script, Objects.of(instances, scene), folder)
     return Edit(source, run, instances, script, steps, objects)
 
 

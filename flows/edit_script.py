@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from ss_flow.cache.canonical import digest_file
 from ss_flow.errors import InputError
 from ss_flow.flows.edit_objects import Objects, object_of_run
+from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import EditedScene
 from ss_flow.tasks.edit import operations
 from ss_flow.tasks.edit.operations import Motion, Vector
 
 T = TypeVar("T")
-Reference = Callable[[Path], Any]
-"""Makes the FileRef of a file."""
 _REQUIRED = cast(Any, object())
 _VERSION = 1
 _MOVING = ("duplicate", "transform", "recolour", "replace", "split")
@@ -41,11 +41,11 @@ class Step:
     fill: bool = False
 
 
-def check(script: object, objects: Objects, reference: Reference, folder: Path) -> tuple[list[Step], Objects]:
+def check(script: object, objects: Objects, folder: Path) -> tuple[list[Step], Objects]:
     """What a script comes to: the steps to run, and the objects afterwards.
 
     script: the document, {"version": 1, "operations": [...]}. objects: those of the scene; they stay as they are.
-    reference: for the files of other objects. folder: what relative paths in the script start from.
+    folder: what relative paths in the script start from.
     Raises InputError for the first fault, naming the operation, the field and what would be right.
     """
     if not isinstance(script, Mapping) or not isinstance(script.get("operations"), list):
@@ -57,12 +57,12 @@ def check(script: object, objects: Objects, reference: Reference, folder: Path) 
     objects = copy.deepcopy(objects)
     steps = []
     for number, raw in enumerate(script["operations"], 1):
-        step = _step(number, raw, objects, reference, folder)
+        step = _step(number, raw, objects, folder)
         steps += [step] if step is not None else []
     return steps, objects
 
 
-def _step(number: int, raw: object, objects: Objects, reference: Reference, folder: Path) -> Step | None:
+def _step(number: int, raw: object, objects: Objects, folder: Path) -> Step | None:
     if not isinstance(raw, Mapping):
         raise InputError(f'operation {number} must be an object such as {{"op": "remove", "instances": [3]}}.')
     op = raw.get("op")
@@ -70,7 +70,7 @@ def _step(number: int, raw: object, objects: Objects, reference: Reference, fold
         raise InputError(
             f"operation {number}: op is {op!r}; it must be one of {', '.join(_OPERATIONS)}{_hint(op, _OPERATIONS)}."
         )
-    call = _Call(number, op, dict(raw), objects, reference, folder)
+    call = _Call(number, op, dict(raw), objects, folder)
     call.take("op", str)
     call.take("comment", _text, "")
     step = _OPERATIONS[op](call)
@@ -86,10 +86,8 @@ def _hint(word: object, known: Sequence[str] | Mapping[str, Any]) -> str:
 class _Call:
     """One operation while its fields are read; what is wrong is said with its number and the field's name."""
 
-    def __init__(
-        self, number: int, op: str, raw: dict[str, Any], objects: Objects, reference: Reference, folder: Path
-    ) -> None:
-        self.number, self.op, self.objects, self.reference, self.folder = number, op, objects, reference, folder
+    def __init__(self, number: int, op: str, raw: dict[str, Any], objects: Objects, folder: Path) -> None:
+        self.number, self.op, self.objects, self.folder = number, op, objects, folder
         self._raw, self._known = raw, list[str]()
 
     def take(self, name: str, parse: Callable[[Any], T], default: T = _REQUIRED) -> T:
@@ -221,7 +219,7 @@ def _replace(call: _Call) -> Step:
         raise call.fault("run", run, error) from None
     call.objects.remove((instance,))
     new_id = call.objects.put_in(entry, parts, call.new_name(entry["name"]))
-    ref = call.reference(file)
+    ref = FileRef(file.absolute(), digest_file(file))
 
     def apply(scene: EditedScene) -> EditedScene:
         other = operations.read_object(file=ref)

@@ -12,10 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console, file_digests
+from ss_flow.flows.cli.context import StoreOptions, console
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.cli.query import read_run
-from ss_flow.task import FileRef
 
 
 @dataclass(frozen=True)
@@ -36,20 +35,13 @@ class EditRun:
     """Where results are kept."""
 
     def run(self) -> int:
-        from ss_flow.flows.edit import prepare_edit, run_edit
+        from ss_flow.flows.edit import open_edit, run_edit
 
         if self.jobs < 0:
             raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
         own_store = self.store if self.store.cache else StoreOptions(read_run(self.result)["store"])
         store = own_store.existing_store()
-        digests = file_digests(store)
-        script = _read_script(self.script)
-        try:
-            edit = prepare_edit(
-                self.result, script, store, lambda path: FileRef(path.absolute(), digests(path)), self.script.parent
-            )
-        finally:
-            digests.save()
+        edit = open_edit(self.result, _read_script(self.script), store, self.script.parent)
         out = console(json=self.json)
         with display(out) as screen:
             document = run_edit(edit, store, self.out, reporter=screen, jobs=self.jobs)

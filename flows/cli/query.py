@@ -40,6 +40,11 @@ class Query:
 
     def run(self) -> int:
         document = read_run(self.result)
+        if "edit" in document:
+            raise InputError(
+                f"{self.result} is an edited run, whose objects no photo shows as they are; search its source, "
+                f"{document['edit']['source']}."
+            )
         instances = read_json(self.result / "instances.json")
         own_store = self.store if self.store.cache else StoreOptions(document["store"])
         store = own_store.existing_store()

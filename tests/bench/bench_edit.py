@@ -21,14 +21,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.store import Store
 from ss_flow.flows.demo import RECIPE
-from ss_flow.flows.edit import prepare_edit, run_edit
+from ss_flow.flows.edit import open_edit, run_edit
 from ss_flow.flows.generated import RoomParams, generate
 from ss_flow.flows.generated.layout import COLORS, Thing, furnish
 from ss_flow.flows.generated.render import Renderer
-from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
@@ -91,7 +89,6 @@ def main() -> None:
     result = options.demo / "result"
     document = json.loads((result / "run.json").read_text())
     store = Store(options.cache or Path(document["store"]))
-    digests = FileDigests(store.root / "files.json")
     scene = store.get(document["results"]["scene"])
     true_before, before = photos(things, params.seed, cameras), renders(scene, cameras)
     found = ids_of(options.demo)
@@ -116,7 +113,7 @@ def main() -> None:
                 mask = np.concatenate([room.ids, room.held_out.ids]) == thing.instance_id
                 operation["color"] = [int(c) for c in np.rint(true_after[mask].mean(axis=0))]
             script = {"operations": [operation]}
-            edit = prepare_edit(result, script, store, lambda p: FileRef(p, digests(p)), result)
+            edit = open_edit(result, script, store)
             told = run_edit(edit, store, options.demo / "edited", jobs=1)
             after = renders(store.get(told["results"]["scene"]), cameras)
             region = changed(true_before, true_after)

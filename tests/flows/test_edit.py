@@ -1,0 +1,145 @@
+"""Editing a finished run from the command line."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_runs import bytes_of, ss_flow
+
+from ss_flow.tasks.deliver.ply import read_columns, read_gaussians
+
+SCENE_FILES = ("scene.ply", "scene_labeled.ply", "instances.json")
+
+
+def edit(warm, *operations: dict, out: str = "edited"):
+    """`ss-flow edit --json` of the run with these operations; what it came to, and the folder."""
+    place = warm.out.parent / out
+    script = place.with_suffix(".json")
+    script.write_text(json.dumps({"version": 1, "operations": list(operations)}))
+    return ss_flow("edit", warm.out, script, "--out", place, "--cache", warm.store, "--json", "--jobs", "1"), place
+
+
+def biggest(out: Path) -> int:
+    entries = json.loads((out / "instances.json").read_text())["instances"]
+    return max((e for e in entries if e["file"]), key=lambda e: e["num_gaussians"])["id"]
+
+
+def test_an_empty_script_gives_the_same_scene(warm):
+    called, place = edit(warm)
+    assert called.code == 0, called.err
+    for name in SCENE_FILES:
+        assert (place / name).read_bytes() == (warm.out / name).read_bytes(), name
+    assert bytes_of(place / "instances") == bytes_of(warm.out / "instances")
+
+
+def test_dropping_the_last_operation_gives_the_bytes_before_and_computes_nothing(warm):
+    own = biggest(warm.out)
+    first, last = {"op": "recolour", "instances": own, "color": "#2040ff"}, {"op": "remove", "instances": own}
+    _, alone = edit(warm, first, out="alone")
+    called, _ = edit(warm, first, last)
+    assert called.computed() == {"edit.remove": 1, "edit.holes": 1}
+    again, place = edit(warm, first)
+    assert again.computed() == {}
+    assert {n: (place / n).read_bytes() for n in SCENE_FILES} == {n: (alone / n).read_bytes() for n in SCENE_FILES}
+
+
+def test_changing_the_last_operation_computes_only_that(warm):
+    own = biggest(warm.out)
+    turn = {"op": "transform", "instances": own, "rotate": {"axis": [0, 0, 1], "degrees": 30}}
+    edit(warm, turn, {"op": "recolour", "instances": own, "color": [255, 0, 0]})
+    called, _ = edit(warm, turn, {"op": "recolour", "instances": own, "color": [0, 255, 0]})
+    assert called.computed() == {"edit.recolour": 1}
+
+
+def test_the_folder_tells_its_source_its_script_and_the_holes(warm):
+    own = biggest(warm.out)
+    operation = {"op": "remove", "instances": own, "fill": True, "comment": "in the way"}
+    called, place = edit(warm, operation)
+    document = json.loads((place / "run.json").read_text())
+    assert document == called.document()
+    assert document["edit"]["source"] == str(warm.out.resolve())
+    assert document["edit"]["script"]["operations"] == [operation]
+    (hole,) = document["edit"]["holes"]
+    assert hole["operation"] == 1 and hole["instances"] == [own]
+    assert 0 <= hole["open_after_filling"] <= hole["unmeasured"] <= hole["pixels"]
+    assert not (read_gaussians(place / "scene_labeled.ply").instance_id == own).any()
+    columns = read_columns(place / "scene_labeled.ply")
+    filled = columns["filled"].sum() if "filled" in columns.dtype.names else 0
+    assert filled == document["edit"]["num_filled"]
+    assert "before and after" in (place / "report.html").read_text()
+
+
+def test_an_object_of_another_run_takes_the_place_of_one(warm, tmp_path):
+    own = biggest(warm.out)
+    other, _ = edit(warm, {"op": "recolour", "instances": own, "color": "#ff00ff"}, out="other")
+    assert other.code == 0
+    replacing = {"op": "replace", "instance": own, "run": "other", "by": own, "name": "the new one"}
+    called, place = edit(warm, replacing)
+    assert called.code == 0, called.err
+    entries = {e["name"]: e for e in json.loads((place / "instances.json").read_text())["instances"]}
+    new = read_gaussians(place / entries["the new one"]["file"])
+    old = read_gaussians(place.parent / "other" / f"instances/{own:04d}.ply")
+    np.testing.assert_allclose(new.means, old.means, atol=1e-5)
+    np.testing.assert_array_equal(new.sh, old.sh)
+
+
+def test_a_bad_script_runs_nothing_and_writes_nothing(warm):
+    called, place = edit(warm, {"op": "remove", "instances": "no such thing"})
+    assert called.code == 2 and not place.exists() and called.out == ""
+    assert "operation 1 (remove): instances is 'no such thing'" in called.err
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"), [(None, "cannot be read"), ("{", "is not JSON"), ("[]", "an edit script is a JSON object")]
+)
+def test_a_file_that_is_no_script_is_refused(tiny, tmp_path, text, sentence):
+    script = tmp_path / "script.json"
+    if text is not None:
+        script.write_text(text)
+    called = ss_flow("edit", tiny.out, script, "--out", tmp_path / "out", "--cache", tiny.store)
+    assert called.code == 2 and sentence in called.err
+
+
+def test_the_source_is_never_overwritten(warm):
+    script = warm.out.parent / "script.json"
+    script.write_text('{"operations": []}')
+    before = bytes_of(warm.out)
+    called = ss_flow("edit", warm.out, script, "--out", warm.out, "--cache", warm.store)
+    assert called.code == 2 and "is the run that is edited; name another folder" in called.err
+    assert bytes_of(warm.out) == before
+
+
+def test_an_edited_run_is_edited_through_its_script(warm):
+    _, place = edit(warm, {"op": "remove", "instances": biggest(warm.out)})
+    called = ss_flow("edit", place, place.with_suffix(".json"), "--out", place.parent / "x", "--cache", warm.store)
+    assert called.code == 2 and "add the operations to its script" in called.err
+    asked = ss_flow("query", place, "red", "--cache", warm.store)
+    assert asked.code == 2 and f"search its source, {warm.out.resolve()}" in asked.err
+
+
+def test_a_scene_that_the_store_no_longer_holds_is_refused(warm, tmp_path):
+    script = tmp_path / "script.json"
+    script.write_text('{"operations": []}')
+    (tmp_path / "other").mkdir()
+    called = ss_flow("edit", warm.out, script, "--out", tmp_path / "out", "--cache", tmp_path / "other")
+    assert called.code == 2 and "no longer holds the scene" in called.err
+
+
+def test_the_page_s_lines_of_python_edit_a_run(warm, monkeypatch, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "editing.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1)
+    own = biggest(warm.out)
+    entries = json.loads((warm.out / "instances.json").read_text())["instances"]
+    entry = next(e for e in entries if e["id"] == own)
+    (warm.out.parent / "ss-flow-demo").mkdir()
+    (warm.out.parent / "ss-flow-demo" / "result").symlink_to(warm.out)
+    run = json.loads((warm.out / "run.json").read_text())
+    (warm.out / "run.json").write_text(json.dumps(run | {"store": str(warm.store)}))
+    monkeypatch.chdir(warm.out.parent)
+    exec(compile(code.replace("red object", entry["name"]), "docs/editing.md", "exec"), {})
+    assert f"({entry['num_gaussians']}, 3)" in capsys.readouterr().out
+    assert set(read_gaussians(Path("only-red/scene_labeled.ply")).instance_id) == {own}
