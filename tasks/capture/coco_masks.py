@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
-from ss_flow.running import progress
+from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Frame, MaskSet
 from ss_flow.tasks.capture.id_images import frame_pixels
+from ss_flow.tasks.capture.ingest import first_of
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import is_number, read_json
 from ss_flow.tasks.masks.pool import mask_set
@@ -48,6 +49,8 @@ def coco_masks(
         raise InputError(
             f"{file.path} lists no image named after a view; {names[0]}.jpg, for one, is expected among its file names."
         )
+    if without := [frame.name for frame in frames if frame.name not in images]:
+        warn(f"{file.path.name} does not list {len(without)} of {len(frames)} views: {first_of(without)}.")
     result = []
     for i, frame in enumerate(frames):
         progress(i, len(frames), frame.name)
@@ -86,6 +89,7 @@ def _contents(path: Path) -> tuple[dict[str, dict[str, Any]], dict[Any, list[dic
         images[stem] = image
         ids.add(image["id"])
     annotations: dict[Any, list[dict[str, Any]]] = {}
+    crowds = 0
     for number, annotation in enumerate(document["annotations"]):
         named = {"id": f"number {number}", **annotation}
         if not _is_id(annotation.get("image_id")) or annotation["image_id"] not in ids:
@@ -93,8 +97,12 @@ def _contents(path: Path) -> tuple[dict[str, dict[str, Any]], dict[Any, list[dic
                 f"annotation {named['id']} of {path} has the image_id {annotation.get('image_id')!r}, which is that of "
                 "no image of the file."
             )
-        if not annotation.get("iscrowd"):
+        if annotation.get("iscrowd"):
+            crowds += 1
+        else:
             annotations.setdefault(annotation["image_id"], []).append(named)
+    if crowds:
+        warn(f"{crowds} crowd regions of {path.name} are left out: each stands for many objects at once.")
     return images, annotations
 
 

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from ss_flow.errors import InputError
+from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Clicks, Float64, Frame
+from ss_flow.tasks.capture.ingest import first_of
 from ss_flow.tasks.capture.lens import Lens, photo_lens, undistorted
 from ss_flow.tasks.capture.scene_files import Hint, Hints, Point, is_number, read_json
 
@@ -87,6 +89,9 @@ def clicks(
                 ).astype(np.int32),
             )
         )
+    used = {frame.name for frame in frames}
+    if lost := [view for view in dict.fromkeys(hint.view for hint in hints.hints) if view not in used]:
+        warn(f"The points of {hints.path.name} in views that are left out do not count: {first_of(lost)}.")
     if not any(len(of_view.label) for of_view in result):
         raise InputError(f"{hints.path} has hints for none of the {len(frames)} views that are used; give some there.")
     return tuple(result)

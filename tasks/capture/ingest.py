@@ -6,6 +6,7 @@ Masks and depth follow the frames they belong to by name, so that frames may hav
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +54,7 @@ def frames(
     skipped: views of the capture that are not among these, of which the run is to warn.
     Raises InputError when a photo is damaged, or its size or that of its valid mask is not the stated one.
     """
-    warn_of_skipped(skipped, "without a photo, a pose or a depth map")
+    warn_of_skipped(skipped, "without a readable photo, a pose or a depth map")
     result = []
     sizes: dict[Lens, tuple[int, int, str]] = {}
     for i, (name, ref) in enumerate(zip(names, photos, strict=True)):
@@ -76,9 +77,13 @@ def frames(
 def warn_of_skipped(names: tuple[str, ...], why: str) -> None:
     """Say which views are left out of a run, the first of them by name."""
     if names:
-        shown = f"{', '.join(names[:_NAMED])}{f' and {len(names) - _NAMED} more' if len(names) > _NAMED else ''}"
         views = "1 view is" if len(names) == 1 else f"{len(names)} views are"
-        warn(f"{views} left out, {why}: {shown}.")
+        warn(f"{views} left out, {why}: {first_of(names)}.")
+
+
+def first_of(names: Sequence[str]) -> str:
+    """Names in words, the first of them where there are many."""
+    return f"{', '.join(names[:_NAMED])}{f' and {len(names) - _NAMED} more' if len(names) > _NAMED else ''}"
 
 
 def frame_of(

@@ -52,7 +52,8 @@ def is_colmap(root: Path) -> bool:
 def open_colmap(root: Path) -> SceneFiles:
     """The largest model of a COLMAP workspace, by registered images.
 
-    Photos lie in `images/`, or beside the model. World units are arbitrary (`metric` is False).
+    Photos lie in `images/`, or beside the model; those that the model lacks are skipped. World units are arbitrary
+    (`metric` is False).
     Raises InputError when a file is damaged, a photo missing, or a lens unknown.
     """
     models = [(folder, *_read_model(folder)) for folder in _models(root)]

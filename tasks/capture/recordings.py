@@ -69,6 +69,9 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
     reader.release()
     floor = params.min_sharpness * float(np.median([s for s, _, _ in best]))
     kept = [frame for sharpness, _, frame in best if sharpness >= floor]
+    warn_of_skipped(
+        tuple(frame.name for sharpness, _, frame in best if sharpness < floor), "blurred beside the other frames"
+    )
     return tuple(kept[: params.max_frames])
 
 

@@ -12,7 +12,15 @@ from ss_flow.tasks.capture.layout_colmap import is_colmap, open_colmap
 from ss_flow.tasks.capture.layout_nerfstudio import open_nerfstudio
 from ss_flow.tasks.capture.layout_scannet import is_scannet, open_scannet, open_sens
 from ss_flow.tasks.capture.layout_tum import open_tum
-from ss_flow.tasks.capture.scene_files import PHOTO_SUFFIXES, VIDEO_SUFFIXES, SceneFiles, by_stem, files_in, read_json
+from ss_flow.tasks.capture.scene_files import (
+    PHOTO_SUFFIXES,
+    UNREAD_SUFFIXES,
+    VIDEO_SUFFIXES,
+    SceneFiles,
+    by_stem,
+    files_in,
+    read_json,
+)
 
 ACCEPTED = (
     "a folder of photos, a video, a COLMAP workspace (sparse/ and images/), a nerfstudio transforms.json, a ScanNet "
@@ -120,6 +128,7 @@ def _open_loose(path: Path) -> SceneFiles:
             name=path.resolve().name,
             names=tuple(p.stem for p in photos),
             photos=tuple(photos),
+            skipped=tuple(file.name for file in files_in(photos[0].parent, UNREAD_SUFFIXES)),
         )
     if len(recordings) > 1:
         raise InputError(f"{path} holds {len(recordings)} recordings; give the path of one of them.")

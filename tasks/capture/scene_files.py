@@ -17,6 +17,8 @@ from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.lens import Lens
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+UNREAD_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raw"})
+"""Photos of cameras and phones that are not read."""
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 
 Pose = tuple[float, ...]
@@ -91,7 +93,7 @@ class SceneFiles:
     zero_is_void: bool = True
     """Whether 0 in them means "not annotated"; otherwise it is background."""
     skipped: tuple[str, ...] = ()
-    """Views of the capture that are left out, for lack of a photo, a pose or a depth map."""
+    """Views of the capture that are left out, for lack of a photo that can be read, a pose or a depth map."""
 
     @property
     def place(self) -> Path:

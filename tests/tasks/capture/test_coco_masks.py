@@ -164,9 +164,19 @@ def test_masks_that_overlap_stay_apart_and_know_their_parents(tmp_path):
 def test_views_are_known_by_the_stems_of_file_names_and_those_not_listed_have_no_masks(tmp_path):
     made.photos(tmp_path)
     document = coco({"some/where/10.png": [rectangle(0, 0, 8, 8)], "C:\\here\\2.JPG": [], "other.jpg": [[[1, 2]]]})
-    two, ten, eleven = read(tmp_path, document)
+    with pytest.warns(UserWarning, match=r"does not list 1 of 3 views: 11\."):
+        two, ten, eleven = read(tmp_path, document)
     assert [len(found) for found in (two, ten, eleven)] == [0, 1, 0]
     assert (two.dense().shape, two.parent.shape) == ((0, HEIGHT, WIDTH), (0,))
+
+
+def test_crowd_regions_are_left_out_with_a_warning(tmp_path):
+    made.photos(tmp_path)
+    document = coco({f"{name}.jpg": [rectangle(0, 0, 8, 8)] for name in ("2", "10", "11")})
+    document["annotations"][0]["iscrowd"] = 1
+    with pytest.warns(UserWarning, match="1 crowd regions of .* are left out"):
+        found = read(tmp_path, document)
+    assert [len(masks) for masks in found] == [0, 1, 1]
 
 
 def masks_both_ways(root: Path, ids: np.ndarray, lenses=None, radial: float = 0.0, **changes):

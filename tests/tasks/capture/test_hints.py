@@ -134,6 +134,15 @@ def test_a_point_that_only_the_distorted_photo_shows_is_refused(tmp_path):
         read(made.photos(tmp_path), hint([[0.5, 0.5]]), lenses=(lens,) * 3)
 
 
+def test_hints_for_a_view_that_is_left_out_are_warned_of(tmp_path):
+    made.photos(tmp_path)
+    (tmp_path / "hints.json").write_text(json.dumps({"2": {"mug": [[3, 4]]}, "10": {"mug": [[3, 4]]}}))
+    scene = open_scene(tmp_path).every(2)
+    views = frames(names=scene.names, photos=refs(scene.photos))
+    with pytest.warns(UserWarning, match=r"hints.json in views that are left out do not count: 10\."):
+        clicks(views, made.cameras_of(views), names=scene.names, hints=scene.hints)
+
+
 def test_hints_for_views_that_are_all_left_out_are_refused(tmp_path):
     made.photos(tmp_path)
     (tmp_path / "hints.json").write_text(json.dumps({"10": {"mug": [[3, 4]]}}))

@@ -79,6 +79,16 @@ def test_the_largest_colmap_model_is_taken(tmp_path, binary):
     np.testing.assert_allclose(read_points(scene.sparse), [[0.5, 1.5, 2.5], [3, 4, 5]])
 
 
+def test_photos_that_a_colmap_model_lacks_or_that_are_not_read_are_skipped(tmp_path):
+    made.colmap(tmp_path / "colmap", binary=True)
+    assert open_scene(tmp_path / "colmap").skipped == ()
+    (tmp_path / "colmap/images/12.png").write_bytes((tmp_path / "colmap/images/2.png").read_bytes())
+    assert open_scene(tmp_path / "colmap").skipped == ("12",)
+    loose = made.photos(tmp_path / "loose")
+    (next(loose.rglob("2.*")).parent / "IMG_3.HEIC").write_bytes(b"")
+    assert open_scene(loose).skipped == ("IMG_3.HEIC",)
+
+
 def test_a_colmap_model_that_pycolmap_wrote_reads_the_same(tmp_path):
     import zlib  # noqa: F401
 
@@ -187,7 +197,7 @@ def test_frames_of_a_transforms_json_whose_photo_is_missing_are_left_out_with_a_
     scene = open_scene(tmp_path)
     assert scene.skipped == ("10",) and scene.names == tuple(name for name in whole.names if name != "10")
     files = tuple(FileRef(photo, "") for photo in scene.photos)
-    with pytest.warns(UserWarning, match="1 view is left out, without a photo, a pose or a depth map: 10."):
+    with pytest.warns(UserWarning, match="1 view is left out, without a readable photo, a pose or a depth map: 10."):
         ingest.frames(names=scene.names, photos=files, lenses=scene.lenses, skipped=scene.skipped)
 
 
