@@ -153,7 +153,9 @@ def prepare(
                 encoder=networks.encoder,
             )
         target = options.target
-        return results if target in (None, *results) else results | {target: _until(target, results)}
+        if target is None or target in results:
+            return results
+        return results | {target: _until(target, results)}
 
     return Prepared(scene, params, networks, build)
 
