@@ -24,11 +24,12 @@ from ss_flow.tasks.geometry.images import encode_png
 RUN_FILE = "run.json"
 
 
-def check_place(folder: Path) -> None:
-    """Raises InputError unless an output folder can be written here: a new one, or in the place of an earlier one."""
+def check_place(folder: Path, mark: str = RUN_FILE) -> None:
+    """Raises InputError unless an output folder can be written here: a new one, or in the place of an earlier one,
+    which holds the file `mark`."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; --out must name a folder.")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / RUN_FILE).is_file():
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / mark).is_file():
         raise InputError(f"{folder} holds something else than an earlier result; name another folder with --out.")
     _check_nearest(folder, folder.absolute().parents)
 

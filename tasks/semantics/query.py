@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Descriptors, Float32, Int32, UInt8
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
-from ss_flow.tasks.ranges import Fraction, Positive
+from ss_flow.tasks.ranges import Count, Fraction, Positive
 from ss_flow.tasks.semantics.encoders import encoder_of
 
 _TEMPERATURE = 10.0
@@ -22,14 +24,36 @@ _HALF = 0.5
 class QueryParams:
     """Which instances a text means."""
 
+    select: Literal["delta", "topk"] = "delta"
+    """Of the instances that the text fits: "delta" takes those near the best, "topk" the best few."""
     tau_corr: Positive = 0.02
-    """How much further than the best an instance's descriptor may be from the text and still match."""
+    """With delta: how much further than the best an instance's descriptor may be from the text and still match."""
+    top_k: Count = 1
+    """With topk: how many match at most."""
     min_relevancy: Fraction = 0.5
     """Relevancy above which a text fits an instance: above 0.5 it fits better than every negative of the encoder; 0
     leaves out the test, as in the paper. Colour words keep to 0.5."""
     prompt: str = "{text}"
     """What the encoder reads, with the text in the place of {text}; "an image of a {text}" in the code of the paper's
     authors."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """How well a text fits each instance."""
+
+    text: str
+    encoder: str
+    """Name of the text-image encoder."""
+    absolute: bool
+    """Whether a text fits an instance or not, whatever the others are like (`TextImageEncoder.absolute`)."""
+    instance_id: Int32
+    """[L] in the order of the descriptors."""
+    score: Float32
+    """[L] cosine of the instance's descriptor and the text, of several terms the least; -1 without a descriptor. Of a
+    text that only says what is not meant, 1 less the largest cosine."""
+    relevancy: Float32
+    """[L] 0..1, above 0.5 where every term fits better than every negative; 0 for an instance without a descriptor."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +83,24 @@ class QueryResult:
         return [int(i) for i in self.instance_id[self.matched > 0]]
 
 
-@task(environment=network_identity)
+def terms(text: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What a text asks for, and what it does not mean: "red mug, not the lamp" -> ("red mug",), ("the lamp",).
+
+    Terms stand between commas; what follows the word "not" (or "but not") in a term is not meant.
+    Raises InputError for a text without a term, and a "not" that nothing follows.
+    """
+    wanted, unwanted = [], []
+    for term in text.split(","):
+        first, *others = (part.strip() for part in re.split(r"\b(?:but\s+)?not\b", term, flags=re.IGNORECASE))
+        wanted += [first] if first else []
+        if not all(others):
+            raise InputError(f'In the query {text!r} nothing follows "not"; ask for something like "red, not the mug".')
+        unwanted += others
+    if not wanted and not unwanted:
+        raise InputError('The query is empty; ask for something, for example "the red mug".')
+    return tuple(wanted), tuple(unwanted)
+
+
 def query(
     descriptors: tuple[Descriptors, ...],
     *,
@@ -68,27 +109,40 @@ def query(
     encoder: Model | None = None,
     background: bool = False,
 ) -> QueryResult:
-    """Rank the instances against a text; an instance matches when the text fits it and delta < tau_corr.
+    """Rank the instances against a text; in a flow, two nodes. See `similarity` and `chosen`."""
+    found = similarity(descriptors, text=text, prompt=params.prompt, encoder=encoder, background=background)
+    return chosen(found, params=params)
 
-    The text fits where relevancy > `min_relevancy`: the smallest, over the encoder's negatives n, of the softmax share
-    exp(10 s) / (exp(10 s) + exp(10 s_n)) (Kerr et al., "LERF", Sec. 3.4).
+
+@task(name="semantics.similarity", environment=network_identity)
+def similarity(
+    descriptors: tuple[Descriptors, ...],
+    *,
+    text: str,
+    prompt: str = QueryParams.prompt,
+    encoder: Model | None = None,
+    background: bool = False,
+) -> Similarity:
+    """How well a text fits each instance.
+
+    A term fits where relevancy > 0.5: the smallest, over the encoder's negatives n, of the softmax share
+    exp(10 s) / (exp(10 s) + exp(10 s_n)) (Kerr et al., "LERF", Sec. 3.4). Of several terms (see `terms`) all must fit;
+    those that are not meant are further negatives of each. A text that only says what is not meant fits where none of
+    these terms does.
 
     With colour words the negatives are the other colours, so a text fits the objects of which its colour is the most
-    common; being red is no matter of degree between objects, and all of these match, whatever their delta.
+    common.
 
     background: whether the background (id 0) is ranked too. It is no object: a text that fits it best, "wall" or
     "grey", would otherwise leave the objects further than tau_corr behind.
 
-    Raises InputError for an empty text, a text that the encoder cannot read, descriptors of another encoder, a
-    tau_corr that is not positive, and a prompt without {text}.
+    Raises InputError for an empty text, a text that the encoder cannot read, descriptors of another encoder, and a
+    prompt without {text}.
     """
     model = encoder_of(encoder)
-    if not text.strip():
-        raise InputError('The query is empty; ask for something, for example "the red mug".')
-    if not params.tau_corr > 0:
-        raise InputError(f"tau_corr is {params.tau_corr}; it must be above 0 (0.02 is usual).")
-    if "{text}" not in params.prompt:
-        raise InputError(f"The prompt {params.prompt!r} has no {{text}} in it; one is 'an image of a {{text}}'.")
+    wanted, unwanted = terms(text)
+    if "{text}" not in prompt:
+        raise InputError(f"The prompt {prompt!r} has no {{text}} in it; one is 'an image of a {{text}}'.")
     foreign = sorted({d.encoder for d in descriptors} - {model.name})
     if foreign:
         raise InputError(
@@ -96,29 +150,57 @@ def query(
             "encoder."
         )
     ranked = [d for d in descriptors if background or d.instance_id != 0]
-    texts = [params.prompt.replace("{text}", phrase) for phrase in (text, *model.negatives(text))]
-    words = model.encode_texts(texts)
-    ids = np.array([d.instance_id for d in ranked], np.int32)
-    vectors = np.array([d.embedding for d in ranked], np.float32).reshape(len(ids), model.dimension)
+    vectors = np.array([d.embedding for d in ranked], np.float32).reshape(len(ranked), model.dimension)
     seen = np.linalg.norm(vectors, axis=1) > 0
-    cosines = np.einsum("ld,td->lt", vectors, words)
-    cosines[~seen] = -1
-    order = np.lexsort((ids, -cosines[:, 0]))
-    cosines, seen = cosines[order], seen[order]
-    score = cosines[:, 0]
-    delta = score[:1] - score
-    relevancy = _relevancy(score, cosines[:, 1:]) * seen
-    fits = relevancy > (_HALF if model.absolute else params.min_relevancy)
-    matched = fits if model.absolute else fits & (delta < params.tau_corr)
-    return QueryResult(
+
+    def cosines(phrases: tuple[str, ...]) -> Float32:
+        words = model.encode_texts([prompt.replace("{text}", phrase) for phrase in phrases])
+        return np.einsum("ld,td->lt", vectors, words)
+
+    fits = [cosines((term, *model.negatives(term), *(unwanted if wanted else ()))) for term in wanted or unwanted]
+    scores = np.stack([found[:, 0] for found in fits], axis=1)
+    relevancies = np.stack([_relevancy(found[:, 0], found[:, 1:]) for found in fits], axis=1)
+    score, relevancy = (
+        (scores.min(axis=1), relevancies.min(axis=1))
+        if wanted
+        else (1 - scores.max(axis=1), 1 - relevancies.max(axis=1))
+    )
+    return Similarity(
         text=text,
         encoder=model.name,
-        instance_id=ids[order],
+        absolute=model.absolute or not wanted,
+        instance_id=np.array([d.instance_id for d in ranked], np.int32),
+        score=np.where(seen, score, -1).astype(np.float32),
+        relevancy=(relevancy * seen).astype(np.float32),
+    )
+
+
+@task(name="semantics.query")
+def chosen(found: Similarity, *, params: QueryParams = QueryParams()) -> QueryResult:
+    """The instances, the best first; one matches when the text fits it and, by `select`, delta < tau_corr or it is
+    among the first `top_k`.
+
+    With colour words being red is no matter of degree between objects: with "delta" all that the text fits match.
+
+    Raises InputError for a tau_corr that is not positive.
+    """
+    if not params.tau_corr > 0:
+        raise InputError(f"tau_corr is {params.tau_corr}; it must be above 0 (0.02 is usual).")
+    order = np.lexsort((found.instance_id, -found.score))
+    score, relevancy = found.score[order], found.relevancy[order]
+    delta = score[:1] - score
+    fits = relevancy > (_HALF if found.absolute else params.min_relevancy)
+    by_delta = (delta < params.tau_corr) | found.absolute
+    near = np.cumsum(fits) <= params.top_k if params.select == "topk" else by_delta
+    return QueryResult(
+        text=found.text,
+        encoder=found.encoder,
+        instance_id=found.instance_id[order],
         score=score,
         margin=score - np.append(score[1:], score[-1:]),
         delta=delta,
-        relevancy=relevancy.astype(np.float32),
-        matched=matched.astype(np.uint8),
+        relevancy=relevancy,
+        matched=(fits & near).astype(np.uint8),
         accepted=bool(fits[:1].any()),
     )
 

@@ -7,6 +7,8 @@ import json
 import pytest
 from tiny_runs import ss_flow
 
+from ss_flow.tasks.deliver.ply import read_gaussians
+
 
 def colours(tiny) -> dict[str, int]:
     """The colour words of the small things, whose objects are in the table's order the last ones."""
@@ -67,3 +69,39 @@ def test_what_nothing_matches_is_said(tiny):
     answer = ss_flow("query", tiny.out, absent, "--cache", tiny.store)
     assert answer.code == 0
     assert f"nothing in the scene matches '{absent}' (colour words); the nearest are:" in answer.out
+
+
+def test_the_folder_of_an_answer_shows_what_matches_in_every_photo_and_in_space(tiny, tmp_path):
+    import cv2
+    import numpy as np
+
+    out = tmp_path / "answer"
+    answer = ss_flow("query", tiny.out, "not purple", "--out", out, "--json", "--cache", tiny.store)
+    assert answer.code == 0, answer.err
+    document = json.loads((out / "answer.json").read_text())
+    assert document == answer.document()
+    matched = [row["id"] for row in document["instances"] if row["matched"]]
+    scene, own = (read_gaussians(f) for f in (tiny.out / "scene_labeled.ply", out / "answer.ply"))
+    assert matched and np.array_equal(own.means, scene.means[np.isin(scene.instance_id, matched)])
+    photos = sorted((tiny.out / "masks").iterdir())
+    assert [p.name for p in photos] == [p.name for p in sorted((out / "masks").iterdir())]
+    for photo in photos:
+        mask = cv2.imread(str(out / "masks" / photo.name), -1)
+        assert mask.dtype == np.uint8
+        assert np.array_equal(mask, 255 * np.isin(cv2.imread(str(photo), -1), matched))
+    again = ss_flow("query", tiny.out, "purple", "--out", out, "--json", "--cache", tiny.store)
+    assert again.code == 0 and json.loads((out / "answer.json").read_text())["text"] == "purple"
+
+
+def test_an_answer_never_takes_the_place_of_anything_else(tiny, tmp_path):
+    answer = ss_flow("query", tiny.out, "red", "--out", tiny.out, "--cache", tiny.store)
+    assert answer.code == 2 and "holds something else" in answer.err
+    assert (tiny.out / "run.json").is_file()
+
+
+def test_the_best_few_take_the_place_of_those_near_the_best(tiny):
+    answer = ss_flow("query", tiny.out, "not purple", "--top-k", "1", "--json", "--cache", tiny.store)
+    assert sum(row["matched"] for row in answer.document()["instances"]) == 1
+    for wrong in (("--top-k", "0"), ("--top-k", "2", "--tau-corr", "0.1")):
+        refused = ss_flow("query", tiny.out, "red", *wrong, "--cache", tiny.store)
+        assert refused.code == 2 and "--top-k takes a whole number" in refused.err

@@ -7,7 +7,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Descriptors
 from ss_flow.tasks.models.colour_words import TERMS
 from ss_flow.tasks.semantics import query as module
-from ss_flow.tasks.semantics.query import QueryParams, query
+from ss_flow.tasks.semantics.query import QueryParams, chosen, query, similarity, terms
 
 
 def descriptor(instance_id: int, embedding, encoder: str = "colour words") -> Descriptors:
@@ -35,7 +35,10 @@ class Directions:
     """A stand-in for CLIP in three dimensions: a word is a direction."""
 
     name, dimension, sees_masks, absolute = "directions", 3, False, False
-    words = {"east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1), "an image of a east": (0, 1, 0)}  # noqa: RUF012
+    words = {  # noqa: RUF012
+        "east": (1, 0, 0), "north": (0, 1, 0), "up": (0, 0, 1), "an image of a east": (0, 1, 0),
+        "north-east": (0.5**0.5, 0.5**0.5, 0),
+    }  # fmt: skip
 
     def encode_texts(self, texts):
         return np.array([self.words[text] for text in texts], np.float32)
@@ -179,3 +182,66 @@ def test_a_tau_that_matches_nothing_is_refused():
 def test_descriptors_of_another_encoder_are_refused():
     with pytest.raises(InputError, match="made by clip-b16"):
         query((descriptor(1, np.ones(11), "clip-b16"),), text="red")
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted", "unwanted"),
+    [
+        ("red mug", ("red mug",), ()),
+        ("red mug, not the lamp", ("red mug",), ("the lamp",)),
+        ("Not the wall", (), ("the wall",)),
+        ("a mug but not red, wooden", ("a mug", "wooden"), ("red",)),
+        ("knot, a notebook", ("knot", "a notebook"), ()),
+        ("cup not red not blue", ("cup",), ("red", "blue")),
+    ],
+)
+def test_a_text_is_taken_apart_into_what_is_meant_and_what_is_not(text, wanted, unwanted):
+    assert terms(text) == (wanted, unwanted)
+
+
+@pytest.mark.parametrize("text", ["red, not", "not", "cup not, red"])
+def test_a_not_that_nothing_follows_is_refused(text):
+    with pytest.raises(InputError, match='nothing follows "not"'):
+        query(ROOM, text=text)
+
+
+def test_of_several_terms_all_must_fit_and_the_least_counts(directions):
+    room = (at_degrees(1, 0), at_degrees(2, 45), at_degrees(3, 90))
+    found = query(room, text="east, north", params=QueryParams(tau_corr=2.0))
+    assert found.instance_id[0] == 2
+    np.testing.assert_allclose(found.score, [0.5**0.5, 0, 0], atol=1e-6)
+    assert found.matches() == [2]
+
+
+def test_what_is_not_meant_counts_against_what_is(directions):
+    room = (at_degrees(1, 5), at_degrees(2, 60))
+    everything = QueryParams(tau_corr=2.0)
+    assert query(room, text="east", params=everything).matches() == [1, 2]
+    found = query(room, text="east, not north", params=everything)
+    assert found.matches() == [1]
+    # exp(10 cos 60) / (exp(10 cos 60) + exp(10 cos 30))
+    assert found.relevancy[1] == pytest.approx(1 / (1 + np.exp(10 * (np.sqrt(3) / 2 - 0.5))), abs=1e-6)
+
+
+def test_a_text_of_only_what_is_not_meant_finds_all_the_rest(directions):
+    room = (at_degrees(1, 0), at_degrees(2, 120), at_degrees(3, 0, height=3.0))
+    found = query(room, text="not east")
+    assert found.matches() == [2, 3] and found.instance_id.tolist() == [2, 3, 1]
+    assert query(ROOM, text="not red").matches() == [1, 3, 5]
+
+
+def test_topk_takes_the_best_few_that_fit(directions):
+    room = (at_degrees(1, 40), at_degrees(2, 0), at_degrees(3, 20), at_degrees(4, 0, height=5.0))
+    for count, expected in ((1, [2]), (2, [2, 3]), (9, [2, 3, 1])):
+        assert query(room, text="east", params=QueryParams(select="topk", top_k=count)).matches() == expected
+
+
+def test_topk_with_colour_words_takes_the_best_few_of_that_colour():
+    assert query(ROOM, text="red", params=QueryParams(select="topk", top_k=1)).matches() == [4]
+
+
+def test_a_search_is_the_choice_among_similarities():
+    found = similarity(ROOM, text="red")
+    assert found.instance_id.tolist() == [1, 2, 3, 4, 5]
+    ours, theirs = chosen(found, params=QueryParams()), query(ROOM, text="red")
+    assert ours.matches() == theirs.matches() and np.array_equal(ours.score, theirs.score)
