@@ -9,7 +9,7 @@ from typing import Any
 
 from ss_flow.errors import InputError
 from ss_flow.flows.params import CaptureParams
-from ss_flow.flows.poses import poses
+from ss_flow.flows.poses import poses, refined_poses
 from ss_flow.graph import INDEX, each
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, Clicks, DepthMap, Frame, LabelMap, MaskSet, Registration, SceneUnit
@@ -68,6 +68,10 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
             metric=scene.metric,
             sparse=reference(scene.sparse) if scene.sparse else None,
         )
+        if params.refine_poses:
+            cameras = refined_poses(frames, cameras, params)
+    elif params.refine_poses:
+        raise InputError(f"{scene.root} has no poses that could be refined; leave --refine-poses out.")
     else:
         cameras = poses(frames, params.sfm, scene.names or None)
         frames = registered(frames, cameras)

@@ -9,6 +9,7 @@ from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
 from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.recordings import VideoParams
+from ss_flow.tasks.capture.refine_poses import RefinePosesParams
 from ss_flow.tasks.capture.registration import RegistrationParams
 from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -43,11 +44,14 @@ class CaptureParams:
     """Where depth comes from; "auto" is the sensor where there is one, else several views (mvs)."""
     calibrate: Literal["none", "depth"] = "none"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
+    refine_poses: bool = False
+    """Whether poses that come with the capture are first refined by bundle adjustment."""
     monodepth: str = "auto"
     """The network for depth=mono: a name of the catalogue, or "auto"."""
     ingest: IngestParams = field(default_factory=IngestParams)
     video: VideoParams = field(default_factory=VideoParams)
     sfm: SfmParams = field(default_factory=SfmParams)
+    refine: RefinePosesParams = field(default_factory=RefinePosesParams)
     sweep: SweepParams = field(default_factory=SweepParams)
     agreement: AgreementParams = field(default_factory=AgreementParams)
     registration: RegistrationParams = field(default_factory=RegistrationParams)

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import INDEX, each, expand, gather, pick
 from ss_flow.tasks.artifacts import Cameras, Frame
 from ss_flow.tasks.capture.features import Features, features
 from ss_flow.tasks.capture.matches import Matches, match
 from ss_flow.tasks.capture.pairs import Look, look, partners
+from ss_flow.tasks.capture.refine_poses import refined_cameras
 from ss_flow.tasks.capture.sfm import SfmParams, Unregistered, accepted, sfm, unregistered
 
 
@@ -29,6 +31,13 @@ def poses(frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] |
         return accepted(gather(tries), missing, min_registered=params.min_registered)
 
     return expand(missing, complete)
+
+
+def refined_poses(frames: tuple[Frame, ...], cameras: Cameras, params: CaptureParams) -> Cameras:
+    """Add the nodes that refine the poses of the frames, which came with the capture."""
+    found = each(frames, build=lambda frame: features(frame, params=params.sfm.features))
+    looks = each(found, build=lambda photo: look(photo, count=params.sfm.pairs.look_features))
+    return refined_cameras(found, cameras, matched(found, looks, params.sfm, None), params=params.refine)
 
 
 def matched(

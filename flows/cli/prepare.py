@@ -142,8 +142,10 @@ def prepare(
         held_out = scene.root / "held_out"
         extra: Capture | None = None
         if held_out.is_dir():
-            uncalibrated = replace(params.capture, calibrate="none")  # of these views only the photos count
-            extra = capture(open_scene(held_out), reference, uncalibrated, networks.monodepth)
+            plain = replace(
+                params.capture, calibrate="none", refine_poses=False
+            )  # of these views only the photos count
+            extra = capture(open_scene(held_out), reference, plain, networks.monodepth)
         results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
         if text is not None:
             results["query"] = query(

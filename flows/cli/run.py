@@ -40,6 +40,8 @@ class Run:
     """A file (.json) of a few points clicked on objects in a few views; the segmenter looks for these objects only."""
     calibrate: Literal["none", "depth"] = "none"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
+    refine_poses: bool = False
+    """Refine the poses that come with the capture by bundle adjustment before anything else."""
     undistorted: bool = False
     """Also write the photos and cameras that the run worked with, without distortion, as a COLMAP workspace."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
@@ -49,6 +51,8 @@ class Run:
         params = settings.preset(Params(), self.execution.preset)
         if self.calibrate != "none":
             params = settings.apply(params, [f"capture.calibrate={self.calibrate}"])
+        if self.refine_poses:
+            params = settings.apply(params, ["capture.refine_poses=true"])
         out = self.out or Path("ss-flow-out") / self.scene.resolve().stem
         scene = open_scene(self.scene, self.masks, self.hints)
         return run_scene(scene, out, params, self.execution, undistorted=self.undistorted)

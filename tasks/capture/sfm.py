@@ -13,6 +13,7 @@ from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Frame, Int32
 from ss_flow.tasks.capture.colmap import load_pycolmap
+from ss_flow.tasks.capture.colmap_database import fill_database
 from ss_flow.tasks.capture.features import FeatureParams, Features
 from ss_flow.tasks.capture.ingest import warn_of_skipped
 from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map
@@ -79,21 +80,13 @@ def sfm(
     with fixed seeds, so that two runs agree to the bit.
     """
     pycolmap = load_pycolmap()
-    database, names = pycolmap.Database.open(":memory:"), {}
-    shapes: list[tuple[str, int, int]] = []
-    with pycolmap.DatabaseTransaction(database):
-        cameras: dict[tuple[int, int], int] = {}
-        for i in range(len(photos)):
-            photo = photos[i]
-            shapes.append((photo.name, photo.width, photo.height))
-            names[photo.name] = i
-            size = (photo.width, photo.height)
-            if size not in cameras:
-                cameras[size] = len(cameras) + 1
-                _write_camera(pycolmap, database, photo, cameras[size], params)
-            _write_photo(pycolmap, database, photo, i + 1, cameras[size])
-        for a, b, geometry in _geometries(pycolmap, (*matches, *again), names):
-            database.write_two_view_geometry(a + 1, b + 1, geometry)
+    model = getattr(pycolmap.CameraModelId, params.camera_model)
+
+    def lens(photo: Features, _: int) -> tuple[tuple[int, int], Any]:
+        size = (photo.width, photo.height)
+        return size, pycolmap.Camera.create_from_model_id(1, model, FIRST_FOCAL * max(size), *size)
+
+    database, kept = fill_database(photos, (*matches, *again), lens)
     manager = pycolmap.ReconstructionManager()
     pipeline = pycolmap.IncrementalPipeline(_mapping_options(pycolmap, params, seed), database, manager)
     registered = 2
@@ -108,7 +101,7 @@ def sfm(
     models = [manager.get(number) for number in range(manager.size())]
     whole = [model for model in models if _plausible(model)]
     best = max(whole, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-    return _cameras(best, shapes, params)
+    return _cameras(best, [(photo.name, photo.width, photo.height) for photo in kept], params)
 
 
 @task(name="capture.unregistered")
@@ -165,40 +158,6 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
         result.append(frame)
         progress(i + 1, len(cameras), name)
     return tuple(result)
-
-
-def _write_camera(pycolmap: Any, database: Any, photo: Features, number: int, params: MappingParams) -> None:
-    """The camera that all photos of one size share, and the rig that COLMAP wants around it."""
-    model = getattr(pycolmap.CameraModelId, params.camera_model)
-    focal = FIRST_FOCAL * max(photo.width, photo.height)
-    camera = pycolmap.Camera.create_from_model_id(number, model, focal, photo.width, photo.height)
-    database.write_camera(camera, use_camera_id=True)
-    rig = pycolmap.Rig(rig_id=number)
-    rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
-    database.write_rig(rig, use_rig_id=True)
-
-
-def _write_photo(pycolmap: Any, database: Any, photo: Features, number: int, camera: int) -> None:
-    database.write_image(pycolmap.Image(name=photo.name, camera_id=camera, image_id=number), use_image_id=True)
-    frame = pycolmap.Frame(frame_id=number, rig_id=camera)
-    frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera), number))
-    database.write_frame(frame, use_frame_id=True)
-    database.write_keypoints(number, photo.points)
-
-
-def _geometries(pycolmap: Any, matches: tuple[Matches, ...], rows: dict[str, int]) -> list[tuple[int, int, Any]]:
-    """Each pair of photos with its geometry, the last one that is given, in the photos' order."""
-    found = {}
-    for own in matches:
-        for i, other in enumerate(own.others):
-            geometry = pycolmap.TwoViewGeometry(
-                config=int(own.configuration[i]),
-                F=own.fundamental[i],
-                inlier_matches=own.pair[own.first[i] : own.first[i + 1]].astype(np.uint32),
-            )
-            a, b = rows[own.name], rows[other]
-            found[min(a, b), max(a, b)] = (a, b, geometry)
-    return [found[pair] for pair in sorted(found)]
 
 
 def _mapping_options(pycolmap: Any, params: MappingParams, seed: int) -> Any:

@@ -1,0 +1,194 @@
+"""Poses that are given but not exact -> better ones: bundle adjustment (Triggs et al. 2000) that starts from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.running import progress, warn
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Cameras, Float64
+from ss_flow.tasks.capture.colmap import load_pycolmap
+from ss_flow.tasks.capture.colmap_database import fill_database
+from ss_flow.tasks.capture.features import Features
+from ss_flow.tasks.capture.matches import Matches
+from ss_flow.tasks.ranges import Count, Positive
+
+_LEAST_POINTS = 100
+"""Fewer common points say nothing about the poses of a whole capture."""
+
+
+@dataclass(frozen=True)
+class RefinePosesParams:
+    """How given poses are refined."""
+
+    first_error: Positive = 24.0
+    """How far off its place, in pixels, a point may be seen while the given poses hold; every round halves it."""
+    last_error: Positive = 3.0
+    """The same in the last round."""
+    min_points: Count = 30
+    """A photo that sees fewer points keeps its given pose."""
+    intrinsics: bool = False
+    """Whether focal lengths are refined too."""
+
+
+@task(name="capture.refined_cameras", isolate=True)
+def refined_cameras(
+    photos: Sequence[Features],
+    cameras: Cameras,
+    matches: tuple[Matches, ...],
+    *,
+    params: RefinePosesParams = RefinePosesParams(),
+    seed: int = 0,
+) -> Cameras:
+    """The cameras with poses under which the photos' common points agree best.
+
+    Points are triangulated with the given poses; then poses and points are adjusted together, in rounds that let ever
+    smaller errors count. Photos tell neither the scale nor the place of the world: the result is brought onto the given
+    cameras by the best similarity. How far the poses moved, and the median reprojection error of the same points
+    before and after, is told as a warning. Sparse points are those of the last round.
+    Raises InputError when the photos have too little in common.
+    """
+    pycolmap = load_pycolmap()
+
+    def lens(photo: Features, row: int) -> tuple[tuple[float, ...], Any]:
+        numbers = [*cameras.intrinsics[row].tolist()]
+        camera = pycolmap.Camera(model="PINHOLE", width=photo.width, height=photo.height, params=numbers)
+        return (photo.width, photo.height, *numbers), camera
+
+    database, _ = fill_database(photos, matches, lens)
+    cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    for row, pose in enumerate(cameras.world_to_camera):
+        if model.exists_frame(row + 1):
+            model.frame(row + 1).rig_from_world = pycolmap.Rigid3d(pose[:3])
+            model.register_frame(row + 1)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    error = max(params.first_error, params.last_error)
+    focal = float(np.median(cameras.intrinsics[:, 0]))
+    while True:
+        filtering, triangulating = _limits(pycolmap, error, focal, seed)
+        numbers = sorted(model.reg_image_ids())
+        for i, number in enumerate(numbers):
+            mapper.triangulate_image(triangulating, number)
+            progress(i, len(numbers), f"points within {error:g} pixels")
+        mapper.complete_and_merge_tracks(triangulating)
+        mapper.filter_points(filtering)
+        if model.num_points3D() < _LEAST_POINTS:
+            raise InputError(
+                f"the poses cannot be refined: only {model.num_points3D()} points are seen in common as the given "
+                "poses would have it; leave --refine-poses out, or give the photos without poses."
+            )
+        _adjust(pycolmap, model, poses=True, intrinsics=params.intrinsics)
+        mapper.filter_points(filtering)
+        if error <= params.last_error:
+            break
+        error = max(error / 2, params.last_error)
+    mapper.end_reconstruction(False)
+    return _result(pycolmap, model, cameras, params)
+
+
+def _limits(pycolmap: Any, error: float, focal: float, seed: int) -> tuple[Any, Any]:
+    """What COLMAP filters and triangulates by when points may be seen so far off, in pixels."""
+    filtering = pycolmap.IncrementalMapperOptions()
+    filtering.num_threads = 1
+    filtering.random_seed = seed
+    filtering.filter_max_reproj_error = error
+    triangulating = pycolmap.IncrementalTriangulatorOptions()
+    triangulating.random_seed = seed
+    triangulating.create_max_angle_error = triangulating.continue_max_angle_error = float(np.degrees(error / focal))
+    triangulating.complete_max_reproj_error = triangulating.merge_max_reproj_error = error
+    return filtering, triangulating
+
+
+def _adjust(pycolmap: Any, model: Any, *, poses: bool, intrinsics: bool) -> None:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_rig_from_world = poses
+    options.refine_sensor_from_rig = options.refine_extra_params = False
+    options.refine_focal_length = intrinsics
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1
+    scope = pycolmap.BundleAdjustmentConfig()
+    for number in sorted(model.reg_image_ids()):
+        scope.add_image(number)
+    if poses:
+        scope.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, scope, model).solve()
+
+
+def _result(pycolmap: Any, model: Any, given: Cameras, params: RefinePosesParams) -> Cameras:
+    rows = [number - 1 for number in sorted(model.reg_image_ids()) if _points(model, number) >= params.min_points]
+    after = _median_error(model)
+    poses = np.stack([np.vstack([model.image(row + 1).cam_from_world().matrix(), (0, 0, 0, 1)]) for row in rows])
+    model.transform(pycolmap.Sim3d(_similarity(poses, given.world_to_camera[rows])))
+    world_to_camera, intrinsics = given.world_to_camera.copy(), given.intrinsics.copy()
+    for row in rows:
+        world_to_camera[row, :3] = model.image(row + 1).cam_from_world().matrix()
+        intrinsics[row] = model.image(row + 1).camera.params
+    points = [point.xyz for _, point in sorted(model.points3D.items()) if point.track.length() >= 3]
+    for number in model.reg_image_ids():
+        model.frame(number).rig_from_world = pycolmap.Rigid3d(given.world_to_camera[number - 1][:3])
+    _adjust(pycolmap, model, poses=False, intrinsics=False)
+    _tell(given, world_to_camera, rows, (_median_error(model), after))
+    return replace(
+        given,
+        world_to_camera=world_to_camera,
+        intrinsics=intrinsics,
+        sparse_points=np.array(points, np.float32).reshape(-1, 3),
+    )
+
+
+def _similarity(poses: Float64, given: Float64) -> Float64:
+    """[3, 4] the similarity that brings cameras onto the given ones: its rotation from how they look, which also holds
+    where they stand in a line; its scale and place from where they stand.
+    """
+    u, _, vt = np.linalg.svd(np.einsum("kji,kjl->il", given[:, :3, :3], poses[:, :3, :3]))
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    source, target = _centers(poses) @ rotation.T, _centers(given)
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    scale = (a * b).sum() / max((a * a).sum(), 1e-12)
+    return np.column_stack([scale * rotation, target.mean(axis=0) - scale * source.mean(axis=0)])
+
+
+def _tell(given: Cameras, refined: Float64, rows: list[int], errors: tuple[float, float]) -> None:
+    moved = np.linalg.norm(_centers(refined) - _centers(given.world_to_camera), axis=1)[rows]
+    turn = refined[rows, :3, :3] @ given.world_to_camera[rows, :3, :3].transpose(0, 2, 1)
+    turned = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    warn(
+        f"The given poses of {len(rows)} of {len(given)} views were refined: they moved by {np.median(moved):.3g} "
+        f"{'m' if given.metric else 'units'} (at most {moved.max():.3g}) and turned by {np.median(turned):.2f} degrees "
+        f"(at most {turned.max():.2f}); points are seen {errors[1]:.2f} pixels off their place instead of "
+        f"{errors[0]:.2f} (medians)."
+    )
+
+
+def _points(model: Any, number: int) -> int:
+    return int(model.image(number).num_points3D)
+
+
+def _centers(world_to_camera: Float64) -> Float64:
+    centers: Float64 = -np.einsum("kji,kj->ki", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
+    return centers
+
+
+def _median_error(model: Any) -> float:
+    """Median distance of points from where they are seen, in pixels."""
+    errors = []
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        seen = image.get_observation_points2D()
+        if seen:
+            places = np.array([model.point3D(point.point3D_id).xyz for point in seen])
+            pose = image.cam_from_world().matrix()
+            local = places @ pose[:, :3].T + pose[:, 3]
+            focal, centre = image.camera.params[:2], image.camera.params[2:]
+            projected = local[:, :2] / local[:, 2:] * focal + centre
+            errors.append(np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1))
+    return float(np.median(np.concatenate(errors)))
