@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,29 @@ def initialise(
         instance_conf=np.broadcast_to(np.asarray(confidence, np.float32), (n,)).copy(),
         part_id=np.broadcast_to(np.asarray(part_id, np.int32), (n,)).copy(),
     )
+
+
+def laid_flat(gaussians: Gaussians, thickness: float, neighbours: int = 12) -> Gaussians:
+    """Round Gaussians on a surface as discs that lie in it.
+
+    The surface's normal at a centre is the direction in which its nearest other centres spread least (Hoppe et al.
+    1992). thickness: standard deviation along it, as a share of that along the surface. Round Gaussians reach as far
+    off the surface as along it, which no view that looks straight at it can tell. Fewer than four stay as they are.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(gaussians) < 4:
+        return gaussians
+    points = gaussians.means.astype(np.float64)
+    _, near = cKDTree(points).query(points, k=min(neighbours, len(points)), workers=1)
+    around = points[near] - points[near].mean(axis=1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    normal = axes[:, :, 0] * np.where(axes[:, 2:, 0] < 0, -1, 1)
+    # The shortest turn from z to the normal.
+    turn = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(len(points))], axis=1)
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    flat = gaussians.log_scales + np.float32([0, 0, np.log(thickness)])
+    return replace(gaussians, quaternions=turn.astype(np.float32), log_scales=flat)
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -154,14 +154,6 @@ def crop_camera(full: Camera, inside: Bool, points: Float32 | Float64, params: C
     return cropped.scaled(max(1, round(cropped.width * scale)), max(1, round(cropped.height * scale)))
 
 
-def instance_view(
-    scene: SceneViews, view: int, mask: Bool, surface: PointSurface, *, crop: CropParams, ignore_occluded: bool = True
-) -> TrainView:
-    """One view of a single instance (spec P1). mask: [H, W]. The rest as for `group_view`."""
-    channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
-    return group_view(scene, view, channels, surface, crop=crop, ignore_occluded=ignore_occluded)
-
-
 def group_view(
     scene: SceneViews,
     view: int,
@@ -172,7 +164,7 @@ def group_view(
     ignore_occluded: bool = True,
     around: Float32 | None = None,
 ) -> TrainView:
-    """One view of a group of instances (spec P1, P4).
+    """One view of an instance (spec P1) or of a group of them (P4).
 
     Pixels are *inside* a mask of the group (colour counts), *free* (nothing of the group may be seen), or ignored:
     where something lies in front of the group's surface, where a depth needed to tell is unknown, or where the frame
@@ -194,13 +186,18 @@ def group_view(
 
 
 def background_view(
-    scene: SceneViews, view: int, mask: Bool, surface: PointSurface, *, crop: CropParams, ignore_occluded: bool = True
+    scene: SceneViews,
+    view: int,
+    channels: Int32,
+    surface: PointSurface,
+    *,
+    crop: CropParams,
+    ignore_occluded: bool = True,
 ) -> TrainView:
     """One view of the background, which goes on unseen behind all else: only pixels that look through it are free.
 
-    mask: [H, W]. The rest as for `group_view`.
+    All as for `group_view`.
     """
-    channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
     seen = _crop(scene, view, channels, crop, surface.points)
     free = seen.outside
     if ignore_occluded:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -11,16 +12,25 @@ from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import REFINED, Float32, Gaussians, InstanceMasks, Int32
 from ss_flow.tasks.gaussians.densification import Schedule
-from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, initialise
+from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, initialise, laid_flat
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
-from ss_flow.tasks.gaussians.views import CropParams, PointSurface, SceneViews, Views, background_view, instance_view
+from ss_flow.tasks.gaussians.views import (
+    NONE_OF_MINE,
+    CropParams,
+    PointSurface,
+    SceneViews,
+    Views,
+    background_view,
+    group_view,
+)
 from ss_flow.tasks.geometry.cameras import camera_extent
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import dilated
-from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive, Range
+from ss_flow.tasks.splat.consensus import agreed
 
 
 @dataclass(frozen=True)
@@ -45,6 +55,14 @@ class ReconstructParams:
     """Most Gaussians of an instance; 0 = any number, as in the paper."""
     background_scale: Positive = 2.0
     """Factor on steps, points and Gaussians for the background, which is the largest by far."""
+    thickness: Annotated[float, Range(0.0, 1.0, open_below=True)] = 0.1
+    """Standard deviation of the first Gaussians along the normal of the surface that the points lie on, as a share of
+    that along the surface; 1 = round, as in 3DGS."""
+    first_opacity: Annotated[float, Range(0.0, 1.0, open_below=True, open_above=True)] = 0.5
+    """Opacity of the first Gaussians; 0.1 in 3DGS."""
+    tau_agree: Fraction = 0.5
+    """Near the border of a mask, pixels count neither as inside nor as outside if less than this share of the views
+    that see their surface point agree; 0 = all count."""
     objective: Objective = Objective()
     """What the training makes small."""
     ignore_occluded: bool = True
@@ -61,8 +79,8 @@ class ReconstructParams:
     max_scale: NonNegative = 0.05
     """No Gaussian becomes longer (one standard deviation) than this share of the extent, or than it starts where that
     is more; 0 = any."""
-    rates: LearningRates = LearningRates()
-    """How fast each parameter is learnt."""
+    rates: LearningRates = LearningRates(rotation=3e-4)
+    """How fast each parameter is learnt; discs that turn fast come to stand on end."""
     dilation: Natural = 0
     """Pixels by which masks are dilated for the first training; 1 in the code of the paper's authors."""
     crop: CropParams = CropParams()
@@ -135,13 +153,15 @@ def retrain(
 
 def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussians:
     rows = thin(instance.points, round(params.max_points * params.scale_of(instance)))
-    return initialise(
+    first = initialise(
         instance.points[rows],
         instance.colors[rows],
         instance.instance_id,
         instance.point_confidence[rows],
         instance.point_part[rows],
+        opacity=params.first_opacity,
     )
+    return laid_flat(first, params.thickness) if params.thickness < 1 else first
 
 
 def thin(points: Float32, limit: int) -> Int32:
@@ -163,11 +183,11 @@ def _trained(
     scene: SceneViews, instance: InstanceMasks, initial: Gaussians, params: ReconstructParams, iterations: int
 ) -> Gaussians:
     surface = PointSurface.of(instance.points)
-    build = background_view if instance.instance_id == 0 else instance_view
+    build = background_view if instance.instance_id == 0 else group_view
     row = {frame.name: i for i, frame in enumerate(scene.frames)}
     views = [
-        build(scene, row[name], mask, surface, crop=params.crop, ignore_occluded=params.ignore_occluded)
-        for name, mask in zip(instance.views, instance.dense(), strict=True)
+        build(scene, row[name], channels, surface, crop=params.crop, ignore_occluded=params.ignore_occluded)
+        for name, channels in zip(instance.views, _channels(scene, instance, params), strict=True)
     ]
     views = [view for view in views if view.inside.any()]
     if not views:
@@ -186,6 +206,14 @@ def _trained(
         warn(f"Training left nothing of instance {instance.instance_id}; it stays as its points.")
         return initial
     return result.gaussians
+
+
+def _channels(scene: SceneViews, instance: InstanceMasks, params: ReconstructParams) -> Iterable[Int32]:
+    """[H, W] of each view with a mask: 0 inside, NONE_OF_MINE outside, IGNORED where the pixel says nothing."""
+    # What is background is what is left over: there is no mask of it to doubt.
+    if params.tau_agree and instance.instance_id:
+        return agreed(scene, instance, params.tau_agree)
+    return (np.where(mask, 0, NONE_OF_MINE).astype(np.int32) for mask in instance.dense())
 
 
 def _settings(params: ReconstructParams, iterations: int, scale: float) -> TrainParams:

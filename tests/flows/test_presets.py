@@ -128,9 +128,14 @@ TABLE = {
             "color": (2.5e-3, 2.5e-3, 1e-2),
             "opacity": (0.025, 0.025, 0.05),
             "scale": (5e-3, 5e-3, 2e-2),
-            "rotation": (1e-3, 1e-3, 3e-3),
         }.items()
     },
+    "splat.reconstruct.rates.rotation": (1e-3, 1e-3, 3e-4),
+    "splat.merge.rates.rotation": (1e-3, 1e-3, 3e-3),
+    # 3DGS's first Gaussians; discs in the surface in ours. What other views say of a mask's border is ours alone.
+    "splat.reconstruct.thickness": (1.0, 1.0, 0.1),
+    "splat.reconstruct.first_opacity": (0.1, 0.1, 0.5),
+    "splat.reconstruct.tau_agree": (0.0, 0.0, 0.5),
     # 24: degree 0 below 2,000 steps is the trainer's rule.
     "splat.reconstruct.sh_degree": (3, 3, 3),
     # In 3DGS lengths are shares of the radius of the cameras.

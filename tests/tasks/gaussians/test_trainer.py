@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ss_flow.running import Surroundings, running
-from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify
-from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
+from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify, rotations
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, laid_flat, select
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.render import render
@@ -316,3 +316,26 @@ def test_a_training_that_was_interrupted_goes_on_to_the_same_bytes(strategy, tmp
     assert resumed.gaussians.means.tobytes() == alone.gaussians.means.tobytes()
     assert resumed.gaussians.sh.tobytes() == alone.gaussians.sh.tobytes()
     assert resumed.loss.tobytes() == alone.loss.tobytes()
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, -1, 0), (0.3, -0.5, -0.8)])
+def test_discs_lie_in_the_surface(normal):
+    normal = np.array(normal) / np.linalg.norm(normal)
+    across = np.linalg.svd(normal[None])[2][1:]
+    points = (np.random.default_rng(0).random((200, 2)) @ across).astype(np.float32)
+    round_ = initialise(points, np.zeros((200, 3), np.uint8), 3, 1.0)
+    flat = laid_flat(round_, 0.1)
+    axes, scales = rotations(flat.quaternions), np.exp(flat.log_scales)
+    np.testing.assert_allclose(np.abs(axes[:, :, 2] @ normal), 1, atol=1e-5)
+    np.testing.assert_allclose(scales[:, 2], 0.1 * scales[:, 0], rtol=1e-5)
+    np.testing.assert_array_equal(flat.log_scales[:, :2], round_.log_scales[:, :2])
+    few = laid_flat(select(round_, np.arange(3)), 0.1)
+    np.testing.assert_array_equal(few.log_scales, round_.log_scales[:3])
+
+
+def test_discs_on_a_ball_point_outwards():
+    around = np.random.default_rng(1).normal(size=(2000, 3))
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    flat = laid_flat(initialise(around.astype(np.float32), np.zeros((2000, 3), np.uint8), 3, 1.0), 0.2)
+    outwards = np.abs(np.einsum("nd,nd->n", rotations(flat.quaternions)[:, :, 2], around))
+    assert np.median(outwards) > 0.99 and (outwards > 0.9).mean() > 0.98

@@ -17,7 +17,6 @@ from ss_flow.tasks.gaussians.views import (
     background_view,
     crop_camera,
     group_view,
-    instance_view,
     propagated_depth,
     sample_depth,
     whole_view,
@@ -36,12 +35,10 @@ def views_of(small: SmallScene, **changes) -> SceneViews:
     return replace(small.views.compared(VisibilityParams()), **changes)
 
 
-def built(
-    small: SmallScene, view: int, instance_id: int, scene: SceneViews | None = None, build=instance_view, **options
-):
+def built(small: SmallScene, view: int, instance_id: int, scene: SceneViews | None = None, build=group_view, **options):
     surface = PointSurface(small.points[small.labels == instance_id][::3], 0.02)
-    mask = small.ids[view] == instance_id
-    return build(scene or views_of(small), view, mask, surface, crop=CropParams(), **options)
+    channels = np.where(small.ids[view] == instance_id, 0, NONE_OF_MINE).astype(np.int32)
+    return build(scene or views_of(small), view, channels, surface, crop=CropParams(), **options)
 
 
 def hidden_by_box(small: SmallScene, view: int) -> np.ndarray:

@@ -1,0 +1,82 @@
+"""What all views say together about the borders of masks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from ball_and_box import HEIGHT, WIDTH, SmallScene
+
+from ss_flow.tasks.artifacts import InstanceMasks
+from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE
+from ss_flow.tasks.geometry.visibility import VisibilityParams
+from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.splat.consensus import agreed
+
+BALL = 2
+
+
+@pytest.fixture(scope="module")
+def small() -> SmallScene:
+    return SmallScene()
+
+
+def with_mask(instance: InstanceMasks, row: int, mask: np.ndarray) -> InstanceMasks:
+    masks = instance.dense()
+    masks[row] = mask
+    return replace(instance, packed=pack_masks(masks))
+
+
+def channels_of(small: SmallScene, instance: InstanceMasks, share: float = 0.5) -> list[np.ndarray]:
+    return list(agreed(small.views.compared(VisibilityParams()), instance, share))
+
+
+def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0
+
+
+def test_masks_on_which_all_views_agree_stay_as_they_are(small):
+    instance = small.instance(BALL)
+    for mask, channels in zip(instance.dense(), channels_of(small, instance), strict=True):
+        assert (channels == IGNORED).sum() <= 0.03 * mask.sum()
+        np.testing.assert_array_equal(channels[channels != IGNORED] == 0, mask[channels != IGNORED])
+
+
+def test_what_one_mask_holds_beyond_the_object_says_nothing(small):
+    instance = small.instance(BALL)
+    true = instance.mask(0)
+    wide = grown(true, 4)
+    channels = channels_of(small, with_mask(instance, 0, wide))[0]
+    beyond = wide & ~true & (small.depths[0].depth > 0)
+    assert (channels[beyond] == IGNORED).mean() > 0.6  # the rest is seen from hardly anywhere else
+    assert (channels[true] == 0).mean() > 0.97
+    assert (channels[~wide] == NONE_OF_MINE).all()
+
+
+def test_what_one_mask_leaves_out_says_nothing(small):
+    instance = small.instance(BALL)
+    true = instance.mask(0)
+    narrow = ~grown(~true, 3)
+    channels = channels_of(small, with_mask(instance, 0, narrow))[0]
+    left_out = true & ~narrow
+    assert (channels[left_out] == IGNORED).mean() > 0.6
+    assert (channels[narrow] == 0).all()
+    assert (channels[~true] != 0).all()
+
+
+def test_without_depth_or_with_too_few_views_masks_stay(small):
+    instance = small.instance(BALL)
+    wide = with_mask(instance, 0, grown(instance.mask(0), 4))
+    unknown = tuple(replace(d, depth=np.zeros_like(d.depth)) for d in small.depths)
+    blind = replace(small.views, depths=unknown).compared(VisibilityParams())
+    assert not any((channels == IGNORED).any() for channels in agreed(blind, wide, 0.5))
+    two = small.instance(BALL, views=(0, 1))
+    two = with_mask(two, 0, np.ones((HEIGHT, WIDTH), bool))
+    assert not any((channels == IGNORED).any() for channels in channels_of(small, two))
+
+
+def test_a_mask_without_pixels_is_no_error(small):
+    instance = with_mask(small.instance(BALL), 3, np.zeros((HEIGHT, WIDTH), bool))
+    assert (channels_of(small, instance)[3] == NONE_OF_MINE).all()
