@@ -91,9 +91,9 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
 
 def weight_free(scene: SceneFiles, params: Params, networks: Networks) -> str | None:
     """What to say of a run whose masks come from no network only because there is none on this machine."""
-    if networks.segmenter is not None or scene.has_masks or params.split.segmenter != "auto":
-        return None
-    return WEIGHT_FREE
+    brings_its_own = scene.has_masks or scene.hints is not None  # hints without a segmenter are refused
+    wanted = networks.segmenter is None and params.split.segmenter == "auto"
+    return WEIGHT_FREE if wanted and not brings_its_own else None
 
 
 def node_records(report: Report) -> list[dict[str, Any]]:
