@@ -42,7 +42,7 @@ class Roots:
     held: set[str] = field(default_factory=set)
     """Keys of actions that stay whatever happens, and their outputs with them."""
     kept: set[str] = field(default_factory=set)
-    """Keys of actions that go only for their age, or for want of room."""
+    """Keys of actions that go only when they are too old, or when there is too little room."""
     objects: set[str] = field(default_factory=set)
     """Digests of objects that stay whatever happens."""
 
@@ -77,7 +77,7 @@ def collect(
 
     Raises StoreFailure when the store cannot be used.
     """
-    # In this order: who starts later than `now` makes, and uses, things that are too young to go.
+    # The clock is read first: what another process makes or uses from now on is then too young to be deleted.
     now = store.now()
     claims = store.open_claims()
     claims.distrust(now - GRACE_SECONDS)
@@ -99,7 +99,7 @@ def collect(
         for file, size in _old_files(store.root, ("checkpoints/*",), before):
             if file.stem not in living:
                 _take(file, size, others["checkpoints"], dry=dry)
-        # These files may be being written now, so they are kept for a while whatever the grace period is.
+        # Another process may be writing these files now, so they stay for an hour, however short the grace period.
         for file, size in _old_files(store.root, HIDDEN, now - GRACE_SECONDS):
             _take(file, size, others["temporary files"], dry=dry)
     if not dry:
@@ -150,7 +150,7 @@ class _Plan:
         self.bytes -= self.survey.actions[key].bytes + self._count(key, -1)
 
     def _count(self, key: str, change: int) -> int:
-        """Count an action's outputs up or down; return the bytes of those that thereby stay, or go."""
+        """Count an action's outputs up or down; return the bytes of the outputs that stay, or go, because of it."""
         size = 0
         for name in self.survey.actions[key].outputs:
             self._names[name] += change

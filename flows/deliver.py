@@ -18,7 +18,8 @@ from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
 from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.scene_files import SceneFiles
-from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_cloud, write_masks, write_scene
+from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_masks, write_scene
+from ss_flow.tasks.deliver.ply import write_cloud
 
 STATUS_EXIT = {"ok": 0, "degraded": 3, "failed": 1}
 METRICS = {
@@ -151,7 +152,7 @@ def write_all(
     maps = {folder / name: results.all(name) for name in ("masks_split", "masks")}
     instances = instances_document(results.all("refine"), scene, results.one("names"), results.one("hierarchy"))
     write_scene(folder, scene, instances)
-    write_cloud(folder, results.one("dense"), results.one("cut"), results.one("parts"))
+    write_cloud(folder / "cloud_labeled.ply", results.one("dense"), results.one("cut"), results.one("parts"))
     stated = dict(zip(scene_files.names, scene_files.lenses, strict=True)) if scene_files.lenses else {}
     lenses = [photo_lens(frame, stated.get(frame.name), cameras) for frame in frames]
     write_masks(maps, frames, lenses)

@@ -37,7 +37,7 @@ HEADLINE = (
     "query.matched_share",
     "query.best",
 )
-"""Those to show where nobody chose."""
+"""Those that are shown when no --metric is given."""
 
 
 def names_of(steps: Iterable[str]) -> list[str]:

@@ -50,7 +50,7 @@ class Tokens:
         )
 
     def take(self, job: Job, *, waiting: int) -> None:
-        """Start a job; the last one that waits gets the cores that nobody wants."""
+        """Start a job; where no other job waits, it gets the spare cores too, up to its `most_cores`."""
         wanted = job.invocation.resources
         if wanted.most_cores > wanted.cores and waiting == 0:
             spare = int(self._capacity.cores - self._held["cores"])

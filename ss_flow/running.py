@@ -54,7 +54,7 @@ def running(surroundings: Surroundings) -> Iterator[None]:
 
 
 def progress(done: int, total: int, note: str = "") -> None:
-    """Say how far a long task is; free of cost where nobody listens. A cancelled task ends here."""
+    """Say how far a long task is; costs nothing where there is no listener. A cancelled task ends here."""
     _surroundings.get().listener(done, total, note)
 
 

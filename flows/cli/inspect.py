@@ -127,7 +127,8 @@ class Why:
         for reason in reasons[:5]:
             these = [n for n in computed if n["why"] == reason]
             what = these[0]["label"] if len(these) == 1 else these[0]["step"]
-            out.print(escape(f"{what}: {reason}{_times(these)}"))
+            count = f" ({len(these)} of them)" if len(these) > 1 else ""
+            out.print(escape(f"{what}: {reason}{count}"))
             for cause in _causes(these[0], nodes):
                 out.print(escape(f"  because {cause}"))
         return 0
@@ -152,10 +153,6 @@ def run_with(store: Store, scene: Path | None, name: str) -> tuple[Run | None, l
             if nodes := named(run, run.nodes(), name):
                 return run, nodes
     return None, []
-
-
-def _times(nodes: list[dict[str, Any]]) -> str:
-    return f" ({len(nodes)} of them)" if len(nodes) > 1 else ""
 
 
 def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:

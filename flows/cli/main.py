@@ -140,7 +140,7 @@ def main(arguments: list[str]) -> int:
 
 def entry() -> None:
     """The console script."""
-    # A cluster's queue asks a job to go by SIGTERM: it then keeps what it has, as after Ctrl-C.
+    # A cluster's queue stops a job with SIGTERM: the run then keeps what it has, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     code = main(sys.argv[1:])
     sys.stdout.flush()

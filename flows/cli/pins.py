@@ -26,7 +26,7 @@ Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 
 @dataclass(frozen=True)
 class CachePin:
-    """Keep results whatever `cache gc` deletes; without a name, list what is pinned."""
+    """Keep results from being deleted by `cache gc`; without a name, list what is pinned."""
 
     what: PositionalText = None
     """A step (propagate, segment[0003]) of the latest run that got to it, the first characters of a digest, or a scene:
@@ -69,7 +69,7 @@ class CachePin:
 
 
 def _pin_results(store: Store, what: str, run: Run, nodes: list[dict[str, Any]]) -> Pin:
-    # Looking them up counts as a use, so that no collector that is at work already takes them.
+    # Looking them up counts as a use, so that a `cache gc` that runs at the same time leaves them alone.
     keys = [key for key in dict.fromkeys(node["key"] for node in nodes) if store.action(key) is not None]
     if not keys:
         raise InputError(f"the results of {what!r} are no longer in the store; run {run.scene} again first.")

@@ -276,7 +276,7 @@ def _declared(workers: list[dict[str, Any]]) -> set[str]:
 
 
 def _offer(worker: dict[str, Any], declared: set[str]) -> dict[str, float]:
-    """What a worker has: as it declares, or, of what nobody declares, as Dask knows it."""
+    """What a worker has: as it declares; of a resource that no worker declares, what Dask knows of it."""
     known = {"GPU": 0, "memory_mb": (worker["memory_limit"] or 0) >> 20, "cores": worker["nthreads"]}
     return {name: worker["resources"].get(name, 0) if name in declared else known[name] for name in RESOURCES}
 

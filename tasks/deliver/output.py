@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap, PointCloud, PointLabels, PointParts
+from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_pixels import photo_pixels
 from ss_flow.tasks.deliver import ply
@@ -85,11 +85,6 @@ def write_scene(folder: Path, scene: Gaussians, instances: Mapping[str, Any]) ->
             own = scene.instance_id == entry["id"]
             one = replace(scene, **{f.name: getattr(scene, f.name)[own] for f in fields(scene)})
             ply.write_gaussians(folder / entry["file"], one, labelled=True)
-
-
-def write_cloud(folder: Path, cloud: PointCloud, labels: PointLabels, parts: PointParts) -> None:
-    """Write cloud_labeled.ply."""
-    ply.write_cloud(folder / "cloud_labeled.ply", cloud, labels, parts)
 
 
 def write_masks(

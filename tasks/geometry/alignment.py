@@ -43,7 +43,7 @@ def fit_scale_shift(
         spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
         bound = 1.345 * min(spread, max_relative)
         weight = np.minimum(1.0, bound / np.maximum(np.abs(residual), 1e-12)) / y**2
-        # Points far off are others' surfaces, on which even Huber's loss would lean.
+        # Points far off belong to other surfaces; they would pull even with Huber's loss.
         weight[np.abs(residual) > 3 * max_relative] = 0
         mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
         variance = np.average((x - mean_x) ** 2, weights=weight)

@@ -26,7 +26,7 @@ class TextImageEncoder(Protocol):
 
     @property
     def absolute(self) -> bool:
-        """Whether a text fits an object or not, whatever the other objects are like ("red")."""
+        """Whether a text fits an object does not depend on the other objects ("red")."""
         ...
 
     def encode_images(self, images: Sequence[UInt8], masks: Sequence[Bool] | None = None) -> Float32:

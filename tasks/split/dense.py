@@ -84,7 +84,7 @@ def consistent_cloud(
         )
         if kept.sum() <= params.max_points:
             break
-        # On surfaces the count falls with the square of the side; a little more ends the loop soon.
+        # On surfaces the count falls with the square of the side; a slightly larger side ends the loop soon.
         voxel *= 1.05 * float(np.sqrt(kept.sum() / params.max_points))
         cloud = sum_by_voxel([cloud.take(kept)], voxel)
     points = means[kept].astype(np.float32)

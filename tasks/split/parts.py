@@ -66,7 +66,7 @@ def find_parts(
             points = seen.point_index[owner == j]
             if len(points):
                 found.append(_PartMask(seen.name, int(shown[j]), points))
-    # An order that the order of the views has no part in.
+    # An order that does not depend on the order of the views.
     found.sort(key=lambda mask: (mask.label, -len(mask.points), mask.points.tobytes(), mask.view))
     votes = Votes(len(labels.label))
     whole = [0]

@@ -32,7 +32,7 @@ class SegmentParams:
     adaptive: bool = True
     """Whether the finest grid leaves out the points where the coarser ones agree."""
     settled_by: Count = 3
-    """So many prompts whose smallest mask holds a point agree there: a prompt at the point would hardly find more."""
+    """A point that lies in the smallest masks of so many prompts is not prompted: it would hardly find more."""
     pred_iou: Fraction = 0.8
     """Least quality that the segmenter itself predicts (row 3)."""
     stability: tuple[Fraction, ...] | None = None

@@ -83,8 +83,8 @@ def segment_rgbd(frame: Frame, depth: DepthMap, cameras: Cameras, *, params: Seg
     columns = ((np.arange(width) + 0.5) * frame.width / width).astype(np.intp)
     pick = np.ix_(rows, columns)
     valid_small = valid[pick]
-    # Thin holes would cut every surface into pieces. They are closed for the masks alone: no step that compares depths
-    # may take what is guessed for what was measured.
+    # Thin holes would cut every surface into pieces. They are closed for the masks alone: steps that compare depths
+    # must see measured depth only, not guesses.
     closed = replace(depth, depth=close_holes(depth.depth))
     surface = surface_of(np.where(valid_small, depth_at_frame_size(closed, frame)[pick], 0).astype(np.float32), camera)
     boundary = boundaries(surface, valid_small, params.depth_jump, params.crease)
