@@ -1,19 +1,28 @@
-"""What the masks and the depth of all views say together about the pixels of one (cf. space carving)."""
+"""What the masks and the depth of all views say together: about the pixels of one, and about points without a label."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, InstanceMasks, Int32
+from ss_flow.tasks.artifacts import Bool, Float32, InstanceMasks, Int32, UInt8
 from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE, SceneViews, sample_depth
 from ss_flow.tasks.geometry.cameras import backproject
+from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.geometry.images import decode_rgb
 
 REACH = 8
 """Pixels of the photo on either side of a mask's border in which the other views are asked."""
 MOST_VIEWS = 12
 """Views that are asked about another one, evenly spread."""
+BEYOND = 2.0
+"""A surface is missing where it lies farther than so many spacings from all labelled points."""
+LEAST_VIEWS = 4
+"""Views whose masks hold a missing point, its own among them."""
+STRIDE = 2
+"""Every second row and column of a mask is looked at for missing points."""
 
 
 def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator[Int32]:
@@ -25,21 +34,69 @@ def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator
 
     scene: at least the views that have a mask. Yields, for each of these, the channels [H, W] that `group_view` takes.
     """
-    row = {frame.name: i for i, frame in enumerate(scene.frames)}
-    views, masks = [row[name] for name in instance.views], instance.dense()
-    asked = views[:: -(-len(views) // MOST_VIEWS)], masks[:: -(-len(views) // MOST_VIEWS)]
-    for view, mask in zip(views, masks, strict=True):
+    for view, mask, others in _views(scene, instance):
         channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
         y, x = np.nonzero(_border(mask))
         if len(y):
             points = _points(scene, view, y, x)
-            known = points[:, 0] == points[:, 0]
-            votes, held = _votes(scene, points[known], [(u, m) for u, m in zip(*asked, strict=True) if u != view])
+            known = ~np.isnan(points[:, 0])
+            votes, held = _votes(scene, points[known], others)
             own = mask[y[known], x[known]]
             same = np.where(own, held, votes - held) + 1
             doubtful = (votes >= 2) & (same < share * (votes + 1))
             channels[y[known][doubtful], x[known][doubtful]] = IGNORED
         yield channels
+
+
+def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> InstanceMasks:
+    """The instance with points where its masks hold a surface that has no labelled point: thin legs, mostly, which the
+    borders of the masks hide from the vote on labels.
+
+    A point joins when the masks of at least four views hold it, and those of at least `share` of the views that see
+    it. One joins for each cube of the points' spacing, the first; its confidence is that share.
+    """
+    from scipy.spatial import cKDTree
+
+    spacing = nearest_spacing(instance.points) if len(instance.points) > 1 else 0.0
+    if not spacing:
+        return instance
+    tree = cKDTree(instance.points)
+    found: list[tuple[Float32, UInt8, Float32]] = []
+    for view, mask, others in _views(scene, instance):
+        y, x = np.nonzero(mask[::STRIDE, ::STRIDE])
+        if not len(y):
+            continue
+        points = _points(scene, view, STRIDE * y, STRIDE * x)
+        known = np.flatnonzero(~np.isnan(points[:, 0]))
+        distance, _ = tree.query(points[known], distance_upper_bound=BEYOND * spacing, workers=1)
+        far = known[np.isinf(distance)]
+        votes, held = _votes(scene, points[far], others)
+        joins = (held + 1 >= LEAST_VIEWS) & (held + 1 >= share * (votes + 1))
+        if joins.any():
+            rows = far[joins]
+            colors = decode_rgb(scene.frames[view])[STRIDE * y[rows], STRIDE * x[rows]]
+            found.append((points[rows], colors, ((held + 1) / (votes + 1))[joins].astype(np.float32)))
+    if not found:
+        return instance
+    points, colors, confidence = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    cell = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
+    first = np.sort(np.unique(cell, axis=0, return_index=True)[1])
+    return replace(
+        instance,
+        points=np.concatenate([instance.points, points[first]]),
+        colors=np.concatenate([instance.colors, colors[first]]),
+        point_confidence=np.concatenate([instance.point_confidence, confidence[first]]),
+        point_part=np.concatenate([instance.point_part, np.zeros(len(first), np.int32)]),
+    )
+
+
+def _views(scene: SceneViews, instance: InstanceMasks) -> Iterator[tuple[int, Bool, list[tuple[int, Bool]]]]:
+    """Each view with a mask: its row, the mask, and rows and masks of the views that are asked about it."""
+    row = {frame.name: i for i, frame in enumerate(scene.frames)}
+    both = list(zip((row[name] for name in instance.views), instance.dense(), strict=True))
+    asked = both[:: -(-len(both) // MOST_VIEWS)]
+    for view, mask in both:
+        yield view, mask, [(other, held) for other, held in asked if other != view]
 
 
 def _border(mask: Bool) -> Bool:

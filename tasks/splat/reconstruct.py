@@ -30,7 +30,7 @@ from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import dilated
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive, Range
-from ss_flow.tasks.splat.consensus import agreed
+from ss_flow.tasks.splat.consensus import agreed, completed
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,10 @@ class ReconstructParams:
     that along the surface; 1 = round, as in 3DGS."""
     first_opacity: Annotated[float, Range(0.0, 1.0, open_below=True, open_above=True)] = 0.5
     """Opacity of the first Gaussians; 0.1 in 3DGS."""
-    tau_agree: Fraction = 0.5
+    tau_agree: Fraction = 0.7
     """Near the border of a mask, pixels count neither as inside nor as outside if less than this share of the views
-    that see their surface point agree; 0 = all count."""
+    that see their surface point agree; and surface without a labelled point joins if at least this share agree. 0 =
+    all pixels count, and the labelled points are all."""
     objective: Objective = Objective()
     """What the training makes small."""
     ignore_occluded: bool = True
@@ -119,10 +120,10 @@ def reconstruct(
     """
     if instance.weak or not len(instance.points) or not instance.views:
         return NO_GAUSSIANS
+    scene = views.compared(visibility)
+    instance = _completed(scene, instance, params)
     initial = _from_points(instance, params)
-    return _trained(
-        views.compared(visibility), dilated(instance, params.dilation), initial, params, params.iterations(instance)
-    )
+    return _trained(scene, dilated(instance, params.dilation), initial, params, params.iterations(instance))
 
 
 @task(
@@ -146,9 +147,15 @@ def retrain(
     unchanged = not (instance.origin == REFINED).any()
     if unchanged or instance.weak or not len(instance.points) or not instance.views:
         return gaussians
+    scene = views.compared(visibility)
+    instance = _completed(scene, instance, params)
     initial = gaussians if params.warm_start and len(gaussians) else _from_points(instance, params)
     steps = max(1, round(params.retrain_share * params.iterations(instance)))
-    return _trained(views.compared(visibility), instance, initial, params, steps)
+    return _trained(scene, instance, initial, params, steps)
+
+
+def _completed(scene: SceneViews, instance: InstanceMasks, params: ReconstructParams) -> InstanceMasks:
+    return completed(scene, instance, params.tau_agree) if params.tau_agree and instance.instance_id else instance
 
 
 def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussians:

@@ -135,7 +135,7 @@ TABLE = {
     # 3DGS's first Gaussians; discs in the surface in ours. What other views say of a mask's border is ours alone.
     "splat.reconstruct.thickness": (1.0, 1.0, 0.1),
     "splat.reconstruct.first_opacity": (0.1, 0.1, 0.5),
-    "splat.reconstruct.tau_agree": (0.0, 0.0, 0.5),
+    "splat.reconstruct.tau_agree": (0.0, 0.0, 0.7),
     # 24: degree 0 below 2,000 steps is the trainer's rule.
     "splat.reconstruct.sh_degree": (3, 3, 3),
     # In 3DGS lengths are shares of the radius of the cameras.

@@ -7,13 +7,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from ball_and_box import HEIGHT, WIDTH, SmallScene
+from ball_and_box import BALL as CENTRE
+from ball_and_box import HEIGHT, RADIUS, WIDTH, SmallScene
 
 from ss_flow.tasks.artifacts import InstanceMasks
 from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import pack_masks
-from ss_flow.tasks.splat.consensus import agreed
+from ss_flow.tasks.splat.consensus import agreed, completed
 
 BALL = 2
 
@@ -80,3 +81,35 @@ def test_without_depth_or_with_too_few_views_masks_stay(small):
 def test_a_mask_without_pixels_is_no_error(small):
     instance = with_mask(small.instance(BALL), 3, np.zeros((HEIGHT, WIDTH), bool))
     assert (channels_of(small, instance)[3] == NONE_OF_MINE).all()
+
+
+def test_surface_that_the_masks_hold_gets_the_points_that_it_lacks(small):
+    whole = small.instance(BALL)
+    low = whole.points[:, 2] < 0.2
+    half = replace(
+        whole,
+        points=whole.points[low],
+        colors=whole.colors[low],
+        point_confidence=whole.point_confidence[low],
+        point_part=whole.point_part[low],
+    )
+    full = completed(small.views.compared(VisibilityParams()), half, 0.7)
+    np.testing.assert_array_equal(full.points[: low.sum()], half.points)
+    added = full.points[low.sum() :]
+    off = np.abs(np.linalg.norm(added - CENTRE, axis=1) - RADIUS)
+    assert len(added) > 50 and off.max() < 0.005 and added[:, 2].max() > 0.4
+    assert len(full.colors) == len(full.point_confidence) == len(full.point_part) == len(full.points)
+    assert (full.point_confidence >= 0.7).all()
+
+
+def test_a_complete_instance_and_what_few_masks_hold_gain_no_points(small):
+    scene, instance = small.views.compared(VisibilityParams()), small.instance(BALL)
+    assert completed(scene, instance, 0.7) is instance
+    wide = instance
+    for row in (0, 1, 2):
+        wide = with_mask(wide, row, grown(instance.mask(row), 6))
+    added = completed(scene, wide, 0.7).points[len(instance.points) :]
+    off = np.abs(np.linalg.norm(added - CENTRE, axis=1) - RADIUS)
+    assert not (off > 0.01).any()
+    lone = replace(instance, points=instance.points[:1])
+    assert completed(scene, lone, 0.7) is lone
