@@ -12,10 +12,21 @@ from ss_flow.flows.params import CaptureParams
 from ss_flow.flows.poses import poses, refined_poses
 from ss_flow.graph import INDEX, each
 from ss_flow.task import FileRef
-from ss_flow.tasks.artifacts import Cameras, Clicks, DepthMap, Frame, LabelMap, MaskSet, Registration, SceneUnit
+from ss_flow.tasks.artifacts import (
+    Cameras,
+    Clicks,
+    ColourTransform,
+    DepthMap,
+    Frame,
+    LabelMap,
+    MaskSet,
+    Registration,
+    SceneUnit,
+)
 from ss_flow.tasks.capture import depth as depth_steps
 from ss_flow.tasks.capture import ingest, recordings, sensor_depth, views
 from ss_flow.tasks.capture.coco_masks import coco_masks
+from ss_flow.tasks.capture.colours import colours
 from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.mono import mono
@@ -50,6 +61,8 @@ class Capture:
     """What the user calls these objects."""
     registration: Registration | None = None
     """Of a sensor's depth."""
+    colours: tuple[ColourTransform, ...] = ()
+    """One a view; none where photos are trained on as they are."""
 
 
 def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, monodepth: Model | None) -> Capture:
@@ -102,7 +115,10 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         )
     objects = scene.hints.objects if scene.hints is not None else ()
     by_view, length = views.by_view(cameras), views.unit(cameras, depths)
-    return Capture(frames, cameras, by_view, depths, length, masks, truth, names, pointed, objects, placing)
+    evened: tuple[ColourTransform, ...] = ()
+    if params.colours.transform != "none":
+        evened = colours(frames, cameras, depths, length, params=params.colours)
+    return Capture(frames, cameras, by_view, depths, length, masks, truth, names, pointed, objects, placing, evened)
 
 
 def _known_names(scene: SceneFiles) -> tuple[str, ...] | None:

@@ -78,6 +78,7 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
         "scene": str(scene.place),
         "params": settings.flat(params),
         "models": models,
+        "reference_photo": store.get(wanted["colours"][0]).reference if "colours" in wanted else None,
         "metrics": {
             METRICS[name]: store.get(value).values
             for name, value in wanted.items()

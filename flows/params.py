@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ss_flow.tasks.capture.colours import ColourParams
 from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
 from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.mono import MonoParams
@@ -56,6 +57,7 @@ class CaptureParams:
     agreement: AgreementParams = field(default_factory=AgreementParams)
     registration: RegistrationParams = field(default_factory=RegistrationParams)
     mono: MonoParams = field(default_factory=MonoParams)
+    colours: ColourParams = field(default_factory=ColourParams)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ R = TypeVar("R")
 
 def splat(capture: Capture, found: Split, networks: Networks, params: Params) -> dict[str, Any]:
     """Instances -> Gaussians, each on its own; refined masks; one scene (Split&Splat, Sec. 3.2)."""
-    views = Views(capture.frames, capture.by_view, capture.depths, capture.unit)
+    views = Views(capture.frames, capture.by_view, capture.depths, capture.unit, capture.colours)
     settings, visibility = params.splat, params.split.visibility
 
     def of_instance(row: int, build: Callable[[list[int]], R]) -> R:
@@ -117,7 +117,8 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
 
 def some(views: Views, rows: list[int]) -> Views:
     """Some views of a scene, in a flow."""
-    return Views(pick(views.frames, rows), pick(views.cameras, rows), pick(views.depths, rows), views.unit)
+    colours = pick(views.colours, rows) if views.colours else ()
+    return Views(pick(views.frames, rows), pick(views.cameras, rows), pick(views.depths, rows), views.unit, colours)
 
 
 def merge_rounds(

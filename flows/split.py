@@ -76,7 +76,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     """Photos and depth -> view-consistent instances (Split&Splat, Sec. 3.1)."""
     views = (capture.frames, capture.cameras, capture.depths)
     if params.dense_source == "splatting":
-        points = dense_splatting(*views, capture.unit, params=params.dense, splatting=params.splatting)
+        points = dense_splatting(*views, capture.unit, capture.colours, params=params.dense, splatting=params.splatting)
     else:
         points = dense(*views, capture.unit, params=params.dense)
     segmenter = networks.segmenter

@@ -87,6 +87,18 @@ class SceneUnit:
 
 
 @dataclass(frozen=True)
+class ColourTransform:
+    """What turns the colours of one photo into those of the scene: its exposure and white balance taken out."""
+
+    name: str
+    """Of the view."""
+    reference: str
+    """The view whose colours are the scene's; its own transform changes nothing."""
+    matrix: Float64
+    """[3, 4] affine: RGB (r, g, b, 1) of the photo, 0..1, to RGB of the scene, which may lie beyond 0..1."""
+
+
+@dataclass(frozen=True)
 class Registration:
     """How the depth maps must be moved for their edges to lie on those of the photos: frame point x goes to
     scale * (x - principal point) + principal point + shift."""

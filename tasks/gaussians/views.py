@@ -9,11 +9,11 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import Bundle
-from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Float64, Frame, Int32, SceneUnit
+from ss_flow.tasks.artifacts import Bool, ColourTransform, DepthMap, Float32, Float64, Frame, Int32, SceneUnit
 from ss_flow.tasks.geometry.cameras import Camera, pixels_in_view
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, transformed
 from ss_flow.tasks.geometry.visibility import VisibilityParams, surface_points
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 from ss_flow.tasks.ranges import Count, Natural
@@ -30,7 +30,7 @@ class TrainView:
     camera: Camera
     """Already cropped to the view's box."""
     image: Float32
-    """[h, w, 3] RGB, 0..1."""
+    """[h, w, 3] RGB of the scene: that of the photo, 0..1, through its colour transform."""
     inside: Bool
     """[h, w] pixels of what is trained: colour loss, alpha towards 1."""
     free: Bool
@@ -49,10 +49,12 @@ class Views(Bundle):
     cameras: Sequence[Camera]
     depths: Sequence[DepthMap]
     unit: SceneUnit
+    colours: Sequence[ColourTransform]
+    """What the photos' colours go through; empty where they stay."""
 
     def compared(self, visibility: VisibilityParams) -> SceneViews:
         """The same with what tells whether two depths are of one surface."""
-        return SceneViews(self.frames, self.cameras, self.depths, self.unit, visibility)
+        return SceneViews(self.frames, self.cameras, self.depths, self.unit, self.colours, visibility)
 
 
 @dataclass(frozen=True)
@@ -222,7 +224,7 @@ class _Crop:
 
     camera: Camera
     image: Float32
-    """[h, w, 3] RGB, 0..1."""
+    """[h, w, 3] RGB of the scene."""
     inside: Bool
     """[h, w] valid pixels of the masks."""
     outside: Bool
@@ -256,11 +258,14 @@ def _crop(
     photo = decode_rgb(frame)[y0 : y0 + height, x0 : x0 + width]
     if photo.shape[:2] != (camera.height, camera.width):
         photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    image = photo.astype(np.float32) / np.float32(255)
+    if scene.colours:
+        image = transformed(image, scene.colours[view])
     valid = decode_valid(frame)[np.ix_(row, column)]
     ids = channels[np.ix_(row, column)]
     return _Crop(
         camera=camera,
-        image=photo.astype(np.float32) / np.float32(255),
+        image=image,
         inside=(ids >= 0) & valid,
         outside=(ids < 0) & (ids != IGNORED) & valid,
         channels=ids,

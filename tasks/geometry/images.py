@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Frame, UInt8
+from ss_flow.tasks.artifacts import Bool, ColourTransform, DepthMap, Float32, Frame, UInt8
 
 
 def decode_rgb(frame: Frame) -> UInt8:
@@ -13,6 +13,12 @@ def decode_rgb(frame: Frame) -> UInt8:
 
     bgr: UInt8 = cv2.imdecode(frame.encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(bgr[..., ::-1])
+
+
+def transformed(image: Float32, colours: ColourTransform) -> Float32:
+    """A photo in the colours of the scene: [H, W, 3] float32, from the same, 0..1."""
+    matrix = colours.matrix.astype(np.float32)
+    return image @ matrix[:, :3].T + matrix[:, 3]
 
 
 def suffix_of(frame: Frame) -> str:

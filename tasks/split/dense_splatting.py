@@ -8,7 +8,7 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud, SceneUnit
+from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Frame, Gaussians, PointCloud, SceneUnit
 from ss_flow.tasks.gaussians.initialise import SH_ZERO, initialise
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
@@ -62,6 +62,7 @@ def dense_splatting(
     cameras: Cameras,
     depths: tuple[DepthMap, ...],
     unit: SceneUnit,
+    colours: tuple[ColourTransform, ...] = (),
     *,
     params: DenseParams,
     splatting: DenseSplattingParams,
@@ -82,7 +83,7 @@ def dense_splatting(
         for view, (frame, seed) in enumerate(zip(frames, seeds, strict=True))
     ]
     initial = _first_gaussians(sum_by_voxel(samples, voxel), voxel, splatting.initial_points)
-    seen = SceneViews(frames, cameras_by_view(cameras), depths, unit, VisibilityParams())
+    seen = SceneViews(frames, cameras_by_view(cameras), depths, unit, colours, VisibilityParams())
     everything = [np.zeros((frame.height, frame.width), np.int32) for frame in frames]
     views = [whole_view(seen, view, all_of_it, splatting.max_side) for view, all_of_it in enumerate(everything)]
     trained = train(

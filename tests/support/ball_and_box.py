@@ -49,7 +49,7 @@ class SmallScene:
     @property
     def views(self) -> Views:
         """All of them, as a run gives them to a step."""
-        return Views(self.frames, cameras_by_view(self.cameras), self.depths, SceneUnit(1.0))
+        return Views(self.frames, cameras_by_view(self.cameras), self.depths, SceneUnit(1.0), ())
 
     def instance(self, instance_id: int, views: tuple[int, ...] = tuple(range(VIEWS)), every: int = 3) -> InstanceMasks:
         mine = np.flatnonzero(self.labels == instance_id)[::every]
