@@ -2,9 +2,9 @@
 
 Every photo is taken to show the colours of the scene through an affine map of RGB of its own: photo = B (scene, 1).
 Points of known depth are looked up in all photos that see them; colours of points and maps of photos are solved for in
-turns (alternating least squares), robustly, since gloss, shadows and pixels beside an edge do not agree. The maps are
-drawn towards identity, and only ratios between photos can be found: in the end the map that changes least is made the
-reference, whose photo's colours are the scene's. Nothing is learnt with the Gaussians, so all trainings share them.
+turns (alternating least squares), robustly, since gloss, shadows and pixels beside an edge do not agree. Only ratios
+between photos can be found: in the end the photo whose map changes least is made the reference, and its colours are the
+scene's. Nothing is learnt with the Gaussians, so all trainings share the maps.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Float32,
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.geometry.visibility import VisibilityParams, surface_points
-from ss_flow.tasks.ranges import Count, Positive
+from ss_flow.tasks.ranges import Count, Fraction, Positive
 
 _SIDE = 320
 """Photos are compared at this size, pixels of the longer side, so that poses may be off by a pixel or two."""
@@ -31,7 +31,7 @@ _UNCLIPPED = (0.02, 0.98)
 """Range of colours that a sensor does not cut off."""
 _DISAGREES = 0.05
 """RGB difference at which an observation has lost half of its weight."""
-_ROUNDS = 30
+_ROUNDS = 10
 _FEW = 200
 """Observations that the prior weighs as many as, besides those that there are."""
 
@@ -43,10 +43,13 @@ class ColourParams:
     transform: Literal["affine", "none"] = "affine"
     """What each photo's colours go through before Gaussians are trained on them: "affine", a 3 x 4 matrix; or "none",
     as in the paper."""
-    points: Count = 20_000
+    points: Count = 10_000
     """Surface points that are looked up in the photos."""
     prior: Positive = 1e-2
     """How strongly a transform is drawn towards plain gains of its channels: the weight of a share of its points."""
+    min_gain: Fraction = 0.2
+    """Photos stay as they are unless so large a share of the disagreement about a point's colour goes, on points that
+    the maps were not fitted to."""
 
 
 class Observations(NamedTuple):
@@ -66,10 +69,13 @@ def colours(
 ) -> tuple[ColourTransform, ...]:
     """The transform of each photo's colours to those of one of them; identity for a photo that shares no surface.
 
-    Pixels of unknown depth, those that a frame masks out and those near black or white count nowhere.
+    All are identity where photos agree already (`min_gain`): a fixed exposure is better than an estimate of it. Pixels
+    of unknown depth, those that a frame masks out and those near black or white count nowhere.
     """
     found = _observations(frames, cameras, depths, unit, params.points)
     to_photo = photo_maps(found, len(frames), params.prior)
+    if gain(found, len(frames), params.prior) < params.min_gain:
+        to_photo = _affine(np.ones((len(frames), 3)))
     reference = int(np.abs(to_photo - np.eye(4)[:3]).sum(axis=(1, 2)).argmin())
     in_scene = _square(to_photo[reference]) @ np.linalg.inv(_square(to_photo))
     return tuple(
@@ -90,7 +96,7 @@ def photo_maps(found: Observations, num_views: int, prior: float) -> Float64:
     weight, seen = np.ones(len(view)), np.bincount(view, minlength=num_views)
     gains = np.ones((num_views, 3))
     for _ in range(_ROUNDS):
-        gains = _gains(found, weight, num_views, count)
+        gains = _gains(found, weight * np.square(color.mean(axis=1)), num_views, count)
         scene = _means(color / gains[view], point, weight, count)
         weight = _weights(color - gains[view] * scene[point])
     if not prior:
@@ -112,10 +118,28 @@ def photo_maps(found: Observations, num_views: int, prior: float) -> Float64:
     return maps
 
 
+def gain(found: Observations, num_views: int, prior: float) -> float:
+    """0..1 share of the disagreement of photos about a point's colour that maps fitted to other points take away."""
+    held_out = found.point % 2 == 1
+    if not held_out.any():
+        return 0.0
+    fitted, rest = (Observations(*(a[rows] for a in found)) for rows in (~held_out, held_out))
+    to_scene = np.linalg.inv(_square(photo_maps(fitted, num_views, prior)))[rest.view]
+    ones = np.concatenate([rest.color, np.ones((len(rest.color), 1))], axis=1)
+
+    def disagreement(colors: Float64) -> float:
+        mean = _means(colors, rest.point, np.ones(len(colors)), int(rest.point.max()) + 1)
+        return float(np.abs(colors - mean[rest.point]).mean() / colors.std())
+
+    before = disagreement(rest.color)
+    return max(0.0, 1 - disagreement((to_scene @ ones[..., None])[:, :3, 0]) / before) if before > 0 else 0.0
+
+
 def _gains(found: Observations, weight: Float64, num_views: int, count: int) -> Float64:
     """[K, 3] factors of each photo's channels, whose geometric mean is 1: least squares of logarithms.
 
-    Colours of points are eliminated, which leaves one equation a photo.
+    weight: [M]; with the squared brightness in it, errors of colours count and not those of their logarithms, which
+    are largest where it is dark. Colours of points are eliminated, which leaves one equation a photo.
     """
     from scipy.sparse import csr_array
 

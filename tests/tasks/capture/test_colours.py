@@ -7,7 +7,7 @@ import pytest
 
 from ss_flow.flows.generated import RoomParams, generate
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, SceneUnit
-from ss_flow.tasks.capture.colours import ColourParams, Observations, colours, photo_maps
+from ss_flow.tasks.capture.colours import ColourParams, Observations, colours, gain, photo_maps
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png, transformed
 
 IDENTITY = np.eye(4)[:3]
@@ -54,6 +54,18 @@ def test_photos_that_agree_stay_as_they_are():
     np.testing.assert_allclose(found, np.tile(IDENTITY, (8, 1, 1)), atol=0.01)
 
 
+def test_only_what_holds_for_other_points_too_is_gained():
+    maps = np.tile(IDENTITY, (12, 1, 1))
+    assert gain(observed(maps, 7, wrong=0.2), 12, 1e-2) < 0.05
+    maps[:, :, :3] *= np.linspace(0.6, 1.2, 12)[:, None, None]
+    assert gain(observed(maps, 7), 12, 1e-2) > 0.5
+
+
+def test_photos_of_one_exposure_stay_as_they_are_to_the_bit():
+    for transform in colours(*captured(np.ones((6, 3))), SceneUnit(1.0), params=ColourParams()):
+        np.testing.assert_array_equal(transform.matrix, IDENTITY)
+
+
 def test_a_photo_that_shares_no_point_stays_as_it_is():
     maps = np.tile(IDENTITY, (6, 1, 1))
     maps[:, :, :3] *= np.array([0.8, 0.9, 1.0, 1.1, 1.2, 1.0])[:, None, None]
@@ -68,8 +80,8 @@ def captured(gains: np.ndarray) -> tuple[tuple[Frame, ...], Cameras, tuple[Depth
     """A generated room, each photo brighter by its gains [K, 3]."""
     made = generate(RoomParams(objects=4, views=len(gains), width=160, height=120, seed=0, held_out=0))
     frames, depths = [], []
-    for name, rgb, gain, depth in zip(made.cameras.names, made.rgb, gains, made.depth, strict=True):
-        photo = np.round(np.clip(rgb * gain, 0, 255)).astype(np.uint8)
+    for name, rgb, factor, depth in zip(made.cameras.names, made.rgb, gains, made.depth, strict=True):
+        photo = np.round(np.clip(rgb * factor, 0, 255)).astype(np.uint8)
         frames.append(Frame(name, 160, 120, encode_png(photo), np.zeros(0, np.uint8), 160, 120))
         depths.append(DepthMap(name, depth, "sensor"))
     return tuple(frames), made.cameras, tuple(depths)
