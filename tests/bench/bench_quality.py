@@ -1,6 +1,6 @@
 """PSNR and SSIM of plain 3DGS on held-out views (every eighth) after so many iterations.
 
-python tests/bench/bench_quality.py CAPTURE --iterations 1000 5000 10000 --densify classic none
+python tests/bench/bench_quality.py CAPTURE --iterations 1000 5000 10000 [--colours] --densify classic none
 """
 
 from __future__ import annotations
@@ -8,6 +8,8 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +20,16 @@ from ss_flow.flows.capture import capture
 from ss_flow.flows.params import CaptureParams
 from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud, SceneUnit
+from ss_flow.tasks.capture.colours import ColourParams, colours
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.evaluate.novel_view import psnr, ssim, to_8bit
+from ss_flow.tasks.evaluate.novel_view import colour_fitted, psnr, ssim, to_8bit
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import camera_of
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, transformed
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.models.catalogue import blake3_of
 from ss_flow.tasks.splat.reconstruct import thin
@@ -59,14 +62,38 @@ def view_of(frame: Frame, cameras: Cameras, depth: DepthMap, index: int, side: i
     return TrainView(camera, image, inside, np.zeros_like(inside), z)
 
 
-def measured(scene: Gaussians, views: list[TrainView]) -> tuple[float, float]:
-    """Mean PSNR and SSIM over views."""
+def evened(
+    views: list[TrainView],
+    rows: Sequence[int],
+    frames: list[Frame],
+    cameras: Cameras,
+    depths: list[DepthMap],
+    unit: float,
+) -> list[TrainView]:
+    """The views with the colours of one of them; rows: which of the frames they are."""
+    own = replace(
+        cameras,
+        names=tuple(cameras.names[row] for row in rows),
+        sizes=cameras.sizes[rows],
+        intrinsics=cameras.intrinsics[rows],
+        world_to_camera=cameras.world_to_camera[rows],
+    )
+    known = tuple(frames[row] for row in rows), own, tuple(depths[row] for row in rows), SceneUnit(unit)
+    found = colours(*known, params=ColourParams())
+    return [replace(view, image=transformed(view.image, of)) for view, of in zip(views, found, strict=True)]
+
+
+def measured(scene: Gaussians, views: list[TrainView]) -> tuple[float, float, float]:
+    """PSNR, PSNR after a fit of colours to each view, and SSIM: means over views."""
     values = []
     for view in views:
-        image, photo = to_8bit(render(scene, view.camera).rgb), to_8bit(view.image)
-        values.append((psnr(image, photo, view.inside), ssim(image, photo, view.inside)))
-    mean = np.mean(values, axis=0)
-    return float(mean[0]), float(mean[1])
+        rgb, photo = np.clip(render(scene, view.camera).rgb, 0, 1), to_8bit(view.image)
+        image, fitted = to_8bit(rgb), to_8bit(colour_fitted(rgb, photo, view.inside))
+        values.append(
+            [psnr(image, photo, view.inside), psnr(fitted, photo, view.inside), ssim(image, photo, view.inside)]
+        )
+    plain, after, similarity = np.mean(values, axis=0).tolist()
+    return plain, after, similarity
 
 
 def main() -> None:
@@ -78,13 +105,17 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=50_000)
     parser.add_argument("--most", type=int, default=150_000)
     parser.add_argument("--sh-degree", type=int, default=3)
+    parser.add_argument("--colours", action="store_true", help="even out the exposure of the photos first")
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--store", type=Path, default=Path(tempfile.gettempdir()) / "ss-flow-bench")
     args = parser.parse_args()
     frames, cameras, depths, cloud = load(args.capture, Store(args.store))
     views = [view_of(f, cameras, d, i, args.side) for i, (f, d) in enumerate(zip(frames, depths, strict=True))]
     held_out = [v for i, v in enumerate(views) if i % 8 == 0]
-    training = [v for i, v in enumerate(views) if i % 8]
+    rows_of_training = [i for i in range(len(views)) if i % 8]
+    training = [views[i] for i in rows_of_training]
+    if args.colours:
+        training = evened(training, rows_of_training, frames, cameras, depths, cloud.unit)
     rows = thin(cloud.points, args.points)
     initial = initialise(cloud.points[rows], cloud.colors[rows], 0, 1.0)
     print(f"{args.capture.name}: {len(training)} views to train, {len(held_out)} held out, {len(rows)} points")
@@ -103,7 +134,8 @@ def main() -> None:
             seconds = time.perf_counter() - start
             quality = measured(result.gaussians, held_out)
             print(
-                f"{strategy} {result.iterations:6} iterations: PSNR {quality[0]:.2f} dB, SSIM {quality[1]:.3f}, "
+                f"{strategy} {result.iterations:6} iterations: PSNR {quality[0]:.2f} dB, colours fitted "
+                f"{quality[1]:.2f} dB, SSIM {quality[2]:.3f}, "
                 f"training views {measured(result.gaussians, training)[0]:.2f} dB, {len(result.gaussians)} Gaussians, "
                 f"{seconds:.0f} s",
                 flush=True,

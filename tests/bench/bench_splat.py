@@ -287,9 +287,10 @@ def main() -> None:
     parser.add_argument("--look", type=Path, help="a folder for pictures")
     parser.add_argument("--store", type=Path, help="a store to keep; each line computes anew otherwise")
     args = parser.parse_args()
-    print("| scene | preset | jobs | PSNR | SSIM | mIoU Split | refined | rendered | PQ rendered | fringe % | worst |"
+    print("| scene | preset | jobs | PSNR | colours fitted | SSIM | mIoU Split | refined | rendered | PQ rendered |"
+          " fringe % | worst |"
           " floaters % | elsewhere /255 | worst | Gaussians | rounds | Split s | Splat s | objects/min |")  # fmt: skip
-    print("|---" * 19 + "|")
+    print("|---" * 20 + "|")
     with tempfile.TemporaryDirectory() as temporary:
         for scene in args.scenes:
             folder = folder_of(scene, args.seed, args.masks, Path(args.store or temporary))
@@ -311,6 +312,7 @@ def told(folder: Path, preset: str, jobs: int, store: Store, args: argparse.Name
     of = {name: [getattr(c, name) for c in clean] or [0.0] for name in ("fringe", "floaters", "elsewhere")}
     print(
         f"| {folder.name} | {preset} | {jobs} | {cell(metrics, 'novel_view', 'psnr', 1, 2)} | "
+        f"{cell(metrics, 'novel_view', 'psnr_colour_fitted', 1, 2)} | "
         f"{cell(metrics, 'novel_view', 'ssim', 1, 3)} | {cell(metrics, 'metrics_split', 'miou')} | "
         f"{cell(metrics, 'metrics_refined', 'miou')} | {cell(metrics, 'metrics_splat', 'miou')} | "
         f"{cell(metrics, 'metrics_splat', 'pq')} | {100 * np.mean(of['fringe']):.2f} | {100 * max(of['fringe']):.2f} | "
