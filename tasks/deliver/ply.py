@@ -58,8 +58,8 @@ def _gaussian_rows(gaussians: Gaussians, part: slice, labels: tuple[str, ...]) -
         gaussians.log_scales[part],
         gaussians.quaternions[part],
     ]
-    columns += [getattr(gaussians, name)[part, None] for name in labels]
-    return np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
+    columns += [getattr(gaussians, name)[part, None].astype(np.float32) for name in labels]
+    return np.concatenate(columns, axis=1, dtype="<f4")
 
 
 def write_cloud(path: Path, cloud: PointCloud, labels: PointLabels, parts: PointParts) -> None:
