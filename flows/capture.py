@@ -33,6 +33,7 @@ from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.registration import calibrated, registration
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.sfm import registered
+from ss_flow.tasks.capture.stereo import stereo
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.models.catalogue import Model
 
@@ -158,7 +159,7 @@ def _depths(
     frames: tuple[Frame, ...],
     cameras: Cameras,
 ) -> tuple[DepthMap, ...]:
-    """The sensor's depth, a plane sweep over several views ("mvs"), or a network's ("mono")."""
+    """The sensor's depth, what several views show together ("mvs"), or a network's ("mono")."""
     names = _known_names(scene)
     if source == "sensor":
         if scene.kind == "sens" and scene.recording is not None:
@@ -184,13 +185,32 @@ def _depths(
         names=names,
         build=lambda _, index: depth_steps.sweep(frames, cameras, view=index, params=params.sweep),
     )
-    agreed = depth_steps.agree(swept, cameras, params=params.agreement)
+    found, agreed = swept, depth_steps.agree(swept, cameras, params=params.agreement)
+    for _ in range(params.stereo.rounds):
+        found = _refined(frames, cameras, found, agreed, names, params)
+        agreed = depth_steps.agree(found, cameras, params=params.agreement)
     if source == "mvs" or monodepth is None:
         return agreed
     # What several views agree on gives the network's depth its scale.
     network = monodepth.file("network")
     return each(
         frames, names=names, build=lambda frame: mono(frame, cameras, agreed, model=network, params=params.mono)
+    )
+
+
+def _refined(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    found: tuple[DepthMap, ...],
+    agreed: tuple[DepthMap, ...],
+    names: tuple[str, ...] | None,
+    params: CaptureParams,
+) -> tuple[DepthMap, ...]:
+    return each(
+        frames,
+        INDEX,
+        names=names,
+        build=lambda _, index: stereo(frames, cameras, found, agreed, view=index, params=params.stereo),
     )
 
 

@@ -13,6 +13,7 @@ from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.refine_poses import RefinePosesParams
 from ss_flow.tasks.capture.registration import RegistrationParams
 from ss_flow.tasks.capture.sfm import SfmParams
+from ss_flow.tasks.capture.stereo import StereoParams
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.semantics.describe import DescribeParams
@@ -55,6 +56,7 @@ class CaptureParams:
     refine: RefinePosesParams = field(default_factory=RefinePosesParams)
     sweep: SweepParams = field(default_factory=SweepParams)
     agreement: AgreementParams = field(default_factory=AgreementParams)
+    stereo: StereoParams = field(default_factory=StereoParams)
     registration: RegistrationParams = field(default_factory=RegistrationParams)
     mono: MonoParams = field(default_factory=MonoParams)
     colours: ColourParams = field(default_factory=ColourParams)

@@ -10,7 +10,7 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame
 from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.geometry.plane_sweep import (
@@ -84,11 +84,11 @@ def sweep(
     all_cameras = [camera_of(cameras, k) for k in range(len(cameras))]
     camera = all_cameras[view]
     near, far = _depth_range(frames, cameras, all_cameras, view, params)
-    sources = _sources(all_cameras, view, 2 / (1 / near + 1 / far), params.sources)
-    reference = _view(frames[view], camera, params.max_side)
+    sources = source_views(all_cameras, view, 2 / (1 / near + 1 / far), params.sources)
+    reference = photo_at_size(frames[view], camera, params.max_side)
     if not sources:
         return DepthMap(frames[view].name, np.zeros_like(reference.gray), "mvs")
-    others = [_view(frames[k], all_cameras[k], params.max_side) for k in sources]
+    others = [photo_at_size(frames[k], all_cameras[k], params.max_side) for k in sources]
     planes = inverse_depth_planes(near, far, params.planes)
     cost = matching_cost(reference, others, planes, params.window | 1, params.best)
     smooth = smooth_cost(cost, reference.gray, params.small_step, params.large_step)
@@ -119,7 +119,7 @@ def agree(
         known = own.depth[own.depth > 0]
         depth = own.depth
         if known.size:
-            near = _sources(all_cameras, k, float(np.median(known)), params.neighbors)
+            near = source_views(all_cameras, k, float(np.median(known)), params.neighbors)
             depth = agreeing_depth(
                 depth,
                 sized[k],
@@ -138,7 +138,8 @@ def agree(
     return tuple(result)
 
 
-def _view(frame: Frame, camera: Camera, max_side: int) -> SweepView:
+def photo_at_size(frame: Frame, camera: Camera, max_side: int) -> SweepView:
+    """The gray photo of a view, scaled down to a longer side of `max_side` pixels, with its camera."""
     import cv2
 
     scale = min(1.0, max_side / max(camera.width, camera.height))
@@ -151,7 +152,8 @@ def _view(frame: Frame, camera: Camera, max_side: int) -> SweepView:
     return SweepView(gray, valid > 0.999, camera.scaled(*size))
 
 
-def _sources(cameras: list[Camera], view: int, depth: float, count: int) -> list[int]:
+def source_views(cameras: list[Camera], view: int, depth: float | Float32, count: int) -> list[int]:
+    """The views that tell most of one view's depth, best first; depth: typical, or [h, w] of the view, world units."""
     others = [k for k in range(len(cameras)) if k != view]
     return [others[i] for i in best_views(cameras[view], [cameras[k] for k in others], depth, count)]
 
@@ -165,13 +167,13 @@ def _depth_range(
         low, high = np.quantile(seen, (0.01, 0.98))
         return float(low) * 0.8, float(high) * 1.25
     guess = typical_depth(all_cameras)
-    sources = _sources(all_cameras, view, guess, params.sources)
+    sources = source_views(all_cameras, view, guess, params.sources)
     if not sources:
         return guess / 4, guess * 4
     baseline = float(np.median([np.linalg.norm(all_cameras[k].center - camera.center) for k in sources]))
     baseline = max(baseline, 1e-6 * guess)
-    reference = _view(frames[view], camera, _COARSE_SIDE)
-    others = [_view(frames[k], all_cameras[k], _COARSE_SIDE) for k in sources]
+    reference = photo_at_size(frames[view], camera, _COARSE_SIDE)
+    others = [photo_at_size(frames[k], all_cameras[k], _COARSE_SIDE) for k in sources]
     planes = inverse_depth_planes(1.5 * baseline, 60 * baseline, _COARSE_PLANES)
     cost = matching_cost(reference, others, planes, 7, params.best)
     smooth = smooth_cost(cost, reference.gray, params.small_step, params.large_step)

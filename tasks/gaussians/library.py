@@ -27,8 +27,8 @@ _INT, _INT32, _INT64, _DOUBLE, _FLOAT, _POINTER = (
 
 NATIVE_SOURCES = (
     "native/binning.h", "native/blending.h", "native/harmonics.h", "native/lanes.h", "native/losses.cpp",
-    "native/parallel.h", "native/projection.h", "native/rasterizer.cpp", "native/rows.h", "native/scene.h",
-    "native/workspace.h",
+    "native/parallel.h", "native/patchmatch.cpp", "native/projection.h", "native/rasterizer.cpp", "native/rows.h",
+    "native/scene.h", "native/workspace.h",
 )  # fmt: skip
 """What the results depend on besides this module: its digests count in the keys of the tasks that use it.
 
@@ -63,6 +63,28 @@ class Gradients(ctypes.Structure):
     _fields_ = tuple(
         (name, _POINTER)
         for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "centers", "background")
+    )
+
+
+class StereoPhoto(ctypes.Structure):
+    """`StereoPhoto` of native/patchmatch.cpp."""
+
+    _fields_ = (
+        *((name, _POINTER) for name in ("quads", "usable", "inverse_depth")),
+        *((name, _INT32) for name in ("width", "height")),
+        *((name, _FLOAT * count) for name, count in (("a", 9), ("b", 3), ("back_a", 9), ("back_b", 3))),
+    )
+
+
+class StereoProblem(ctypes.Structure):
+    """`StereoProblem` of native/patchmatch.cpp."""
+
+    _fields_ = (
+        *((name, _POINTER) for name in ("quads", "others", "planes", "cost")),
+        *((name, _INT32) for name in ("width", "height", "count", "best", "radius", "step", "turns")),
+        ("seed", ctypes.c_uint32),
+        *((name, _FLOAT) for name in ("min_inverse", "max_inverse", "max_slope")),
+        *((name, _FLOAT) for name in ("gray_scale", "smoothness", "smooth_scale", "consistency")),
     )
 
 
@@ -124,6 +146,8 @@ def library(name: str | None = None) -> Any:
     lib.ss_surface_loss.restype = None
     lib.ss_adam.argtypes = [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE]
     lib.ss_adam.restype = None
+    lib.ss_patchmatch.argtypes = [by_reference(StereoProblem)]
+    lib.ss_patchmatch.restype = _INT
     return lib
 
 

@@ -33,14 +33,16 @@ class SweepView:
     """Of the photo's size."""
 
 
-def view_scores(camera: Camera, others: Sequence[Camera], depth: float) -> Float64:
+def view_scores(camera: Camera, others: Sequence[Camera], depth: float | Float32) -> Float64:
     """How useful each other view is for the depth of one: the share of its pixels that it sees, if at `depth`, times
     how near their parallax is to 6 degrees (less cannot be measured, more cannot be matched).
 
-    depth: in world units. Returns [len(others)], 0..1.
+    depth: in world units, of all pixels or a map, [h, w]. Returns [len(others)], 0..1.
     """
-    small = camera.scaled(8, 6)
-    points = backproject(np.full((6, 8), depth, np.float32), small)
+    wide = np.atleast_2d(np.asarray(depth, np.float32))
+    rows, columns = ((np.arange(n) + 0.5) / n for n in (6, 8))
+    sampled = wide[(rows * wide.shape[0]).astype(int)][:, (columns * wide.shape[1]).astype(int)]
+    points = backproject(sampled, camera.scaled(8, 6))
     to_reference = points - camera.center
     scores = np.zeros(len(others))
     for i, other in enumerate(others):
@@ -58,7 +60,7 @@ def view_scores(camera: Camera, others: Sequence[Camera], depth: float) -> Float
     return scores
 
 
-def best_views(camera: Camera, others: Sequence[Camera], depth: float, count: int) -> list[int]:
+def best_views(camera: Camera, others: Sequence[Camera], depth: float | Float32, count: int) -> list[int]:
     """Indices of the most useful other views, best first; those that see nothing of it are left out."""
     scores = view_scores(camera, others, depth)
     order = np.argsort(-scores, kind="stable")[:count]
@@ -145,11 +147,17 @@ def matching_cost(
 def _transfer(reference: Camera, source: Camera) -> tuple[Float64, Float64, tuple[Float64, Float64]]:
     """Homographies H(w) = A + w B from reference to source pixels for the plane at inverse depth w, and the two parts
     of their third row before scaling, whose sign tells what lies before the source camera."""
-    relative = source.world_to_camera @ np.linalg.inv(reference.world_to_camera)
-    inverse = np.linalg.inv(_matrix(reference))
-    at_infinity = _matrix(source) @ relative[:3, :3] @ inverse
-    parallax = np.outer(_matrix(source) @ relative[:3, 3], (0.0, 0.0, 1.0)) @ inverse
+    at_infinity, shift = pixel_transfer(reference, source)
+    parallax = np.outer(shift, np.linalg.inv(_matrix(reference))[2])
     return at_infinity, parallax, (at_infinity[2], parallax[2])
+
+
+def pixel_transfer(reference: Camera, source: Camera) -> tuple[Float64, Float64]:
+    """[3, 3] A and [3] b: the pixel x of a point with inverse depth w lies at A x + w b in the source, in homogeneous
+    coordinates, with integer pixel centres."""
+    relative = source.world_to_camera @ np.linalg.inv(reference.world_to_camera)
+    at_infinity = _matrix(source) @ relative[:3, :3] @ np.linalg.inv(_matrix(reference))
+    return at_infinity, _matrix(source) @ relative[:3, 3]
 
 
 def _matrix(camera: Camera) -> Float64:

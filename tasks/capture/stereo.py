@@ -1,0 +1,100 @@
+"""Depth without a sensor, the second look: PatchMatch in every view from what all views found together before.
+
+What one view cannot tell, since its photo is blurred or its surfaces are plain there, another may: depth that views
+agree on is carried into all others as the first guess, and holds planes to what the others found (Xu & Tao 2019, ACMM).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame
+from ss_flow.tasks.capture.depth import photo_at_size, source_views
+from ss_flow.tasks.capture.patchmatch import PatchMatchParams, Source, patchmatch, stereo_identity
+from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, pixels_in_view
+from ss_flow.tasks.geometry.holes import close_holes
+from ss_flow.tasks.ranges import Count, Fraction, Natural
+
+
+@dataclass(frozen=True)
+class StereoParams:
+    """How the depth that a sweep found is refined."""
+
+    rounds: Natural = 1
+    """How often depth is refined and compared between views; 0 leaves it as swept."""
+    max_side: Count = 480
+    """Longer side of the depth map, in pixels."""
+    sources: Count = 8
+    """Other photos that each photo is compared with."""
+    lenders: Count = 24
+    """Other views whose depth is carried into each view."""
+    max_cost: Fraction = 0.45
+    """Pixels that match worse are unknown; 0.45 is a correlation of 0.1."""
+    patchmatch: PatchMatchParams = field(default_factory=PatchMatchParams)
+
+
+@task(name="capture.stereo", environment=stereo_identity)
+def stereo(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    found: tuple[DepthMap, ...],
+    agreed: tuple[DepthMap, ...],
+    *,
+    view: int,
+    params: StereoParams = StereoParams(),
+) -> DepthMap:
+    """The depth of one view by PatchMatch, from what the views found so far; `agree` must see it again.
+
+    found: each view's depth by itself; agreed: what of it other views confirm; one map a view each, in the cameras'
+        order. Where a view has agreed depth, it starts from that, or else from other views' depth, or else its own.
+    Depth stays unknown throughout where the view has none yet.
+    """
+    all_cameras = [camera_of(cameras, k) for k in range(len(cameras))]
+    reference = photo_at_size(frames[view], all_cameras[view], params.max_side)
+    guess = _at_size(agreed[view].depth, reference.gray)
+    if not found[view].depth.any():
+        return DepthMap(frames[view].name, np.zeros_like(reference.gray), "mvs")
+    typical = float(np.median(found[view].depth[found[view].depth > 0]))
+    lenders = source_views(all_cameras, view, typical, params.lenders)
+    for other in (
+        carried([(agreed[k].depth, all_cameras[k]) for k in lenders], reference.camera),
+        _at_size(found[view].depth, reference.gray),
+        np.full_like(guess, typical),
+    ):
+        guess = np.where(guess > 0, guess, other)
+    near, far = np.quantile(guess, (0.005, 0.995))
+    guess = np.clip(guess, 0.8 * near, 1.25 * far)
+    sources = [
+        Source(other, _at_size(agreed[k].depth, other.gray))
+        for k in source_views(all_cameras, view, guess, params.sources)
+        for other in (photo_at_size(frames[k], all_cameras[k], params.max_side),)
+    ]
+    if not sources:
+        return DepthMap(frames[view].name, np.zeros_like(reference.gray), "mvs")
+    depth, cost = patchmatch(reference, sources, guess, view, params.patchmatch)
+    keep = (cost <= params.max_cost) & reference.valid
+    return DepthMap(frames[view].name, np.where(keep, depth, 0).astype(np.float32), "mvs")
+
+
+def carried(maps: list[tuple[Float32, Camera]], camera: Camera) -> Float32:
+    """The depth that other views' maps show to a camera, the nearest at each pixel; 0 where they show none.
+
+    maps: [h, w] z-depth in world units, 0 where unknown, each with its view's camera. Returns [H, W].
+    """
+    front = np.full(camera.height * camera.width, np.inf, np.float32)
+    for depth, other in maps:
+        points = backproject(depth, other.scaled(depth.shape[1], depth.shape[0]))[depth.ravel() > 0]
+        _, column, row, z = pixels_in_view(points, camera)
+        np.minimum.at(front, row * camera.width + column, z.astype(np.float32))
+    seen: Bool = np.isfinite(front)
+    return close_holes(np.where(seen, front, 0).astype(np.float32).reshape(camera.height, camera.width))
+
+
+def _at_size(depth: Float32, like: Float32) -> Float32:
+    import cv2
+
+    size = (like.shape[1], like.shape[0])
+    return cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST) if depth.shape != like.shape else depth
