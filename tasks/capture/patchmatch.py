@@ -36,9 +36,9 @@ class PatchMatchParams:
     """Out of the other photos, so many that match a pixel best decide."""
     window: Count = 11
     """Side of the window that is compared, in pixels, of which every second counts; even is one more."""
-    gray_scale: Positive = 12.0
+    gray_scale: Positive = 30.0
     """Pixels of a window whose gray level differs by so much from the middle's count 1/e."""
-    smoothness: NonNegative = 0.1
+    smoothness: NonNegative = 0.3
     """Price of a plane that none of the neighbours continues (matching costs lie in 0..1)."""
     smooth_scale: Positive = 0.02
     """Inverse depths that differ by this share, or more, do not continue one another."""

@@ -25,7 +25,7 @@ class StereoParams:
 
     rounds: Natural = 1
     """How often depth is refined and compared between views; 0 leaves it as swept."""
-    max_side: Count = 480
+    max_side: Count = 320
     """Longer side of the depth map, in pixels."""
     sources: Count = 8
     """Other photos that each photo is compared with."""

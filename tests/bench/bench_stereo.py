@@ -1,0 +1,139 @@
+"""How much depth several views give without a sensor, how right it is, and what it costs.
+
+    python tests/bench/bench_stereo.py CAPTURE [--rounds 1] [--stride 1] [--max-side 320] [--pictures FOLDER]
+    python tests/bench/bench_stereo.py --room 0 [--views 24]
+
+CAPTURE is a posed capture; where it has a sensor's depth, that is the truth, else only what is known is told. A room is
+generated, with exact depth. Printed after the sweep and after each round, by itself and as far as views agree: the
+share of all pixels that are known, of these (where the truth is known) the shares within 5 and 2 percent of the truth,
+the share of the truth's pixels that are known and within 5 percent, and CPU seconds a view. Pictures show the photo,
+the truth, the agreed sweep and the agreed last round of ten views beside each other.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from ss_flow.flows.generated import RoomParams, generate
+from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame
+from ss_flow.tasks.capture import ingest, sensor_depth
+from ss_flow.tasks.capture.depth import agree, sweep
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.capture.stereo import StereoParams, stereo
+from ss_flow.tasks.geometry.images import decode_rgb, encode_png
+
+T = TypeVar("T")
+
+
+def captured(path: Path, stride: int) -> tuple[tuple[Frame, ...], Cameras, list[Float32]]:
+    """Frames, cameras and the sensor's depth (none: no maps) of every `stride`-th view."""
+    scene = open_scene(path)
+    assert scene.poses is not None and scene.lenses is not None, "a posed capture is needed"
+    skip = slice(None, None, stride)
+
+    def files(paths: Sequence[Path | None]) -> tuple[FileRef | None, ...]:
+        return tuple(None if p is None else FileRef(p, p.name) for p in paths[skip])
+
+    names, lenses = scene.names[skip], scene.lenses[skip]
+    frames = ingest.frames(names=names, photos=files(scene.photos), valid=files(scene.valid), lenses=lenses)
+    cameras = ingest.cameras(frames, names=names, lenses=lenses, poses=scene.poses[skip], metric=scene.metric)
+    if scene.depths is None:
+        return frames, cameras, []
+    maps = sensor_depth.depth(
+        frames,
+        names=names,
+        files=files(scene.depths),
+        scale=scene.depth_scale,
+        metric=scene.metric,
+        lenses=lenses,
+        depth_lens=scene.depth_lens,
+    )
+    return frames, cameras, [m.depth for m in maps]
+
+
+def generated(seed: int, views: int) -> tuple[tuple[Frame, ...], Cameras, list[Float32]]:
+    room = generate(RoomParams(objects=10, views=views, width=540, height=360, seed=seed, held_out=0))
+    none = np.zeros(0, np.uint8)
+    photos = zip(room.cameras.names, room.rgb, strict=True)
+    return tuple(Frame(n, 540, 360, encode_png(p), none, 540, 360) for n, p in photos), room.cameras, list(room.depth)
+
+
+def tell(step: str, maps: Sequence[DepthMap], truth: Sequence[Float32], seconds: float) -> None:
+    known = np.mean([(m.depth > 0).mean() for m in maps])
+    line = f"{step:18s} known {known:.3f}"
+    if truth:
+        compared, off = [], []
+        for m, true in zip(maps, truth, strict=True):
+            t = cv2.resize(true, m.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            compared.append(m.depth[t > 0] > 0)
+            off.append(np.abs(m.depth[t > 0] / t[t > 0] - 1))
+        both, error = np.concatenate(compared), np.concatenate(off)
+        within5, within2 = (np.mean(error[both] < limit) for limit in (0.05, 0.02))
+        line += f", of these within 5 % {within5:.3f}, 2 % {within2:.3f}"
+        line += f"; found and right {np.mean(both & (error < 0.05)):.3f}"
+    print(f"{line}; {seconds / len(maps):.2f} CPU s a view", flush=True)
+
+
+def timed(work: Callable[[], T]) -> tuple[T, float]:
+    begun = time.process_time()
+    return work(), time.process_time() - begun
+
+
+def picture(frame: Frame, maps: Sequence[Float32]) -> np.ndarray:
+    """The photo and depth maps side by side, in BGR, coloured by inverse depth over the range of the first map."""
+    size = (frame.width * 360 // frame.height, 360)
+    tiles = [cv2.resize(cv2.cvtColor(decode_rgb(frame), cv2.COLOR_RGB2BGR), size, interpolation=cv2.INTER_AREA)]
+    near, far = np.quantile(maps[0][maps[0] > 0], (0.02, 0.98)) if maps[0].any() else (1.0, 2.0)
+    for depth in maps:
+        inverse = (1 / np.where(depth > 0, depth, far) - 1 / far) / (1 / near - 1 / far)
+        colored = cv2.applyColorMap((np.clip(inverse, 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
+        tiles.append(cv2.resize(np.where(depth[..., None] > 0, colored, 0), size, interpolation=cv2.INTER_NEAREST))
+    return np.hstack(tiles)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path, nargs="?")
+    parser.add_argument("--room", type=int, default=0, help="seed of the room, where no capture is named")
+    parser.add_argument("--views", type=int, default=24, help="of the room")
+    parser.add_argument("--stride", type=int, default=1, help="every n-th view of the capture")
+    parser.add_argument("--rounds", type=int, default=StereoParams().rounds)
+    parser.add_argument("--max-side", type=int, default=StereoParams().max_side)
+    parser.add_argument("--pictures", type=Path)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    frames, cameras, truth = (
+        captured(options.capture, options.stride) if options.capture else generated(options.room, options.views)
+    )
+    views = range(len(frames))
+    found, seconds = timed(lambda: tuple(sweep(frames, cameras, view=k) for k in views))
+    tell("swept", found, truth, seconds)
+    agreed, seconds = timed(lambda: agree(found, cameras))
+    tell("swept, agreed", agreed, truth, seconds)
+    swept, params = agreed, replace(StereoParams(), max_side=options.max_side)
+    for number in range(options.rounds):
+        before = (found, agreed)
+        found, seconds = timed(
+            lambda b=before: tuple(stereo(frames, cameras, *b, view=k, params=params) for k in views)
+        )
+        tell(f"round {number + 1}", found, truth, seconds)
+        agreed, seconds = timed(lambda f=found: agree(f, cameras))
+        tell(f"round {number + 1}, agreed", agreed, truth, seconds)
+    if options.pictures:
+        options.pictures.mkdir(parents=True, exist_ok=True)
+        for k in views[:: max(1, len(views) // 10)]:
+            maps = [*([truth[k]] if truth else []), swept[k].depth, agreed[k].depth]
+            cv2.imwrite(str(options.pictures / f"{frames[k].name}.png"), picture(frames[k], maps))
+
+
+if __name__ == "__main__":
+    main()
