@@ -90,7 +90,7 @@ def fill(
         of_plane = plane_of == number
         colors[of_plane] = _colors(places[of_plane], points, around[planes[number].rows])
     shaped = some_rows(after, ~_came_to_light(before, after, instances, views, places, _NEAR * spacing))
-    return joined([shaped, _with_ids_of(shaped, _flat(places, colors, plane_of, planes))])
+    return joined([shaped, _with_ids_of(shaped, _flat(places, colors, plane_of, planes, spacing))])
 
 
 @dataclass(frozen=True)
@@ -248,15 +248,15 @@ def _colors(places: Float64, points: PointCloud, rows: Int32) -> UInt8:
     return np.median(points.colors[rows[near]], axis=1).astype(np.uint8)
 
 
-def _flat(places: Float64, colors: UInt8, plane_of: Int32, planes: list[_Plane]) -> EditedScene:
-    """Gaussians that lie in their planes, a fifth as thick as they are wide."""
+def _flat(places: Float64, colors: UInt8, plane_of: Int32, planes: list[_Plane], spacing: float) -> EditedScene:
+    """Gaussians that lie in their planes: a spacing wide (one standard deviation), a fifth of it thick."""
     from scipy.spatial.transform import Rotation
 
     made = initialise(places.astype(np.float32), colors, 0, 0.0, opacity=_OPACITY)
     turns = [np.stack([*plane.axes, np.cross(*plane.axes)], axis=1) for plane in planes]
     quaternions = np.array([Rotation.from_matrix(turn).as_quat(scalar_first=True) for turn in turns], np.float32)
-    log_scales = made.log_scales.copy()
-    log_scales[:, 2] -= np.float32(np.log(5))
+    widths = np.log(spacing * np.array([1, 1, 0.2]))
+    log_scales = np.tile(widths.astype(np.float32), (len(places), 1))
     return edited(replace(made, quaternions=quaternions[plane_of], log_scales=log_scales), filled=1)
 
 

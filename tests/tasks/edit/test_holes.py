@@ -77,6 +77,8 @@ def test_filling_continues_the_floor_under_the_box_and_says_so(seen, removed):
     under = ((new[:, :2] > low - SPACING) & (new[:, :2] < high + SPACING)).all(axis=1)
     assert under.mean() > 0.98  # the rest lies where another box hides the floor from all views
     assert (after.instance_id[after.filled > 0] == 0).all()
+    widths = np.exp(after.log_scales[after.filled > 0])
+    np.testing.assert_allclose(widths, np.tile([SPACING, SPACING, SPACING / 5], (len(new), 1)), rtol=1e-5)
     colors = 0.5 + 0.28209479 * after.sh[after.filled > 0, 0]
     np.testing.assert_allclose(colors, np.tile(box_scene.COLORS[0] / 255, (len(new), 1)), atol=0.01)
     before = holes(scene, removed, measured, instances=(BOX,), gone=(BOX,)).unmeasured.sum()
