@@ -118,6 +118,7 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
     found: dict[str, Holes] = {n: store.get(value) for n, value in report.values.items() if n != "scene"}  # type: ignore[arg-type]
     document = {
         "status": "ok",
+        "warnings": [{"label": n["label"], "text": text} for n in report.nodes for text in n.get("warnings", ())],
         "scene": edit.run["scene"],
         "params": edit.run["params"],
         "models": edit.run["models"],
