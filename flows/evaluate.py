@@ -22,7 +22,7 @@ def on_points(results: dict[str, Any], truth: TruePoints, *, radius: float, comp
     results: digests by name, as run.json has them.
     """
     instances = stored("reproject", results["reproject"])
-    rules = {"transfer_radius": radius, "compat_gap_bug": compat}
+    rules: dict[str, Any] = {"transfer_radius": radius, "compat_gap_bug": compat}
     with labelled("split"):
         points, labels = stored("dense", results["dense"]), stored("cut", results["cut"])
         after_split = evaluate_points(points, labels, instances, truth, **rules)

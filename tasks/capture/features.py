@@ -62,7 +62,7 @@ def features(frame: Frame, *, params: FeatureParams = FeatureParams()) -> Featur
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     keypoints, found = extractor.extract_from_uint8_array(gray)
     shapes = pycolmap.keypoints_to_matrix(keypoints).reshape(-1, 4)
-    points = shapes[:, :2] * np.float32([frame.width / gray.shape[1], frame.height / gray.shape[0]])
+    points = shapes[:, :2] * np.array([frame.width / gray.shape[1], frame.height / gray.shape[0]], np.float32)
     pixel = np.clip(points.astype(int), 0, (frame.width - 1, frame.height - 1))
     counts = decode_valid(frame)[pixel[:, 1], pixel[:, 0]]
     # By place where sizes are equal: a photo's features never come in another order.
