@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -27,6 +28,8 @@ from ss_flow.tasks.ranges import Angle, Count, Fraction, Positive
 class MappingParams:
     """How cameras are found from matches."""
 
+    mapper: Literal["incremental", "global"] = "incremental"
+    """COLMAP's mapper: "incremental" places one photo after the other, "global" all at once (GLOMAP), in less time."""
     min_pose_matches: Count = 15
     """So many points must confirm a photo's pose (COLMAP's own default is 30)."""
     min_start_angle: Angle = 8.0
@@ -88,15 +91,18 @@ def sfm(
 
     database, kept = fill_database(photos, (*matches, *again), lens)
     manager = pycolmap.ReconstructionManager()
-    pipeline = pycolmap.IncrementalPipeline(_mapping_options(pycolmap, params, seed), database, manager)
-    registered = 2
+    if params.mapper == "global":
+        pipeline = pycolmap.GlobalPipeline(_global_options(pycolmap, seed), database, manager)
+        step, start = pycolmap.GlobalPipelineCallback.MODEL_UPDATE_CALLBACK, 0
+    else:
+        pipeline = pycolmap.IncrementalPipeline(_incremental_options(pycolmap, params, seed), database, manager)
+        step, start = pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK, 2
+    steps = itertools.count(start)
 
-    def count() -> None:
-        nonlocal registered
-        registered = min(registered + 1, len(photos))
-        progress(registered, len(photos), "photos placed")
+    def told() -> None:
+        progress(min(next(steps), len(photos)), len(photos), "photos placed")
 
-    pipeline.add_callback(int(pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK.value), count)
+    pipeline.add_callback(int(step.value), told)
     pipeline.run()
     models = [manager.get(number) for number in range(manager.size())]
     whole = [model for model in models if _plausible(model)]
@@ -160,7 +166,7 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
     return tuple(result)
 
 
-def _mapping_options(pycolmap: Any, params: MappingParams, seed: int) -> Any:
+def _incremental_options(pycolmap: Any, params: MappingParams, seed: int) -> Any:
     pycolmap.set_random_seed(seed)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
@@ -172,6 +178,15 @@ def _mapping_options(pycolmap: Any, params: MappingParams, seed: int) -> Any:
     options.triangulation.random_seed = seed
     options.min_model_size = 3
     options.extract_colors = False
+    return options
+
+
+def _global_options(pycolmap: Any, seed: int) -> Any:
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = seed
+    options.min_model_size = 3
     return options
 
 

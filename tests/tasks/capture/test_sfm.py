@@ -8,7 +8,7 @@ from generated_views import views
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, Frame
-from ss_flow.tasks.capture.sfm import SfmParams, registered
+from ss_flow.tasks.capture.sfm import MappingParams, SfmParams, registered
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
 
 EYES = [(x, y, 0.1 * x) for x in (-0.9, -0.3, 0.3, 0.9) for y in (-0.3, 0.3)]
@@ -65,6 +65,15 @@ def test_other_workers_find_the_same_to_the_bit(scene, found, tmp_path, options)
     again = cameras_of(find_poses(scene[0], store, **options), store)
     for field in ("intrinsics", "world_to_camera", "sparse_points", "radial"):
         np.testing.assert_array_equal(getattr(again, field), getattr(found, field))
+
+
+def test_the_global_mapper_finds_the_same_cameras(scene, found, store):
+    params = SfmParams(mapping=MappingParams(mapper="global"))
+    cameras = cameras_of(find_poses(scene[0], store, params), store)
+    estimated, expected, _ = aligned_centers(cameras, scene[1])
+    assert cameras.names == found.names
+    assert np.linalg.norm(estimated - expected, axis=1).max() < 0.02
+    assert not np.array_equal(cameras.world_to_camera, found.world_to_camera)
 
 
 def test_a_photo_more_costs_its_own_features_and_pairs(scene, tmp_path):
