@@ -29,7 +29,7 @@ class PairParams:
     or "auto": the `partners` most similar ones, and in a numbered series or a video the neighbours too."""
     exhaustive_limit: Natural = 30
     """In "auto", so many photos are matched with all the others of them, however similar."""
-    partners: Count = 16
+    partners: Count = 12
     """To how many photos before it a photo is matched in full."""
     overlap: Natural = 6
     """How many neighbours on either side of a photo in a series are matched in full, whether similar or not."""
