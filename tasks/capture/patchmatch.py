@@ -56,8 +56,8 @@ class Source:
 
 
 def stereo_identity() -> dict[str, str]:
-    """What the result depends on besides its inputs: the native library's instruction set."""
-    return {"stereo": on_this_processor(instruction_set())}
+    """What the result depends on besides its inputs: the instruction set of the library that the rasterizer is in."""
+    return {"rasterizer": on_this_processor(instruction_set())}
 
 
 def patchmatch(

@@ -157,4 +157,4 @@ def test_depth_is_carried_to_another_view_with_the_nearest_in_front(scene):
 
 
 def test_the_instruction_set_counts_in_the_key():
-    assert stereo_identity()["stereo"].split()[-1] in library.BUILDS
+    assert stereo_identity()["rasterizer"].split()[-1] in library.BUILDS
