@@ -10,7 +10,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Float32, InstanceMasks, Int32, UInt8
 from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE, SceneViews, sample_depth
 from ss_flow.tasks.geometry.cameras import backproject
-from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.geometry.clustering import dbscan, nearest_spacing
 from ss_flow.tasks.geometry.images import decode_rgb
 
 REACH = 8
@@ -19,6 +19,8 @@ MOST_VIEWS = 12
 """Views that are asked about another one, evenly spread."""
 BEYOND = 2.0
 """A surface is missing where it lies farther than so many spacings from all labelled points."""
+CONNECTED = 3.0
+"""Spacings from one point to the next of one surface."""
 LEAST_VIEWS = 4
 """Views whose masks hold a missing point, its own among them."""
 STRIDE = 2
@@ -53,7 +55,8 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     borders of the masks hide from the vote on labels.
 
     A point joins when the masks of at least four views hold it, and those of at least `share` of the views that see
-    it. One joins for each cube of the points' spacing, the first; its confidence is that share.
+    it, and when other points lead from it to the labelled ones: what is apart is another thing. One joins for each cube
+    of the points' spacing, the first; its confidence is that share.
     """
     from scipy.spatial import cKDTree
 
@@ -81,6 +84,9 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     points, colors, confidence = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     cell = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
     first = np.sort(np.unique(cell, axis=0, return_index=True)[1])
+    together = dbscan(np.concatenate([instance.points, points[first]]), CONNECTED * spacing, 1)
+    own, added = np.split(together, [len(instance.points)])
+    first = first[np.isin(added, own)]
     return replace(
         instance,
         points=np.concatenate([instance.points, points[first]]),

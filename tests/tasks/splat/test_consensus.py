@@ -113,3 +113,19 @@ def test_a_complete_instance_and_what_few_masks_hold_gain_no_points(small):
     assert not (off > 0.01).any()
     lone = replace(instance, points=instance.points[:1])
     assert completed(scene, lone, 0.7) is lone
+
+
+def test_surface_apart_from_the_labelled_points_is_another_thing(small):
+    ball, box = small.instance(BALL), small.instance(1)
+    masks = ball.dense() | box.dense()
+    both = replace(ball, packed=pack_masks(masks))
+    apart = np.linalg.norm(ball.points - CENTRE, axis=1) < 0.23
+    far = replace(
+        both,
+        points=ball.points[apart] + np.float32([0, 0, 1]),
+        colors=ball.colors[apart],
+        point_confidence=ball.point_confidence[apart],
+        point_part=ball.point_part[apart],
+    )
+    assert len(completed(small.views.compared(VisibilityParams()), far, 0.7).points) == len(far.points)
+    assert len(completed(small.views.compared(VisibilityParams()), both, 0.7).points) > len(both.points)
