@@ -107,13 +107,13 @@ def photo_maps(found: Observations, num_views: int, prior: float) -> Float64:
         turned = maps[:, :, :3].transpose(0, 2, 1)
         squares = _added(weight[:, None, None] * (turned @ maps[:, :, :3])[view], point, count)
         sides = _added(weight[:, None, None] * (turned[view] @ (color - maps[view, :, 3])[..., None]), point, count)
-        scene = np.linalg.solve(squares + 1e-9 * np.eye(3), sides)[..., 0]
+        scene = _solved(squares + 1e-9 * np.eye(3), sides)[..., 0]
         ones = np.concatenate([scene, np.ones((count, 1))], axis=1)[point]
         squares = _added(weight[:, None, None] * ones[:, :, None] * ones[:, None], view, num_views)
         sides = _added(weight[:, None, None] * ones[:, :, None] * color[:, None], view, num_views)
         squares += pull[:, None, None] * np.eye(4)
         sides += pull[:, None, None] * first.transpose(0, 2, 1)
-        maps = np.linalg.solve(squares, sides).transpose(0, 2, 1)
+        maps = _solved(squares, sides).transpose(0, 2, 1)
         weight = _weights(color - (maps[view] @ ones[..., None])[..., 0])
     return maps
 
@@ -171,10 +171,14 @@ def _means(values: Float64, rows: Int32, weight: Float64, length: int) -> Float6
     )
 
 
+def _solved(squares: Float64, sides: Float64) -> Float64:
+    return np.asarray(np.linalg.solve(squares, sides), np.float64)
+
+
 def _added(values: Float64, rows: Int32, length: int) -> Float64:
     """Sums of the values [M, ...] by row."""
     flat = values.reshape(len(values), -1).T
-    sums = np.stack([np.bincount(rows, column, length) for column in flat], axis=-1)
+    sums = np.stack([np.bincount(rows, column, length) for column in flat], axis=-1).astype(np.float64, copy=False)
     return sums.reshape(length, *values.shape[1:])
 
 
@@ -206,10 +210,10 @@ def _observations(
         views.append(np.full(int(counts.sum()), view, np.int32))
         rows.append(row[counts])
         colors.append(color[counts])
-    view, point, color = np.concatenate(views), np.concatenate(rows), np.concatenate(colors)
+    point = np.concatenate(rows)
     shared = np.bincount(point, minlength=len(points))[point] >= _MIN_VIEWS
-    _, point = np.unique(point[shared], return_inverse=True)
-    return Observations(view[shared], point.astype(np.int32), color[shared])
+    _, renumbered = np.unique(point[shared], return_inverse=True)
+    return Observations(np.concatenate(views)[shared], renumbered.astype(np.int32), np.concatenate(colors)[shared])
 
 
 def _some_points(depth: DepthMap, cameras: Cameras, view: int, most: int, rng: np.random.Generator) -> Float32:

@@ -8,6 +8,7 @@ import pytest
 from ball_and_box import HEIGHT, WIDTH, SmallScene
 
 from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import ColourTransform
 from ss_flow.tasks.gaussians.views import (
     IGNORED,
     NONE_OF_MINE,
@@ -70,6 +71,17 @@ def test_the_three_kinds_of_pixels_do_not_overlap_and_follow_the_ids(small):
         np.testing.assert_array_equal(made.ids == NONE_OF_MINE, made.free)
         np.testing.assert_array_equal(made.ids == IGNORED, ~made.inside & ~made.free)
         np.testing.assert_array_equal(whole(small, view, made.inside, made.camera), small.ids[view] == 2)
+
+
+def test_a_photo_is_trained_on_in_the_colours_of_the_scene(small):
+    matrix = np.array([[1.5, 0.1, 0, 0.02], [0, 0.8, 0, -0.01], [0, 0.2, 1.1, 0]])
+    even = ColourTransform("v1", "v0", matrix)
+    same = ColourTransform("v0", "v0", np.eye(4)[:3])
+    scene = views_of(small, colours=(same, even, *(same,) * (len(small.frames) - 2)))
+    plain, changed = built(small, 1, 1), built(small, 1, 1, scene)
+    np.testing.assert_allclose(changed.image, plain.image @ matrix[:, :3].T + matrix[:, 3], atol=1e-6)
+    np.testing.assert_array_equal(built(small, 0, 1, scene).image, built(small, 0, 1).image)
+    assert changed.image.max() > 1  # what is bright in the scene may be brighter than a photo can show
 
 
 def test_where_the_box_hides_the_ball_the_ball_is_ignored_and_elsewhere_free(small):
