@@ -40,9 +40,9 @@ _FEW = 200
 class ColourParams:
     """How the exposure and white balance of photos are evened out."""
 
-    transform: Literal["affine", "none"] = "affine"
-    """What each photo's colours go through before Gaussians are trained on them: "affine", a 3 x 4 matrix; or "none",
-    as in the paper."""
+    transform: Literal["affine", "none"] = "none"
+    """What each photo's colours go through before Gaussians are trained on them: "none", as in the paper, or "affine",
+    a 3 x 4 matrix."""
     points: Count = 10_000
     """Surface points that are looked up in the photos."""
     prior: Positive = 1e-2
