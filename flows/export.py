@@ -18,10 +18,11 @@ from ss_flow.tasks.deliver.export.splat import splat
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.export.usda import usda
 
-Format = Literal[
-    "ply", "labelled-ply", "compressed-ply", "splat", "spz", "gltf", "usda", "mesh-ply", "mesh-obj", "mesh-glb"
-]
-FORMATS: tuple[str, ...] = get_args(Format)
+Gaussian = Literal["ply", "labelled-ply", "compressed-ply", "splat", "spz", "gltf", "usda"]
+Surface = Literal["mesh-ply", "mesh-obj", "mesh-glb"]
+Workspace = Literal["colmap", "nerfstudio"]
+Format = Gaussian | Surface | Literal["coco"] | Workspace
+SURFACES, WORKSPACES = get_args(Surface), get_args(Workspace)
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,12 @@ GAUSSIANS: dict[str, tuple[str, Callable[[Source], FileContent]]] = {
 """The formats of Gaussians: what their files end in, and the node of a file."""
 MESHES = {"mesh-ply": ".ply", "mesh-obj": ".obj"}
 """The formats with a file for each surface, and what it ends in."""
-MESH_SCENE = ".glb"
+OTHERS = {"mesh-glb": ".glb", "coco": ".json", "colmap": "", "nerfstudio": ""}
 
 
 def suffix_of(format: str) -> str:
     """What a file of a format ends in."""
-    return GAUSSIANS[format][0] if format in GAUSSIANS else MESHES.get(format, MESH_SCENE)
+    return GAUSSIANS[format][0] if format in GAUSSIANS else (MESHES | OTHERS)[format]
 
 
 def one_file(source: Source, format: str, holes: Literal["open", "closed"]) -> FileContent:

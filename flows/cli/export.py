@@ -14,12 +14,16 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import export as formats
-from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.context import StoreOptions, console, file_digests
 from ss_flow.flows.cli.finished import FinishedRun, open_run
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.deliver import STATUS_EXIT
-from ss_flow.resolution import Failure
+from ss_flow.task import FileRef
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.deliver.export.coco import coco
 from ss_flow.tasks.deliver.output import check_writable, replacing
+from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorted
+from ss_flow.tasks.geometry.images import suffix_of
 
 MANIFEST = "export.json"
 
@@ -35,7 +39,7 @@ class Export:
     instance: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An instance by id or name, 0 = the background; may be given several times. All when left out."""
     each: bool = False
-    """A file for each instance, in a folder with export.json; so are mesh-ply and mesh-obj at all times."""
+    """A file for each instance, in a folder with export.json; mesh-ply and mesh-obj are written so at all times."""
     holes: Literal["open", "closed"] = "open"
     """For meshes: "closed" closes by a guess what no view shows."""
     out: Path | None = None
@@ -48,18 +52,22 @@ class Export:
     """Where results are kept."""
 
     def run(self) -> int:
-        run = open_run(self.result, self.store, ("scene", "cameras"))
+        workspace = self.format in formats.WORKSPACES
+        self._check_options()
+        run = open_run(self.result, self.store, ("scene", "cameras", "ingest", "masks"))
         several = self.each or self.format in formats.MESHES
-        surfaces = self.format.startswith("mesh-")
-        if self.holes != "open" and not surfaces:
-            raise InputError(f"--holes {self.holes} is for meshes; {self.format} holds Gaussians.")
-        if self.jobs < 0:
-            raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
-        ids = run.ids(self.instance) if self.instance else run.all_ids() if several or surfaces else None
-        out = self.out or Path("ss-flow-export") / (run.name + ("" if several else formats.suffix_of(self.format)))
-        _check_place(out, folder=several)
+        by_instance = several or self.format == "coco" or self.format in formats.SURFACES
+        ids = run.ids(self.instance) if self.instance else run.all_ids() if by_instance else None
+        folder = several or workspace
+        out = self.out or Path("ss-flow-export") / (run.name + ("" if folder else formats.suffix_of(self.format)))
+        _check_place(out, folder=folder)
+        if workspace:
+            return self._write_workspace(out, run)
+        pixels = _masks_and_photos(run) if self.format == "coco" else ((), ())
 
         def build() -> dict[str, Any]:
+            if self.format == "coco":
+                return {"file": coco(masks=pixels[0], photos=pixels[1], names=run.names, instances=ids or ())}
             source = formats.Source(run.node("scene"), run.node("cameras"), run.names, ids)
             if several:
                 return formats.a_file_each(source, self.format, self.holes)
@@ -74,6 +82,36 @@ class Export:
             request = Request(build, run.document["scene"], reporter=screen, done=done)
             (report,) = run_flows([request], run.store, jobs=self.jobs, recorded=False)
         return self._tell(out, report, written)
+
+    def _check_options(self) -> None:
+        """Raises InputError for options that mean nothing for the format, or are out of range."""
+        if self.holes != "open" and self.format not in formats.SURFACES:
+            raise InputError(f"--holes {self.holes} is for meshes, and {self.format} holds none.")
+        if self.format in formats.WORKSPACES and (self.instance or self.each):
+            raise InputError(f"--instance and --each are for parts of a scene; {self.format} holds photos and cameras.")
+        if self.format == "coco" and self.each:
+            raise InputError("--each is for formats of Gaussians and meshes; coco tells all instances in one file.")
+        if self.jobs < 0:
+            raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
+
+    def _write_workspace(self, out: Path, run: FinishedRun) -> int:
+        """Write the photos and cameras that the run worked with."""
+        frames = [run.store.get(value) for value in run.document["results"]["ingest"]]
+        cameras = run.load("cameras")
+        with replacing(out) as filling:
+            if self.format == "colmap":
+                maps = [run.store.get(value) for value in run.document["results"]["masks"]]
+                write_undistorted(filling, frames, cameras, maps)
+            else:
+                write_nerfstudio(filling, frames, cameras)
+            files = [
+                {"file": str(file.relative_to(filling)), "instances": None, "bytes": file.stat().st_size}
+                for file in sorted(filling.rglob("*"))
+                if file.is_file()
+            ]
+            manifest = {"result": str(run.folder), "format": self.format, "files": files}
+            (filling / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        return self._tell(out, None, files)
 
     def _write(self, out: Path, run: FinishedRun, report: Report, ids: tuple[int, ...] | None) -> list[dict[str, Any]]:
         """Write what came out; returns what each file is."""
@@ -96,10 +134,11 @@ class Export:
             (filling / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
         return files
 
-    def _tell(self, out: Path, report: Report, files: list[dict[str, Any]]) -> int:
-        status = "degraded" if any(isinstance(value, Failure) for value in report.values.values()) else "ok"
-        failures = [{"label": f.label, "error": f"{type(f.error).__name__}: {f.error}"} for f in report.failures]
-        warnings = sorted({w for node in report.nodes for w in node.get("warnings") or ()})
+    def _tell(self, out: Path, report: Report | None, files: list[dict[str, Any]]) -> int:
+        failed = report.failures if report else []
+        status = "degraded" if failed else "ok"
+        failures = [{"label": f.label, "error": f"{type(f.error).__name__}: {f.error}"} for f in failed]
+        warnings = sorted({w for node in (report.nodes if report else ()) for w in node.get("warnings") or ()})
         if self.json:
             document = {"status": status, "format": self.format, "out": str(out), "files": files}
             print(json.dumps({**document, "warnings": warnings, "failures": failures}))
@@ -110,6 +149,29 @@ class Export:
         size = sum(file["bytes"] for file in files) / 1e6
         words.print(escape(f"{status}: {out} ({self.format}, {len(files)} files, {size:.1f} MB)"))
         return STATUS_EXIT[status]
+
+
+def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str, ...]]:
+    """The final id images of a run, and the file name of the photo of each.
+
+    Where the capture is gone or has no photos of its own (a video), photos are called as the frames are.
+    """
+    digests = file_digests(run.store)
+    names = run.load("cameras").names
+    try:
+        photos = {photo.stem: photo.name for photo in open_scene(Path(run.document["scene"])).photos}
+    except InputError:
+        photos = {}
+    files = [run.folder / "masks" / f"{name}.png" for name in names]
+    missing = next((file for file in files if not file.is_file()), None)
+    if missing is not None:
+        raise InputError(f"{missing} is not there; run the scene again.")
+    masks = tuple(FileRef(file.absolute(), digests(file)) for file in files)
+    digests.save()
+    for name, value in zip(names, run.document["results"]["ingest"], strict=True):
+        if name not in photos:
+            photos[name] = f"{name}.{suffix_of(run.store.get(value))}"
+    return masks, tuple(photos[name] for name in names)
 
 
 def _check_place(out: Path, *, folder: bool) -> None:

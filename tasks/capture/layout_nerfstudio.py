@@ -79,9 +79,9 @@ def transforms_document(cameras: Sequence[Camera], files: Sequence[str]) -> dict
     frames = []
     for camera, file in zip(cameras, files, strict=True):
         matrix = np.linalg.inv(camera.world_to_camera) @ _OPENGL_TO_OPENCV
-        lens = {"w": camera.width, "h": camera.height}
-        lens |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-        frames.append({"file_path": file, **lens, "transform_matrix": matrix.tolist()})
+        lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        size = {"w": camera.width, "h": camera.height}
+        frames.append({"file_path": file, **size, **lens, "transform_matrix": matrix.tolist()})
     return {"camera_model": "OPENCV", "frames": frames}
 
 

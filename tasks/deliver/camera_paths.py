@@ -102,7 +102,7 @@ def _looked_at(scene: Gaussians, views: tuple[Camera, ...]) -> Float64:
         across = np.eye(3) - np.outer(axis, axis)
         matrix += across + _TOWARDS_SURFACE * np.eye(3)
         vector += across @ view.center + _TOWARDS_SURFACE * (view.center + depth * axis)
-    return np.linalg.solve(matrix, vector)
+    return np.asarray(np.linalg.solve(matrix, vector), np.float64)
 
 
 @task(name="deliver.camera_paths.given")

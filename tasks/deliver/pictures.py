@@ -82,10 +82,10 @@ def film(pictures: Sequence[FileContent], *, what: What, fps: int) -> FileConten
         return FileContent.of(file.read_bytes())
 
 
-def _decoded(picture: FileContent) -> np.ndarray:
+def _decoded(png: FileContent) -> np.ndarray:
     import cv2
 
-    pixels = cv2.imdecode(picture.content, cv2.IMREAD_UNCHANGED)
+    pixels = cv2.imdecode(png.content, cv2.IMREAD_UNCHANGED)
     return pixels[..., ::-1] if pixels.ndim == 3 else pixels
 
 

@@ -1,11 +1,14 @@
-"""The frames and cameras that a run worked with, as a capture that other tools (and we) read: COLMAP's text form."""
+"""The frames and cameras that a run worked with, as a capture that other tools (and we) read."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from ss_flow.tasks.artifacts import Cameras, Frame, LabelMap
+from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
+from ss_flow.tasks.geometry.cameras import cameras_by_view
 from ss_flow.tasks.geometry.images import encode_png, suffix_of
 
 
@@ -27,6 +30,23 @@ def write_undistorted(folder: Path, frames: Sequence[Frame], cameras: Cameras, m
             (folder / "valid").mkdir(exist_ok=True)
             (folder / "valid" / f"{frame.name}.png").write_bytes(frame.valid.tobytes())
     _write_model(folder / "sparse" / "0", files, cameras)
+
+
+def write_nerfstudio(folder: Path, frames: Sequence[Frame], cameras: Cameras) -> None:
+    """Write `transforms.json` of pinhole cameras, the photos in `images/`, and where pixels are to be ignored `valid/`.
+
+    The masks of `valid/` are 0 there, as nerfstudio takes them.
+    """
+    (folder / "images").mkdir(parents=True)
+    files = [f"images/{frame.name}.{suffix_of(frame)}" for frame in frames]
+    document = transforms_document(cameras_by_view(cameras), files)
+    for frame, file, entry in zip(frames, files, document["frames"], strict=True):
+        (folder / file).write_bytes(frame.encoded.tobytes())
+        if frame.valid.size:
+            (folder / "valid").mkdir(exist_ok=True)
+            entry["mask_path"] = f"valid/{frame.name}.png"
+            (folder / entry["mask_path"]).write_bytes(frame.valid.tobytes())
+    (folder / "transforms.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
 
 
 def _write_model(folder: Path, files: Sequence[str], cameras: Cameras) -> None:

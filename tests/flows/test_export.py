@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 from tiny_runs import bytes_of, ss_flow
 
+from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.ply import read_columns, read_gaussians
 
 
@@ -64,6 +66,50 @@ def test_meshes_come_as_a_folder_of_objects_and_as_one_scene(tiny, tmp_path):
     assert (tmp_path / "a.glb").read_bytes()[:4] == b"glTF"
 
 
+def test_coco_says_what_the_masks_show_in_the_pixels_of_the_photos(tiny, tmp_path):
+    answer = export(tiny, "--format", "coco", "--out", tmp_path / "a.json")
+    assert answer.code == 0, answer.err
+    document = json.loads((tmp_path / "a.json").read_text())
+    photos = sorted((tiny.scene / "color").iterdir())
+    assert [image["file_name"] for image in document["images"]] == [photo.name for photo in photos]
+    seen = 0
+    for image, photo in zip(document["images"], photos, strict=True):
+        ids = cv2.imread(str(tiny.out / "masks" / f"{photo.stem}.png"), cv2.IMREAD_UNCHANGED)
+        assert cv2.imread(str(photo)).shape[:2] == (image["height"], image["width"]) == ids.shape
+        own = [a for a in document["annotations"] if a["image_id"] == image["id"]]
+        assert sorted(a["instance_id"] for a in own) == sorted(set(np.unique(ids).tolist()) & set(ids_of(tiny)))
+        for annotation in own:
+            mask = ids == annotation["instance_id"]
+            counts = annotation["segmentation"]["counts"]
+            runs = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+            np.testing.assert_array_equal(runs.reshape(ids.shape[::-1]).T, mask)
+            x, y, width, height = annotation["bbox"]
+            assert mask[y : y + height, x : x + width].sum() == annotation["area"] == mask.sum()
+            seen += 1
+    assert seen > 4
+
+
+def test_coco_can_be_given_to_a_run_as_its_masks(tiny, tmp_path):
+    export(tiny, "--format", "coco", "--out", tmp_path / "a.json")
+    asked = ["--masks", tmp_path / "a.json", "--until", "segment", "--preset", "fast", "--json"]
+    answer = ss_flow("run", tiny.scene, *asked, "--cache", tmp_path / "store")
+    assert answer.code == 0, answer.err
+
+
+@pytest.mark.parametrize("format", ["colmap", "nerfstudio"])
+def test_photos_and_cameras_come_out_as_a_capture_with_the_same_cameras(tiny, tmp_path, format):
+    answer = export(tiny, "--format", format, "--out", tmp_path / "a", "--json")
+    assert answer.code == 0, answer.err
+    read, given = open_scene(tmp_path / "a"), open_scene(tiny.scene)
+    assert read.kind == format and read.names == given.names
+    np.testing.assert_allclose(read.poses, given.poses, atol=1e-6)
+    for ours, theirs in zip(read.lenses, given.lenses, strict=True):
+        assert (ours.width, ours.height, ours.pinhole) == (96, 72, True)
+        np.testing.assert_allclose((ours.fx, ours.fy, ours.cx, ours.cy), (theirs.fx, theirs.fy, theirs.cx, theirs.cy))
+    again = export(tiny, "--format", format, "--out", tmp_path / "a")
+    assert again.code == 0, again.err
+
+
 def test_a_second_export_computes_nothing(tiny, tmp_path):
     one = str(ids_of(tiny)[0])
     export(tiny, "--format", "mesh-obj", "--instance", one, "--out", tmp_path / "a")
@@ -85,6 +131,8 @@ def test_the_background_is_an_instance_when_it_is_asked_for(tiny, tmp_path):
         (["--format", "ply", "--instance", "no such"], "is no instance of"),
         (["--format", "ply", "--holes", "closed"], "is for meshes"),
         (["--format", "ply", "--jobs", "-1"], "out of range"),
+        (["--format", "colmap", "--instance", "1"], "holds photos and cameras"),
+        (["--format", "coco", "--each"], "tells all instances in one file"),
     ],
 )
 def test_bad_usage_gets_one_sentence(tiny, tmp_path, more, said):

@@ -44,7 +44,7 @@ def base_colors(gaussians: Gaussians) -> Float64:
 def levels(values: Float32 | Float64, bits: int) -> NDArray[np.uint32]:
     """Values 0..1 as the nearest of 2^bits levels; those outside take the nearer end."""
     top = (1 << bits) - 1
-    return np.floor(np.clip(values, 0, 1) * top + 0.5).astype(np.uint32)
+    return np.floor(np.asarray(values, np.float64).clip(0, 1) * top + 0.5).astype(np.uint32)
 
 
 def smallest_three(quaternions: Float32) -> tuple[NDArray[np.intp], Float64]:

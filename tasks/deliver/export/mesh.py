@@ -9,10 +9,10 @@ import numpy as np
 
 from ss_flow.running import progress, warn
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, Float32, Gaussians, Int32, UInt8
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Gaussians, Int32, UInt8
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import Rendering, render
-from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, project
+from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view, project
 from ss_flow.tasks.geometry.open3d import load_open3d
 
 _CELLS = 128
@@ -28,7 +28,6 @@ _STRAY = 0.005
 """Share of the Gaussians at each end of each axis that may lie outside the box."""
 _SMALLEST_PIECE = 0.05
 """Share of the largest piece's triangles below which another piece is taken for floating debris."""
-_POISSON_DEPTH = 7
 
 
 @dataclass(frozen=True)
@@ -43,20 +42,20 @@ class TriangleMesh:
     triangles: Int32
     """[T, 3] rows of `vertices`, anticlockwise from outside."""
     watertight: bool
-    """Whether it is closed, has no edge of three triangles and does not cut itself."""
+    """Whether each edge belongs to exactly two triangles."""
 
 
 @task(
     name="deliver.export.mesh",
-    resources=Resources(cores=1, memory_mb=700),
+    resources=Resources(cores=1, memory_mb=900),
     environment=backend_identity,
 )
 def mesh(own: Gaussians, cameras: Cameras, *, instance_id: int, holes: Literal["open", "closed"]) -> TriangleMesh:
     """The surface of one instance as the input views would see it if it stood alone.
 
-    own: its Gaussians only.
-    holes: "open" leaves open what no view shows; "closed" puts a Poisson surface (Kazhdan and Hoppe 2013) through the
-    fused one, which closes it by a guess. Colours are those that the views see, averaged.
+    own: its Gaussians only. holes: "open" leaves open what no view shows; "closed" takes for solid what no view sees
+    through (Kutulakos and Seitz 2000), within the instance's box, and so gives a solid whose far side is a guess.
+    Colours are those that the views see, averaged.
     """
     views = [view for view in (_framed(own, camera) for camera in cameras_by_view(cameras)) if view is not None]
     if not views:
@@ -65,29 +64,35 @@ def mesh(own: Gaussians, cameras: Cameras, *, instance_id: int, holes: Literal["
     o3d = load_open3d()
     low, high = np.quantile(own.means.astype(np.float64), (_STRAY, 1 - _STRAY), axis=0)
     side = max(float((high - low).max()) * (1 + 2 * _MARGIN), 1e-6)
+    cell = side / _CELLS
+    corner = (low + high) / 2 - side / 2
     volume = o3d.pipelines.integration.UniformTSDFVolume(
         length=side,
         resolution=_CELLS,
-        sdf_trunc=_TRUNCATION * side / _CELLS,
+        sdf_trunc=_TRUNCATION * cell,
         color_type=o3d.pipelines.integration.TSDFVolumeColorType.RGB8,
-        origin=((low + high) / 2 - side / 2)[:, None],
+        origin=corner[:, None],
     )
+    middles = corner + (np.indices((_CELLS,) * 3).reshape(3, -1).T + 0.5) * cell if holes == "closed" else None
+    empty = np.zeros(_CELLS**3, bool)
     for done, view in enumerate(views):
         progress(done, len(views), f"instance {instance_id}")
-        _fuse(o3d, volume, render(own, view), view)
+        depth = _fuse(o3d, volume, render(own, view), view)
+        if middles is not None:
+            _carve(empty, middles, depth, view, _TRUNCATION * cell)
     surface = volume.extract_triangle_mesh()
+    if holes == "closed":
+        surface = _closed(o3d, volume, surface, empty, (low - corner) / cell, (high - corner) / cell)
     _drop_debris(surface)
     if not len(surface.triangles):
         warn(f"instance {instance_id} is nowhere solid enough for a surface; its mesh is empty")
         return _empty(instance_id)
-    if holes == "closed":
-        surface = _closed(o3d, surface)
     return TriangleMesh(
         instance_id,
         np.asarray(surface.vertices, np.float32),
         np.rint(255 * np.clip(np.asarray(surface.vertex_colors), 0, 1)).astype(np.uint8),
         np.asarray(surface.triangles, np.int32),
-        bool(surface.is_watertight()),
+        bool(surface.is_edge_manifold(allow_boundary_edges=False)),
     )
 
 
@@ -115,8 +120,8 @@ def _framed(own: Gaussians, camera: Camera) -> Camera | None:
     return larger.cropped(x0, y0, x1, y1)
 
 
-def _fuse(o3d: Any, volume: Any, seen: Rendering, view: Camera) -> None:
-    """Add a rendering's expected depth and colours to the volume."""
+def _fuse(o3d: Any, volume: Any, seen: Rendering, view: Camera) -> Float32:
+    """Add a rendering's expected depth and colours to the volume; returns the depth, 0 where there is none."""
     alpha = np.maximum(seen.alpha, 1e-6)
     depth = np.where(seen.alpha > _SOLID, seen.depth / alpha, 0).astype(np.float32)
     colors = np.rint(255 * (seen.rgb / alpha[..., None]).clip(0, 1)).astype(np.uint8)
@@ -134,6 +139,15 @@ def _fuse(o3d: Any, volume: Any, seen: Rendering, view: Camera) -> None:
         o3d.camera.PinholeCameraIntrinsic(*lens),
         np.ascontiguousarray(view.world_to_camera),
     )
+    return depth
+
+
+def _carve(empty: Bool, middles: Float64, depth: Float32, view: Camera, margin: float) -> None:
+    """Mark the cells [C] in front of a view's surfaces, and those beside them where it sees through."""
+    left = np.flatnonzero(~empty)
+    rows, column, row, z = pixels_in_view(middles[left], view)
+    seen = depth[row, column]
+    empty[left[rows[(seen == 0) | (z < seen - margin)]]] = True
 
 
 def _drop_debris(surface: Any) -> None:
@@ -145,9 +159,18 @@ def _drop_debris(surface: Any) -> None:
         surface.remove_unreferenced_vertices()
 
 
-def _closed(o3d: Any, surface: Any) -> Any:
-    surface.compute_vertex_normals()
-    points = o3d.geometry.PointCloud(surface.vertices)
-    points.normals, points.colors = surface.vertex_normals, surface.vertex_colors
-    whole, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(points, depth=_POISSON_DEPTH, n_threads=1)
+def _closed(o3d: Any, volume: Any, surface: Any, empty: Bool, low: Float64, high: Float64) -> Any:
+    """The surface of what is not empty; low, high: the instance's box in cells, beyond which all is."""
+    from scipy.spatial import cKDTree
+
+    known = np.asarray(volume.extract_volume_tsdf())
+    place = np.indices((_CELLS,) * 3).reshape(3, -1).T
+    empty = empty | ((place < np.floor(low) - 1) | (place > np.ceil(high) + 1)).any(axis=1)
+    value = np.where(known[:, 1] > 0, known[:, 0], np.where(empty, 1.0, -1.0))
+    value[((place == 0) | (place == _CELLS - 1)).any(axis=1)] = 1.0
+    volume.inject_volume_tsdf(o3d.utility.Vector2dVector(np.column_stack([value, np.ones(len(value))])))
+    whole = volume.extract_triangle_mesh()
+    if len(surface.vertices):
+        nearest = cKDTree(np.asarray(surface.vertices)).query(np.asarray(whole.vertices))[1]
+        whole.vertex_colors = o3d.utility.Vector3dVector(np.asarray(surface.vertex_colors)[nearest])
     return whole

@@ -52,7 +52,7 @@ def spz(gaussians: Gaussians) -> FileContent:
 
 def _rotations(quaternions: Float32) -> np.ndarray:
     """[N] the three smaller components, of order x y z w, as sign and 9 bits each, and which was left out."""
-    largest, others = smallest_three(quaternions[:, [1, 2, 3, 0]] * np.float32([1, -1, -1, 1]))
+    largest, others = smallest_three(quaternions[:, [1, 2, 3, 0]] * np.array([1, -1, -1, 1], np.float32))
     packed = largest.astype(np.uint32)
     for component in others.T:
         size = np.floor(511 * np.abs(component) * 2**0.5 + 0.5).clip(0, 511).astype(np.uint32)
