@@ -1,13 +1,14 @@
 """How well an edit of a generated room agrees with the room generated anew with that change.
 
     ss-flow demo --out DEMO --masks truth [--objects 6 --views 12]
-    python tests/bench/bench_edit.py DEMO [--cache STORE] [--pictures DIR]
+    python tests/bench/bench_edit.py DEMO [--cache STORE] [--pictures DIR] [--only CHANGE]
 
-For every small thing: removed, removed and filled, moved by 30 cm in the air, given another colour. The changed region
-is where the true pictures before and after differ by more than 8 of 255 in any channel, widened by two pixels; it holds
-the shadows of what has left, which the edit cannot know. PSNR in it of the edited scene against the changed room
-(`edited`), and for comparison of the scene before against the room before (`before`). `elsewhere` is the PSNR of the
-rendering after against that before, outside of the region. The views are those of the capture and those kept back.
+For every small thing: removed, removed and filled, moved by 30 cm in the air, given another colour with its light and
+shade. The changed region is where the true pictures before and after differ by more than 8 of 255 in any channel,
+widened by two pixels; it holds the shadows of what has left, which the edit cannot know. PSNR in it of the edited
+scene against the changed room (`edited`), and for comparison of the scene before against the room before (`before`).
+`elsewhere` is the PSNR of the rendering after against that before, outside of the region. The views are those of the
+capture and those kept back.
 """
 
 from __future__ import annotations
@@ -81,6 +82,7 @@ def main() -> None:
     parser.add_argument("demo", type=Path)
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--only", help="one change, such as recoloured")
     options = parser.parse_args()
     params = RoomParams(**json.loads((options.demo / "scene" / RECIPE).read_text())["room"])
     things = list(furnish(params.objects, np.random.default_rng(params.seed)))
@@ -96,7 +98,8 @@ def main() -> None:
     for thing in [t for t in things if t.instance_id > 3 and t.instance_id in found]:
         own, row = found[thing.instance_id], things.index(thing)
         other = next(name for name in COLORS if name not in (thing.color, "black"))
-        shades = tuple(tuple(round(c * s) for c in COLORS[other]) for s in (1.0, 0.55))
+        luma = np.array(thing.material.shades) @ (0.2126, 0.7152, 0.0722)
+        shades = tuple(tuple(round(c * share) for c in COLORS[other]) for share in luma / luma.max())
         painted = replace(thing.material, shades=shades)
         recoloured = replace(thing, material=painted)
         gone = replace(thing, mesh=thing.mesh.moved(*UNDERGROUND))
@@ -108,6 +111,8 @@ def main() -> None:
             ("moved, filled", lifted, {"op": "transform", "instances": own, "move": list(AWAY), "fill": True}),
             ("recoloured", recoloured, {"op": "recolour", "instances": own}),
         ):
+            if options.only not in (None, change):
+                continue
             true_after = photos([*things[:row], anew, *things[row + 1 :]], params.seed, cameras)
             if change == "recoloured":
                 mask = np.concatenate([room.ids, room.held_out.ids]) == thing.instance_id
