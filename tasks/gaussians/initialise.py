@@ -86,7 +86,7 @@ def laid_flat(gaussians: Gaussians, thickness: float, neighbours: int = 12) -> G
     # The shortest turn from z to the normal.
     turn = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(len(points))], axis=1)
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-    flat = gaussians.log_scales + np.float32([0, 0, np.log(thickness)])
+    flat = gaussians.log_scales + np.array([0, 0, np.log(thickness)], np.float32)
     return replace(gaussians, quaternions=turn.astype(np.float32), log_scales=flat)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, InstanceMasks, Int32, UInt8
 from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE, SceneViews, sample_depth
@@ -114,7 +115,7 @@ def _border(mask: Bool) -> Bool:
     return np.asarray(cv2.dilate(image, disc) > cv2.erode(image, disc, borderValue=1))
 
 
-def _points(scene: SceneViews, view: int, row: Int32, column: Int32) -> Float32:
+def _points(scene: SceneViews, view: int, row: NDArray[np.intp], column: NDArray[np.intp]) -> Float32:
     """[N, 3] the surface points of pixels, world; NaN where no depth is known."""
     camera = scene.cameras[view]
     box = camera.cropped(int(column.min()), int(row.min()), int(column.max()) + 1, int(row.max()) + 1)
