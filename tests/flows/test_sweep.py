@@ -135,11 +135,11 @@ def test_a_bad_place_or_scene_is_refused_with_one_sentence(tiny, tmp_path):
 
 def test_with_a_text_the_search_is_a_step_and_its_threshold_can_be_swept(warm, tmp_path):
     options = ["--set", "query.tau_corr=0.01,0.2", "--metric", "query.matched", "query.best"]
-    found = sweep_tiny(warm, *options, "--query", "something white", out=tmp_path / "swept")
+    found = sweep_tiny(warm, *options, "--query", "a white thing", out=tmp_path / "swept")
     rows = found.document()
     assert [list(row["metrics"]) for row in rows] == [["query.matched", "query.best"]] * 2
     assert [row["misses"] for row in rows] == [2, 1]  # the similarities are computed once
-    answer = ss_flow("query", warm.out, "something white", "--json", "--cache", warm.store).document()["instances"]
+    answer = ss_flow("query", warm.out, "a white thing", "--json", "--cache", warm.store).document()["instances"]
     assert rows[0]["metrics"]["query.best"] == pytest.approx(answer[0]["score"], abs=1e-3)
     assert rows[0]["metrics"]["query.matched"] == sum(row["matched"] for row in answer if row["id"])
     assert "warning" not in found.err
