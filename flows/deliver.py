@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from ss_flow.closure import code_closure
 from ss_flow.engine import Report
 from ss_flow.flows import settings
 from ss_flow.flows.params import Params
+from ss_flow.flows.results import Results
 from ss_flow.flows.split import Networks
 from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.scene_files import SceneFiles
@@ -38,25 +38,6 @@ FALLBACKS = {
     "encoder": "colour words (no network)",
     "monodepth": None,
 }
-
-
-@dataclass(frozen=True)
-class Results:
-    """The results of a run by name, read from the store when they are asked for."""
-
-    store: Store
-    digests: dict[str, Any]
-
-    def one(self, name: str) -> Any:
-        return self.store.get(self.digests[name])
-
-    def all(self, name: str) -> list[Any]:
-        return [self.store.get(value) for value in self.digests[name]]
-
-    def missing(self) -> list[str]:
-        """Names of what the store no longer holds."""
-        listed = {name: [value] if isinstance(value, str) else value for name, value in self.digests.items()}
-        return [name for name, values in listed.items() if not all(value in self.store for value in values)]
 
 
 def run_document(store: Store, scene: SceneFiles, params: Params, networks: Networks, report: Report) -> dict[str, Any]:

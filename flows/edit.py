@@ -18,9 +18,10 @@ from ss_flow.events import Reporter
 from ss_flow.flows.deliver import failure_records, node_records
 from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check
-from ss_flow.graph import labelled, stored
+from ss_flow.flows.results import FinishedRun, finished_run, read_run
+from ss_flow.graph import labelled
 from ss_flow.resolution import Failure
-from ss_flow.tasks.artifacts import EditedScene, Gaussians
+from ss_flow.tasks.artifacts import EditedScene
 from ss_flow.tasks.deliver.output import RUN_FILE, check_place, replacing, write_scene
 from ss_flow.tasks.edit.fill import fill
 from ss_flow.tasks.edit.holes import Holes, Measured, holes
@@ -35,12 +36,8 @@ _CAPTURE = ("ingest", "cameras", "depth", "dense")
 class Edit:
     """A checked script, ready to run."""
 
-    source: Path
-    """The output folder of the run that is edited."""
-    run: Mapping[str, Any]
-    """Its run.json."""
-    instances: Mapping[str, Any]
-    """Its instances.json."""
+    source: FinishedRun
+    """The run that is edited."""
     script: Mapping[str, Any]
     steps: list[Step]
     objects: Objects
@@ -49,9 +46,9 @@ class Edit:
     def build(self) -> dict[str, Any]:
         """Add the script's nodes to a flow: "scene", and for each operation N after which something has left its place
         "holes_N", and "unfilled_N" where its holes are filled."""
-        results = self.run["results"]
-        measured = Measured(*(stored(name, results[name]) for name in _NEEDED[1:]))
-        scene = begin(stored("scene", results["scene"]))
+        results = self.source.results
+        measured = Measured(*(results.node(name) for name in _NEEDED[1:]))
+        scene = begin(results.node("scene"))
         outputs: dict[str, Any] = {}
         for step in self.steps:
             with labelled(str(step.number)):
@@ -72,19 +69,15 @@ def open_edit(source: Path, script: Mapping[str, Any], store: Store, folder: Pat
     paths in the script start from.
     Raises InputError when the run cannot be edited, and for the script's first fault.
     """
-    run, instances = _read(source / RUN_FILE), _read(source / "instances.json")
-    if "edit" in run:
+    document = read_run(source)
+    if "edit" in document:
         raise InputError(
             f"{source} is an edited run; add the operations to its script (edit.script in its {RUN_FILE}) and edit its "
-            f"source, {run['edit']['source']}."
+            f"source, {document['edit']['source']}."
         )
-    results = run.get("results", {})
-    needed = [results.get(name, "") for name in _NEEDED]
-    if not all(digest in store for value in needed for digest in ([value] if isinstance(value, str) else value)):
-        raise InputError(f"the store {store.location} no longer holds the scene of {source}; run it again.")
-    scene: Gaussians = store.get(results["scene"])
-    steps, objects = check(script, Objects.of(instances, scene), folder)
-    return Edit(source, run, instances, script, steps, objects)
+    run = finished_run(source, document, store, _NEEDED)
+    steps, objects = check(script, Objects.of(run.instances, run.results.one("scene")), folder)
+    return Edit(run, script, steps, objects)
 
 
 def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None = None, jobs: int = 0) -> dict[str, Any]:
@@ -93,7 +86,7 @@ def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None =
     Raises InputError when `out` cannot be written, and what a task raised when one failed.
     """
     check_place(out)
-    if out.resolve() == edit.source.resolve():
+    if out.resolve() == edit.source.folder.resolve():
         raise InputError(f"--out {out} is the run that is edited; name another folder.")
     documents: list[dict[str, Any]] = []
 
@@ -103,7 +96,9 @@ def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None =
             raise failed.error
         documents.append(_deliver(edit, store, out, report))
 
-    request = Request(edit.build, str(out.resolve()), {"edited": str(edit.source.resolve())}, None, reporter, done)
+    request = Request(
+        edit.build, str(out.resolve()), {"edited": str(edit.source.folder.resolve())}, None, reporter, done
+    )
     run_flows([request], store, jobs=jobs)
     return documents[-1]
 
@@ -112,23 +107,23 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
     from ss_flow.tasks.deliver.report import report_html
     from ss_flow.tasks.edit.pictures import before_and_after
 
-    results = edit.run["results"]
+    results = edit.source.results.digests
     scene: EditedScene = store.get(report.values["scene"])  # type: ignore[arg-type]
-    instances = edit.objects.document(edit.instances, scene)
+    instances = edit.objects.document(edit.source.instances, scene)
     found: dict[str, Holes] = {n: store.get(value) for n, value in report.values.items() if n != "scene"}  # type: ignore[arg-type]
     document = {
         "status": "ok",
         "warnings": [{"label": n["label"], "text": text} for n in report.nodes for text in n.get("warnings", ())],
-        "scene": edit.run["scene"],
-        "params": edit.run["params"],
-        "models": edit.run["models"],
+        "scene": edit.source.document["scene"],
+        "params": edit.source.document["params"],
+        "models": edit.source.document["models"],
         "metrics": {},
         "nodes": node_records(report),
         "failures": failure_records(report),
         "results": {name: results[name] for name in _CAPTURE} | report.values,
         "store": store.location,
         "edit": {
-            "source": str(edit.source.resolve()),
+            "source": str(edit.source.folder.resolve()),
             "script": edit.script,
             "holes": [_told(step, found) for step in edit.steps if step.leaving],
             "num_filled": int(scene.filled.sum()),
@@ -160,15 +155,3 @@ def _told(step: Step, found: Mapping[str, Holes]) -> dict[str, Any]:
     if step.fill:
         told["open_after_filling"] = int(found[f"unfilled_{step.number}"].unmeasured.sum())
     return told
-
-
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file.parent} is not the output folder of a run: it has no {file.name}.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} is damaged ({error}); run the scene again.") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{file} is damaged: it should hold a JSON object; run the scene again.")
-    return document

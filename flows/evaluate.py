@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.errors import InputError
-from ss_flow.graph import labelled, stored
+from ss_flow.flows.results import Results
+from ss_flow.graph import labelled
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.evaluate.points import TruePoints, evaluate_gaussians, evaluate_points, lifted
@@ -16,26 +17,23 @@ from ss_flow.tasks.evaluate.scannet import scannet_truth
 Reference = Callable[[Path], FileRef]
 
 
-def on_points(results: dict[str, Any], truth: TruePoints, *, radius: float, compat: bool) -> dict[str, Metrics]:
-    """Score what a run came to after Split and after Splat on annotated points.
-
-    results: digests by name, as run.json has them.
-    """
-    instances = stored("reproject", results["reproject"])
+def on_points(results: Results, truth: TruePoints, *, radius: float, compat: bool) -> dict[str, Metrics]:
+    """Score what a run came to after Split and after Splat on annotated points."""
+    instances = results.node("reproject")
     rules: dict[str, Any] = {"transfer_radius": radius, "compat_gap_bug": compat}
     with labelled("split"):
-        points, labels = stored("dense", results["dense"]), stored("cut", results["cut"])
+        points, labels = results.node("dense"), results.node("cut")
         after_split = evaluate_points(points, labels, instances, truth, **rules)
     with labelled("splat"):
-        after_splat = evaluate_gaussians(stored("scene", results["scene"]), instances, truth, **rules)
+        after_splat = evaluate_gaussians(results.node("scene"), instances, truth, **rules)
     return {"split": after_split, "splat": after_splat}
 
 
-def lifted_truth(results: dict[str, Any]) -> TruePoints:
+def lifted_truth(results: Results) -> TruePoints:
     """The capture's own annotated views, carried to the dense points. Raises InputError when it has none."""
-    if "truth" not in results:
+    if "truth" not in results.digests:
         raise InputError("the capture has no annotated views; name the ground truth of a scan with --truth.")
-    dense, seen, truth = (stored(name, results[name]) for name in ("dense", "visibility", "truth"))
+    dense, seen, truth = (results.node(name) for name in ("dense", "visibility", "truth"))
     return lifted(dense, seen, truth)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +17,7 @@ from ss_flow.cache.files import user_cache
 from ss_flow.cache.location import is_url, open_store
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
+from ss_flow.flows.results import FinishedRun, finished_run, read_run
 from ss_flow.tasks.models import catalogue
 
 # What may be left out: the help then shows what to give, not "{None}|PATH" and "(default: None)".
@@ -107,6 +109,17 @@ def choose_model(kind: str, name: str, digests: FileDigests, *, wanted: bool = T
         )
     digests.once(catalogue.verify, model, [file.ref.digest for file in model.files])
     return model
+
+
+def open_run(folder: Path, options: StoreOptions, needed: Sequence[str]) -> FinishedRun:
+    """A finished run by its output folder, with the store that it names, unless the options name one.
+
+    needed: the results that the store must still hold.
+    Raises InputError when the folder is not that of a run or is damaged, or a result is gone.
+    """
+    document = read_run(folder)
+    chosen = options if options.cache else StoreOptions(document["store"])
+    return finished_run(folder, document, chosen.existing_store(), needed)
 
 
 def console(*, json: bool) -> Console:

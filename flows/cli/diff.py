@@ -17,7 +17,7 @@ from rich.table import Table
 
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import console
-from ss_flow.flows.cli.query import read_run
+from ss_flow.flows.results import read_run
 from ss_flow.tasks.evaluate.comparison import Correspondence, correspondence
 
 _SHOWN = 10

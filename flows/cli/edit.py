@@ -12,9 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console
+from ss_flow.flows.cli.context import StoreOptions, console, open_run
 from ss_flow.flows.cli.prepare import display
-from ss_flow.flows.cli.query import read_run
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,7 @@ class EditRun:
 
         if self.jobs < 0:
             raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
-        own_store = self.store if self.store.cache else StoreOptions(read_run(self.result)["store"])
-        store = own_store.existing_store()
+        store = open_run(self.result, self.store, ()).store
         edit = open_edit(self.result, _read_script(self.script), store, self.script.parent)
         out = console(json=self.json)
         with display(out) as screen:

@@ -14,10 +14,9 @@ from rich.table import Table
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests
-from ss_flow.flows.cli.query import read_run
-from ss_flow.flows.deliver import Results
+from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run
 from ss_flow.flows.evaluate import lifted_truth, on_points, scan_truth
+from ss_flow.flows.results import read_run
 from ss_flow.resolution import Failure
 from ss_flow.task import FileRef
 
@@ -52,9 +51,8 @@ class Evaluate:
             raise InputError(f"--radius {self.radius} is out of range; it must be 0 or more.")
         if self.protocol == "views" and (self.truth or self.radius or self.compat):
             raise InputError("--truth, --radius and --compat are for --protocol points; add it.")
-        document = read_run(self.result)
         warnings: list[str] = []
-        metrics = _of_views(self.result, document) if self.protocol == "views" else self._of_points(document, warnings)
+        metrics = _of_views(self.result) if self.protocol == "views" else self._of_points(warnings)
         if self.json:
             told = {"protocol": self.protocol, "result": str(self.result), "metrics": metrics, "warnings": warnings}
             print(json.dumps(told, indent=1))
@@ -67,29 +65,23 @@ class Evaluate:
         console(json=False).print(table)
         return 0
 
-    def _of_points(self, document: dict[str, Any], warnings: list[str]) -> dict[str, dict[str, float]]:
-        own = self.store if self.store.cache else StoreOptions(document["store"])
-        store = own.existing_store()
-        results = Results(store, document["results"])
-        needed = _NEEDED if self.truth else (*_NEEDED, *(n for n in ("visibility", "truth") if n in results.digests))
-        if gone := [name for name in results.missing() if name in needed]:
-            raise InputError(
-                f"the store {store.location} no longer holds all of {self.result} ({', '.join(gone)}); run it again."
-            )
-        digests = file_digests(store)
+    def _of_points(self, warnings: list[str]) -> dict[str, dict[str, float]]:
+        annotated = () if self.truth or "truth" not in read_run(self.result)["results"] else ("visibility", "truth")
+        run = open_run(self.result, self.store, (*_NEEDED, *annotated))
+        results, digests = run.results, file_digests(run.store)
         found: list[Report] = []
 
         def build() -> dict[str, Any]:
             if self.truth is None:
-                truth = lifted_truth(results.digests)
+                truth = lifted_truth(results)
             else:
                 truth = scan_truth(self.truth, lambda p: FileRef(p.absolute(), digests(p)), compat=self.compat)
-            return dict(on_points(results.digests, truth, radius=self.radius, compat=self.compat))
+            return dict(on_points(results, truth, radius=self.radius, compat=self.compat))
 
-        run_flows([Request(build, document["scene"], done=found.append)], store, recorded=False)
+        run_flows([Request(build, run.document["scene"], done=found.append)], run.store, recorded=False)
         digests.save()
         warnings += dict.fromkeys(text for node in found[-1].nodes for text in node.get("warnings") or ())
-        return {stage: _values(store, value) for stage, value in found[-1].values.items()}
+        return {stage: _values(run.store, value) for stage, value in found[-1].values.items()}
 
 
 def _values(store: Store, value: Any) -> dict[str, float]:
@@ -98,8 +90,8 @@ def _values(store: Store, value: Any) -> dict[str, float]:
     return dict(store.get(value).values)
 
 
-def _of_views(folder: Path, document: dict[str, Any]) -> dict[str, dict[str, float]]:
-    metrics = {stage: values for stage, values in document["metrics"].items() if stage != "novel_view"}
+def _of_views(folder: Path) -> dict[str, dict[str, float]]:
+    metrics = {stage: values for stage, values in read_run(folder)["metrics"].items() if stage != "novel_view"}
     if not metrics:
         raise InputError(f"{folder} was run on a capture without annotated views; there is nothing to measure by.")
     return metrics

@@ -14,10 +14,10 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import export as formats
-from ss_flow.flows.cli.context import StoreOptions, console, file_digests
-from ss_flow.flows.cli.finished import FinishedRun, open_run
+from ss_flow.flows.cli.context import StoreOptions, console, file_digests, open_run
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.deliver import STATUS_EXIT
+from ss_flow.flows.results import FinishedRun
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.export.coco import coco
@@ -68,7 +68,7 @@ class Export:
         def build() -> dict[str, Any]:
             if self.format == "coco":
                 return {"file": coco(masks=pixels[0], photos=pixels[1], names=run.names, instances=ids or ())}
-            source = formats.Source(run.node("scene"), run.node("cameras"), run.names, ids)
+            source = formats.Source(run.results.node("scene"), run.results.node("cameras"), run.names, ids)
             if several:
                 return formats.a_file_each(source, self.format, self.holes)
             return {"file": formats.one_file(source, self.format, self.holes)}
@@ -97,7 +97,7 @@ class Export:
     def _write_workspace(self, out: Path, run: FinishedRun) -> int:
         """Write the photos and cameras that the run worked with."""
         frames = [run.store.get(value) for value in run.document["results"]["ingest"]]
-        cameras = run.load("cameras")
+        cameras = run.results.one("cameras")
         with replacing(out) as filling:
             if self.format == "colmap":
                 maps = [run.store.get(value) for value in run.document["results"]["masks"]]
@@ -157,7 +157,7 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
     Where the capture is gone or has no photos of its own (a video), photos are called as the frames are.
     """
     digests = file_digests(run.store)
-    names = run.load("cameras").names
+    names = run.results.one("cameras").names
     try:
         photos = {photo.stem: photo.name for photo in open_scene(Path(run.document["scene"])).photos}
     except InputError:

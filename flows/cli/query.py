@@ -21,11 +21,13 @@ from ss_flow.flows.cli.context import (
     choose_model,
     console,
     file_digests,
+    open_run,
 )
+from ss_flow.flows.results import read_run
 from ss_flow.graph import stored
 from ss_flow.keys import Value
 from ss_flow.resolution import Failure
-from ss_flow.tasks.deliver.output import RUN_FILE, check_place, replacing
+from ss_flow.tasks.deliver.output import check_place, replacing
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
 
 ANSWER_FILE = "answer.json"
@@ -60,14 +62,8 @@ class Query:
                 f"{self.result} is an edited run, whose objects no photo shows as they are; search its source, "
                 f"{document['edit']['source']}."
             )
-        instances = read_json(self.result / "instances.json")
-        own_store = self.store if self.store.cache else StoreOptions(document["store"])
-        store = own_store.existing_store()
-        descriptors = tuple(document["results"]["describe"])
-        if not all(value in store for value in descriptors):
-            raise InputError(
-                f"the store {store.location} no longer holds the descriptors of {self.result}; run it again."
-            )
+        run = open_run(self.result, self.store, ("describe",))
+        store, descriptors = run.store, tuple(document["results"]["describe"])
         own = {f.name: document["params"].get(f"semantics.query.{f.name}", f.default) for f in fields(QueryParams)}
         params = QueryParams(**own)
         if self.tau_corr is not None:
@@ -98,7 +94,7 @@ class Query:
             done=lambda report: answers.append(_answer(store, report.values["query"])),
         )
         run_flows([request], store, recorded=False)
-        answer = _document(answers[-1], instances)
+        answer = _document(answers[-1], run.instances)
         if self.out is not None:
             write_answer(self.out, self.result, answer)
         self._tell(answers[-1], answer)
@@ -171,22 +167,3 @@ def _encoder_name(store: Store, descriptors: tuple[str, ...]) -> str:
 
     name = store.get(descriptors[0]).encoder if descriptors else ColourWords.name
     return "none" if name == ColourWords.name else str(name)
-
-
-def read_run(folder: Path) -> dict[str, Any]:
-    """The document run.json of an output folder. Raises InputError when there is none, or it is damaged."""
-    file = folder / RUN_FILE
-    if not file.is_file():
-        raise InputError(f"{folder} is not the output folder of a run: it has no {RUN_FILE}.")
-    document = read_json(file)
-    if not {"store", "scene", "params", "results"} <= document.keys():
-        raise InputError(f"{file} is damaged: it lacks what a run writes; run the scene again.")
-    return document
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """A JSON document of an output folder. Raises InputError when it cannot be read."""
-    try:
-        return dict(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"{file} is damaged ({error}); run the scene again.") from None

@@ -14,10 +14,10 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console, file_digests
-from ss_flow.flows.cli.finished import FinishedRun, open_run
+from ss_flow.flows.cli.context import StoreOptions, console, file_digests, open_run
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.render import CameraPath, Shot, shoot
+from ss_flow.flows.results import FinishedRun
 from ss_flow.resolution import Failure
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
@@ -67,12 +67,12 @@ class Render:
         is_film = out.suffix.lower() == ".mp4"
         _check_place(out, is_film=is_film)
         ids = run.ids(self.instance) if self.instance else None
-        unit = float(run.load("dense").unit) / 1000
+        unit = float(run.results.one("dense").unit) / 1000
         shot = Shot(self._path(run.store), self.frames, self.elevation, self.what, self.width, unit, self.fps)
         written = 0
 
         def build() -> dict[str, Any]:
-            scene, cameras = run.node("scene"), run.node("cameras")
+            scene, cameras = run.results.node("scene"), run.results.node("cameras")
             return shoot(scene, cameras, ids, shot, whole=self.surroundings or ids is None, is_film=is_film)
 
         def done(report: Report) -> None:

@@ -9,10 +9,10 @@ from typing import Annotated
 import tyro
 from rich.markup import escape
 
-from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console
-from ss_flow.flows.cli.query import read_json, read_run
-from ss_flow.flows.deliver import Results, write_report
+from ss_flow.flows.cli.context import StoreOptions, console, open_run
+from ss_flow.flows.deliver import write_report
+
+_SHOWN = ("ingest", "cameras", "depth", "masks_split", "masks", "scene")
 
 
 @dataclass(frozen=True)
@@ -25,16 +25,8 @@ class WriteReport:
     """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
-        document = read_run(self.result)
-        instances = read_json(self.result / "instances.json")
-        own = self.store if self.store.cache else StoreOptions(document["store"])
-        results = Results(own.existing_store(), document["results"])
-        if missing := results.missing():
-            raise InputError(
-                f"the store {results.store.location} no longer holds all of {self.result} ({', '.join(missing)}); "
-                "run the scene again."
-            )
+        run = open_run(self.result, self.store, _SHOWN)
         file = self.result / "report.html"
-        write_report(file, results, document, instances)
+        write_report(file, run.results, run.document, run.instances)
         console(json=False).print(escape(str(file)))
         return 0

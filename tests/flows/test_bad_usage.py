@@ -249,7 +249,7 @@ def test_a_search_after_its_store_went_away_says_so_and_makes_no_new_one(warm):
     (warm.out / "run.json").write_text(json.dumps(document))
     descriptor = document["results"]["describe"][0]
     shutil.rmtree(warm.store / "objects" / descriptor[:2] / descriptor)
-    assert_refused(ss_flow("query", warm.out, "red"), "no longer holds the descriptors")
+    assert_refused(ss_flow("query", warm.out, "red"), "no longer holds describe")
     shutil.rmtree(warm.store)
     assert_refused(ss_flow("query", warm.out, "red"), "there is no store")
     assert not warm.store.exists()

@@ -126,7 +126,7 @@ def test_a_scene_that_the_store_no_longer_holds_is_refused(warm, tmp_path):
     script.write_text('{"operations": []}')
     (tmp_path / "other").mkdir()
     called = ss_flow("edit", warm.out, script, "--out", tmp_path / "out", "--cache", tmp_path / "other")
-    assert called.code == 2 and "no longer holds the scene" in called.err
+    assert called.code == 2 and "no longer holds scene" in called.err
 
 
 def test_the_page_s_lines_of_python_edit_a_run(warm, monkeypatch, capsys):

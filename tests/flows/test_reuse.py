@@ -16,7 +16,7 @@ import pytest
 from tiny_runs import SHORT, bytes_of, run_tiny, ss_flow, start_tiny, write_room
 
 from ss_flow import closure
-from ss_flow.flows.cli.query import read_run
+from ss_flow.flows.results import read_run
 
 BEFORE_PROPAGATE = {
     "capture.ingest",
