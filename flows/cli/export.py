@@ -14,7 +14,7 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import export as formats
-from ss_flow.flows.cli.context import StoreOptions, console, file_digests, open_run
+from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.results import FinishedRun
@@ -42,7 +42,7 @@ class Export:
     """A file for each instance, in a folder with export.json; mesh-ply and mesh-obj are written so at all times."""
     holes: Literal["open", "closed"] = "open"
     """For meshes: "closed" closes by a guess what no view shows."""
-    out: Path | None = None
+    out: OptionalPath = None
     """The file or folder to write; by default ss-flow-export/NAME of the result, with the format's suffix."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""

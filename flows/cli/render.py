@@ -14,7 +14,7 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console, file_digests, open_run
+from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.render import CameraPath, Shot, shoot
 from ss_flow.flows.results import FinishedRun
@@ -51,7 +51,7 @@ class Render:
     """How many degrees above an instance an orbit stands."""
     fps: int = 24
     """Frames a second of a film."""
-    out: Path | None = None
+    out: OptionalPath = None
     """A file that ends in .mp4, or a folder of PNG files and their cameras; by default ss-flow-render/NAME.mp4."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""

@@ -99,7 +99,9 @@ def test_the_search_threshold_changes_nothing_in_a_run_and_only_the_answer_of_a_
     actions = len(list((warm.store / "actions").rglob("*.json")))
     for _ in range(2):
         assert ss_flow("query", warm.out, "red", "--json").code == 0
-    assert len(list((warm.store / "actions").rglob("*.json"))) == actions + 1
+    assert len(list((warm.store / "actions").rglob("*.json"))) == actions + 2  # the similarities, and the answer
+    assert ss_flow("query", warm.out, "red", "--tau-corr", "0.7", "--json").code == 0
+    assert len(list((warm.store / "actions").rglob("*.json"))) == actions + 3
 
 
 def test_what_the_encoder_is_shown_changes_the_descriptors_and_nothing_before_them(warm):
