@@ -20,8 +20,8 @@ UNIT = 512.0
 class FeatureParams:
     """Which features are found."""
 
-    max_features: Count = 8192
-    """The most SIFT features a photo, the largest first."""
+    max_features: Count = 4096
+    """The most SIFT features a photo, the largest first; comparing two photos takes time as their square."""
     peak_threshold: Positive = 0.003
     """Contrast that a SIFT feature needs; COLMAP's own default, 0.0067, finds too few in dim or blurred rooms."""
     max_image_side: Count = 1600
