@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,16 @@ def floor_of(module: str) -> str | None:
         if module == package or module.startswith(package + "."):
             return folder
     return None
+
+
+def test_every_package_is_installed():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    found = [
+        ".".join((FLOORS[floor], *place.parent.relative_to(ROOT / floor).parts))
+        for floor in FLOORS
+        for place in (ROOT / floor).rglob("__init__.py")
+    ]
+    assert sorted(listed) == sorted(found)
 
 
 def imported(tree: ast.AST):
