@@ -198,6 +198,7 @@ def _trained(
     ]
     views = [view for view in views if view.inside.any()]
     if not views:
+        warn(f"No view shows instance {instance.instance_id} where it may be seen; it stays as its points.")
         return initial
     extent = max(box_diagonal(surface.points), surface.spacing)
     if params.extent == "cameras":

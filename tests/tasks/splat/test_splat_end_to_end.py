@@ -266,3 +266,12 @@ def test_each_instance_of_a_pair_moves_at_the_pace_of_its_own_size(built):
     assert np.unique(sizes).size == 2
     assert sizes[0] == pytest.approx(box_diagonal(built.box.means))
     assert sizes[-1] == pytest.approx(box_diagonal(built.ball.means))
+
+
+def test_an_instance_that_only_excluded_pixels_show_stays_as_its_points_and_is_told(built):
+    instance = built.scene.instance(1)
+    nothing = encode_png(np.zeros(built.scene.maps[0].ids.shape, np.uint8))
+    views = replace(built.views, frames=tuple(replace(frame, valid=nothing) for frame in built.scene.frames))
+    with pytest.warns(UserWarning, match="No view shows instance 1"):
+        kept = reconstruct(views, instance, params=replace(TRAIN, max_points=0))
+    np.testing.assert_array_equal(kept.means, instance.points)
