@@ -21,7 +21,7 @@ from ss_flow.flows.generated.layout import Thing, furnish
 from ss_flow.flows.generated.masks import DegradeParams, degrade
 from ss_flow.flows.generated.render import Renderer
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, UInt8
-from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of
+from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, looking
 from ss_flow.tasks.geometry.images import encode_png
 
 __all__ = ["DegradeParams", "Room", "RoomParams", "SceneObject", "Views", "degrade", "generate", "write_scene"]
@@ -203,13 +203,7 @@ def _pose(turn: float, phase: Float64, jitter: Float64, gaze: float) -> Float64:
 def _looking(eye: Float64, target: Float64) -> Float64:
     """World-to-camera of an upright camera at `eye` that looks at `target`."""
     forward = target - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
+    return looking(eye, forward / np.linalg.norm(forward), np.array([0.0, 0.0, 1.0]))
 
 
 def _photograph(renderer: Renderer, poses: Float64, params: RoomParams, rng: np.random.Generator) -> Views:

@@ -10,7 +10,7 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Cameras, Float64, Gaussians
 from ss_flow.tasks.capture.layout_nerfstudio import read_cameras
 from ss_flow.tasks.deliver.point_view import orbit_camera
-from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, looking, pixels_in_view
 
 _TOWARDS_SURFACE = 0.1
 """How much the places that the cameras look at count for the middle of an orbit, against the meeting of their axes."""
@@ -83,9 +83,7 @@ def round_scene(scene: Gaussians, cameras: Cameras, *, frames: int) -> tuple[Cam
     for angle in 2 * np.pi * np.arange(frames) / frames:
         center = target + height * up + radius * (np.cos(angle) * east + np.sin(angle) * north)
         forward = (target - center) / max(float(np.linalg.norm(target - center)), 1e-9)
-        right = np.cross(forward, up)
-        right /= max(float(np.linalg.norm(right)), 1e-9)
-        found.append(_posed(views[0], np.stack([right, np.cross(forward, right), forward]), center))
+        found.append(replace(views[0], world_to_camera=looking(center, forward, up)))
     return tuple(found)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, UInt8
-from ss_flow.tasks.geometry.cameras import Camera, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
 _SKY = (244, 245, 247)
@@ -37,14 +37,8 @@ def orbit_camera(
     outward = np.cos(elevation) * around + np.sin(elevation) * up
     half_fov = np.radians(22.0)
     eye = center + outward * radius / np.sin(half_fov) * 0.9
-    forward = -outward
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
     focal = height / 2 / np.tan(half_fov)
-    return Camera(width, height, focal, focal, width / 2, height / 2, pose)
+    return Camera(width, height, focal, focal, width / 2, height / 2, looking(eye, -outward, up))
 
 
 def _up(centred: Float64, cameras: Cameras | None) -> Float64:

@@ -14,7 +14,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.cameras import Camera, looking
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -122,14 +122,7 @@ def cameras_beside(
 def _looking(centre: Float64, offset: Float64, up: Float64, radius: float, focal: float) -> Camera:
     """The camera at centre + offset that shows a sphere around `centre` whole."""
     distance = float(np.linalg.norm(offset))
-    forward = -offset / distance
-    right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-6:  # straight from above or below
-        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ (centre + offset)
+    pose = looking(centre + offset, -offset / distance, up)
     half = int(np.ceil(focal * radius / np.sqrt(distance**2 - radius**2))) + 2
     return Camera(2 * half, 2 * half, focal, focal, half, half, pose)
 

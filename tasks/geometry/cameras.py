@@ -53,6 +53,22 @@ def cameras_by_view(cameras: Cameras) -> tuple[Camera, ...]:
     return tuple(camera_of(cameras, view) for view in range(len(cameras)))
 
 
+def looking(eye: Float64, forward: Float64, up: Float64) -> Float64:
+    """[4, 4] world-to-camera of an upright camera.
+
+    eye: [3] where it stands, world. forward: [3] where it looks, of length 1. up: [3] of any length; where it looks
+    straight up or down, any camera will do.
+    """
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
+
+
 def camera_extent(cameras: Sequence[Camera]) -> float:
     """What 3DGS measures a scene with: 1.1 times the largest distance of a camera from the mean of all, world units.
 
