@@ -36,6 +36,10 @@ class Results:
         """A node for a result, in a flow."""
         return stored(name, self.digests[name])
 
+    def nodes(self) -> dict[str, Any]:
+        """A node for every result, by name."""
+        return {name: self.node(name) for name in self.digests}
+
     def missing(self, names: Iterable[str]) -> list[str]:
         """Those of these results that the run did not have, or the store no longer holds."""
 

@@ -44,6 +44,7 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         "parts": found.parts,
         "reproject": found.instances,
         "masks_split": masks_split,
+        **({"hinted": found.hinted} if found.hinted is not None else {}),
     }
     void = params.evaluate.zero_is_void is not False
     if capture.truth is not None:
@@ -58,6 +59,9 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
                     results[masks], capture.truth, found.tree, zero_is_void=void
                 )
     if held_out is not None:
+        results |= {"ingest_held_out": held_out.frames, "cameras_held_out": held_out.cameras}
+        if held_out.truth is not None:
+            results["truth_held_out"] = held_out.truth
         results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])
     results["names"] = name(results["describe"], encoder=networks.encoder)
     if found.hinted is not None:

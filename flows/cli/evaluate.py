@@ -3,24 +3,45 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run
-from ss_flow.flows.evaluate import lifted_truth, on_points, scan_truth
-from ss_flow.flows.results import read_run
+from ss_flow.flows.cli.context import OptionalPath, StoreOptions, choose_model, console, file_digests, open_run
+from ss_flow.flows.cli.query import encoder_name, query_params
+from ss_flow.flows.evaluate import (
+    LERF,
+    LabelledScene,
+    Nodes,
+    labels_of,
+    lifted_truth,
+    on_objects,
+    on_points,
+    scan_truth,
+)
+from ss_flow.flows.results import FinishedRun, read_run
 from ss_flow.resolution import Failure
 from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Metrics
+from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.capture.scene_files import read_json
 
-_NEEDED = ("dense", "cut", "reproject", "scene")
+_LERF_NEEDED = {
+    "lerf-strict": ("ingest", "cameras", "scene", "describe"),
+    "lerf-oracle": ("ingest", "cameras", "masks_split", "masks", "describe"),
+    "lerf-2d": ("ingest", "cameras", "scene", "describe"),
+}
+
+_STAGES = {"split": "after Split", "refined": "refined masks", "splat": "after Splat"}
 
 
 @dataclass(frozen=True)
@@ -29,65 +50,152 @@ class Evaluate:
 
     result: Annotated[Path, tyro.conf.Positional]
     """The output folder of a run."""
-    protocol: Literal["views", "points"] = "views"
+    protocol: Literal["views", "points", "lerf-strict", "lerf-oracle", "lerf-2d", "objects"] = "views"
     """"views": masks on the pixels of all annotated views pooled, as `run` measures them; "points": instances on
-    annotated points, as ScanNet is evaluated."""
+    annotated points, as ScanNet is evaluated; "lerf-strict", "lerf-oracle", "lerf-2d": texts on labelled frames;
+    "objects": renderings near each object, at its border, and without it."""
     truth: OptionalPath = None
-    """For "points": the folder of a ScanNet scene with its mesh and annotation, in the frame of the poses; left out,
-    the capture's annotated views are carried to its dense points."""
+    """For "points": the folder of a ScanNet or Replica scene with its mesh and annotation, in the frame of the poses;
+    left out, the capture's annotated views are carried to its dense points. For "lerf-...": the folder of label files;
+    by default label/ of the scene."""
     radius: float = 0.0
     """For "points": annotated points farther than this from everything labelled count as unlabelled, in world units; 0
     = no limit, as in the protocol."""
     compat: bool = False
     """For "points": score as the published scripts do: by the annotation of the finer mesh, and with the ids 0 to the
     number of instances, also where they have gaps."""
+    texts: OptionalPath = None
+    """For "lerf-...": a file (.json) of what to ask for in the place of a category's own name: {category: text}."""
     json: bool = False
     """Print one JSON document."""
     store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
     """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
-        if self.radius < 0:
-            raise InputError(f"--radius {self.radius} is out of range; it must be 0 or more.")
-        if self.protocol == "views" and (self.truth or self.radius or self.compat):
-            raise InputError("--truth, --radius and --compat are for --protocol points; add it.")
+        self._check()
         warnings: list[str] = []
-        metrics = _of_views(self.result) if self.protocol == "views" else self._of_points(warnings)
+        tables = self._measured(warnings)
         if self.json:
-            told = {"protocol": self.protocol, "result": str(self.result), "metrics": metrics, "warnings": warnings}
-            print(json.dumps(told, indent=1))
+            told = {"protocol": self.protocol, "result": str(self.result), "metrics": tables.stages}
+            objects = {"objects": tables.objects} if tables.objects else {}
+            print(json.dumps({**told, **objects, "warnings": warnings}, indent=1))
             return 0
         for text in warnings:
             console(json=True).print(escape(f"warning: {text}"))
-        table = Table("metric", *(f"after {stage.capitalize()}" for stage in metrics), box=None)
-        for name in dict.fromkeys(name for values in metrics.values() for name in values):
-            table.add_row(name, *(f"{values[name]:.4f}" if name in values else "" for values in metrics.values()))
-        console(json=False).print(table)
+        _tell(tables, console(json=False))
         return 0
 
-    def _of_points(self, warnings: list[str]) -> dict[str, dict[str, float]]:
+    def _check(self) -> None:
+        if self.radius < 0:
+            raise InputError(f"--radius {self.radius} is out of range; it must be 0 or more.")
+        if self.protocol != "points" and (self.radius or self.compat):
+            raise InputError("--radius and --compat are for --protocol points; add it.")
+        if self.protocol in ("views", "objects") and self.truth:
+            raise InputError("--truth is for --protocol points and for those on labelled frames; add one.")
+        if self.protocol not in LERF and self.texts:
+            raise InputError(
+                "--texts is for the protocols on labelled frames, such as --protocol lerf-strict; add one."
+            )
+
+    def _measured(self, warnings: list[str]) -> _Tables:
+        if self.protocol == "views":
+            return _Tables(_of_views(self.result))
+        if self.protocol == "points":
+            return self._of_points(warnings)
+        if self.protocol == "objects":
+            return self._of_objects(warnings)
+        return self._of_labels(warnings)
+
+    def _of_points(self, warnings: list[str]) -> _Tables:
         annotated = () if self.truth or "truth" not in read_run(self.result)["results"] else ("visibility", "truth")
-        run = open_run(self.result, self.store, (*_NEEDED, *annotated))
-        results, digests = run.results, file_digests(run.store)
-        found: list[Report] = []
+        run = open_run(self.result, self.store, ("dense", "cut", "reproject", "scene", *annotated))
 
-        def build() -> dict[str, Any]:
-            if self.truth is None:
-                truth = lifted_truth(results)
-            else:
-                truth = scan_truth(self.truth, lambda p: FileRef(p.absolute(), digests(p)), compat=self.compat)
-            return dict(on_points(results, truth, radius=self.radius, compat=self.compat))
+        def build(nodes: Nodes, reference: Callable[[Path], FileRef]) -> dict[str, Any]:
+            folder = self.truth
+            truth = lifted_truth(nodes) if folder is None else scan_truth(folder, reference, compat=self.compat)
+            return dict(on_points(nodes, truth, radius=self.radius, compat=self.compat))
 
-        run_flows([Request(build, run.document["scene"], done=found.append)], run.store, recorded=False)
+        return _Tables(_metrics(_evaluated(run, build, warnings)))
+
+    def _of_objects(self, warnings: list[str]) -> _Tables:
+        kept_back = "truth_held_out" in read_run(self.result)["results"]
+        names = ("ingest", "cameras", "truth")
+        run = open_run(self.result, self.store, ("scene", "masks", *(f"{n}_held_out" for n in names if kept_back)))
+        found = _evaluated(run, lambda nodes, reference: dict(on_objects(nodes)), warnings)
+        views, taken = found["views"], found["removals"]
+        means = {
+            "psnr": views.whole_psnr,
+            "ssim": views.whole_ssim,
+            "object_psnr": float(np.mean(views.psnr)),
+            "object_ssim": float(np.mean(views.ssim)),
+            "band_psnr": views.band_psnr,
+        }
+        if len(taken.residual):
+            means |= {"residual": float(np.mean(taken.residual)), "worst_residual": float(np.max(taken.residual))}
+        objects = {
+            "true objects": _rows(instance=views.instance, views=views.views, psnr=views.psnr, ssim=views.ssim),
+            "instances taken out": _rows(instance=taken.instance, residual=taken.residual),
+        }
+        return _Tables({"held out views" if kept_back else "training views": means}, objects)
+
+    def _of_labels(self, warnings: list[str]) -> _Tables:
+        run = open_run(self.result, self.store, _LERF_NEEDED[self.protocol])
+        files = open_scene(Path(run.document["scene"]))
+        digests = file_digests(run.store)
+        name = encoder_name(run.store, run.results.digests["describe"])
+        labelled = LabelledScene.of(
+            self.truth or labels_of(files),
+            files,
+            lambda path: FileRef(path.absolute(), digests(path)),
+            encoder=choose_model("text-image", name, digests),
+            query=query_params(run.document),
+            texts=_texts(self.texts),
+        )
         digests.save()
-        warnings += dict.fromkeys(text for node in found[-1].nodes for text in node.get("warnings") or ())
-        return {stage: _values(run.store, value) for stage, value in found[-1].values.items()}
+        if labelled.unread:
+            said = ", ".join(labelled.unread)
+            warnings.append(f"{name_in_words(name)} cannot be asked for {said}; these categories score 0.")
+        build = LERF[self.protocol]
+        return _Tables(_metrics(_evaluated(run, lambda nodes, reference: dict(build(nodes, labelled)), warnings)))
 
 
-def _values(store: Store, value: Any) -> dict[str, float]:
-    if isinstance(value, Failure):
-        raise value.error
-    return dict(store.get(value).values)
+@dataclass(frozen=True)
+class _Tables:
+    """What a protocol came to."""
+
+    stages: Mapping[str, Mapping[str, float]]
+    """Figures by stage."""
+    objects: Mapping[str, list[dict[str, float]]] | None = None
+    """Rows of single objects, by what they are."""
+
+
+def name_in_words(encoder: str) -> str:
+    """What to call an encoder in messages."""
+    return "the encoder of colour words" if encoder == "none" else encoder
+
+
+def _evaluated(
+    run: FinishedRun, build: Callable[[Nodes, Callable[[Path], FileRef]], dict[str, Any]], warnings: list[str]
+) -> dict[str, Any]:
+    """The artifacts that `build` makes of a run's results. Raises what went wrong."""
+    digests = file_digests(run.store)
+    found: list[Report] = []
+    request = Request(
+        lambda: build(run.results.nodes(), lambda path: FileRef(path.absolute(), digests(path))),
+        run.document["scene"],
+        done=found.append,
+    )
+    run_flows([request], run.store, recorded=False)
+    digests.save()
+    warnings += dict.fromkeys(text for node in found[-1].nodes for text in node.get("warnings") or ())
+    for value in found[-1].values.values():
+        if isinstance(value, Failure):
+            raise value.error
+    return {name: run.store.get(str(value)) for name, value in found[-1].values.items()}
+
+
+def _metrics(found: Mapping[str, Metrics]) -> dict[str, dict[str, float]]:
+    return {stage: dict(metrics.values) for stage, metrics in found.items()}
 
 
 def _of_views(folder: Path) -> dict[str, dict[str, float]]:
@@ -95,3 +203,29 @@ def _of_views(folder: Path) -> dict[str, dict[str, float]]:
     if not metrics:
         raise InputError(f"{folder} was run on a capture without annotated views; there is nothing to measure by.")
     return metrics
+
+
+def _texts(file: Path | None) -> dict[str, str]:
+    document = {} if file is None else read_json(file)
+    if not isinstance(document, dict) or not all(isinstance(text, str) for text in document.values()):
+        raise InputError(f"{file} holds no texts; an object of the form {{category: text}} is expected.")
+    return document
+
+
+def _rows(**columns: np.ndarray) -> list[dict[str, float]]:
+    lists = {name: column.tolist() for name, column in columns.items()}
+    return [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
+
+
+def _tell(tables: _Tables, out: Console) -> None:
+    table = Table("metric", *(_STAGES.get(stage, stage) for stage in tables.stages), box=None)
+    stages = tables.stages.values()
+    for name in dict.fromkeys(name for values in stages for name in values):
+        table.add_row(name, *(f"{values[name]:.4f}" if name in values else "" for values in stages))
+    out.print(table)
+    for title, rows in (tables.objects or {}).items():
+        if rows:
+            table = Table(title, *list(rows[0])[1:], box=None)
+            for row in rows:
+                table.add_row(*(str(v) if isinstance(v, int) else f"{v:.4f}" for v in row.values()))
+            out.print(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -64,8 +65,7 @@ class Query:
             )
         run = open_run(self.result, self.store, ("describe",))
         store, descriptors = run.store, tuple(document["results"]["describe"])
-        own = {f.name: document["params"].get(f"semantics.query.{f.name}", f.default) for f in fields(QueryParams)}
-        params = QueryParams(**own)
+        params = query_params(document)
         if self.tau_corr is not None:
             params = replace(params, tau_corr=self.tau_corr)
         if not 0 < params.tau_corr <= 2:
@@ -77,7 +77,7 @@ class Query:
         if self.out is not None:
             check_place(self.out, ANSWER_FILE)
         digests = file_digests(store)
-        encoder = choose_model("text-image", _encoder_name(store, descriptors), digests)
+        encoder = choose_model("text-image", encoder_name(store, descriptors), digests)
         digests.save()
         answers: list[QueryResult] = []
         request = Request(
@@ -112,6 +112,12 @@ class Query:
             mark = "[green]match[/]" if row["matched"] else ""
             table.add_row(mark, str(row["id"]), row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}")
         out.print(table)
+
+
+def query_params(document: dict[str, Any]) -> QueryParams:
+    """How a run searches, from its run.json."""
+    own = {f.name: document["params"].get(f"semantics.query.{f.name}", f.default) for f in fields(QueryParams)}
+    return QueryParams(**own)
 
 
 def _document(found: QueryResult, instances: dict[str, Any]) -> dict[str, Any]:
@@ -161,8 +167,8 @@ def _answer(store: Store, value: Value | Failure) -> QueryResult:
     return found
 
 
-def _encoder_name(store: Store, descriptors: tuple[str, ...]) -> str:
-    """The text must be read by the network that described the instances."""
+def encoder_name(store: Store, descriptors: Sequence[str]) -> str:
+    """The network that described the instances, which must also read the text."""
     from ss_flow.tasks.models.colour_words import ColourWords
 
     name = store.get(descriptors[0]).encoder if descriptors else ColourWords.name

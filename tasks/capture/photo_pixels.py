@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Float32, Frame
 from ss_flow.tasks.capture.lens import Lens, distorted, undistorted
+
+T = TypeVar("T", bound=np.generic)
 
 _NODES = 400
 """So many places along the longer side are solved for; cubic interpolation between them is mostly exact enough."""
@@ -38,6 +42,20 @@ def photo_pixels(frame: Frame, lens: Lens) -> NDArray[np.int32]:
         column, row = np.where(shown[:, None], place, 0).astype(np.int32).T
         result[top : top + rows] = np.where(shown, row * frame.width + column, -1).reshape(-1, width)
     return result
+
+
+def on_photo(image: NDArray[T], frame: Frame, pixels: NDArray[np.int32] | None) -> NDArray[T]:
+    """What a frame's pixels hold, in the pixels of its input photo: [source height, source width], nearest neighbour.
+
+    image: [H, W]. pixels: what `photo_pixels` gives for the frame; None for a photo without distortion. Pixels of the
+    photo that the frame does not show are 0.
+    """
+    import cv2
+
+    if pixels is None:
+        size = (frame.source_width, frame.source_height)
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT), image.dtype)
+    return np.where(pixels >= 0, image.ravel()[pixels], 0).astype(image.dtype)
 
 
 def _moves(lens: Lens, width: int, height: int) -> Float32:

@@ -12,12 +12,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap
 from ss_flow.tasks.capture.lens import Lens
-from ss_flow.tasks.capture.photo_pixels import photo_pixels
+from ss_flow.tasks.capture.photo_pixels import on_photo, photo_pixels
 from ss_flow.tasks.deliver import ply
 from ss_flow.tasks.geometry.images import encode_png
 
@@ -95,8 +93,6 @@ def write_masks(
     stages: the maps of all frames by the folder to write. lenses: what `photo_lens` gives for each frame; where there
     is one, its distortion is put back, and pixels of the photo that the frame does not show are 0.
     """
-    import cv2
-
     alike: dict[tuple[Lens | None, int, int], list[int]] = {}
     for row, (frame, lens) in enumerate(zip(frames, lenses, strict=True)):
         alike.setdefault((lens, frame.width, frame.height), []).append(row)
@@ -109,9 +105,5 @@ def write_masks(
         for folder, maps in stages.items():
             for row in rows:
                 frame, ids = frames[row], maps[row].ids
-                if pixels is None:
-                    size = (frame.source_width, frame.source_height)
-                    full = cv2.resize(ids, size, interpolation=cv2.INTER_NEAREST_EXACT)
-                else:
-                    full = np.where(pixels >= 0, ids.ravel()[pixels], 0).astype(np.uint16)
+                full = on_photo(ids, frame, pixels)
                 (folder / f"{frame.name}.png").write_bytes(encode_png(full).tobytes())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Float64
+from ss_flow.tasks.artifacts import Bool, Float64
 
 Labels = NDArray[np.integer]
 Counts = NDArray[np.int64]
@@ -50,6 +50,16 @@ class Contingency:
             self.intersection[np.ix_(rows, columns)],
             self.truth_area[rows],
             self.predicted_area[columns],
+        )
+
+    def of_truth(self, kept: Bool) -> Contingency:
+        """The table of some true labels. kept: [G]. The elements of the others still count in the predicted areas."""
+        return Contingency(
+            self.truth_ids[kept],
+            self.predicted_ids,
+            self.intersection[kept],
+            self.truth_area[kept],
+            self.predicted_area,
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Bool, Float64, LabelMap
 from ss_flow.tasks.evaluate.contingency import Contingency, Labels, contingency
-from ss_flow.tasks.evaluate.instances import pooled
+from ss_flow.tasks.evaluate.instances import pooled, summary
 from ss_flow.tasks.masks.overlap import iou
 
 
@@ -73,14 +73,14 @@ def strict_ious(frame: LabelledFrame, predicted: Mapping[str, Bool]) -> dict[str
 
 
 def strict_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """A scene's miou and macc25 over all (frame, category) pairs, each pair counting once; IoU > 0.25 is a hit.
+    """A scene's miou, macc25 and macc50 over all (frame, category) pairs, each pair counting once; IoU > 0.25 is a hit.
 
     frames: the result of `strict_ious` for each frame. Raises InputError when no frame has a label.
     """
     ious = np.array([iou for frame in frames for iou in frame.values()])
     if not ious.size:
         raise InputError("The label files hold no polygon; at least one is needed to evaluate.")
-    return {"miou": float(ious.mean()), "macc25": float((ious > 0.25).mean())}
+    return summary(ious)
 
 
 def oracle_ious(frame: LabelledFrame, ids: Labels, candidates: Mapping[str, frozenset[int]]) -> list[float]:
@@ -101,7 +101,7 @@ def oracle_ious(frame: LabelledFrame, ids: Labels, candidates: Mapping[str, froz
 
 
 def oracle_scores(frames: Sequence[Sequence[float]]) -> dict[str, float]:
-    """A scene's miou and macc25 as the mean of the frames' means; IoU >= 0.25 is a hit (spec 2.2, oracle, step e).
+    """A scene's miou, macc25 and macc50 as the mean of the frames' means; IoU >= 0.25 is a hit (spec 2.2, oracle, e).
 
     frames: the result of `oracle_ious` for each frame. Raises InputError when no frame has a label.
     """
@@ -111,6 +111,7 @@ def oracle_scores(frames: Sequence[Sequence[float]]) -> dict[str, float]:
     return {
         "miou": float(np.mean([f.mean() for f in kept])),
         "macc25": float(np.mean([(f >= 0.25).mean() for f in kept])),
+        "macc50": float(np.mean([(f >= 0.50).mean() for f in kept])),
     }
 
 

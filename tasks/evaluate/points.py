@@ -8,14 +8,16 @@ IoU strictly above 0.25 or 0.50.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import (
     Float32,
+    Float64,
     Gaussians,
     InstanceMasks,
     Int32,
@@ -27,12 +29,14 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.evaluate.contingency import Contingency, Labels, contingency
 from ss_flow.tasks.evaluate.instances import segmentation_metrics, summary
-from ss_flow.tasks.evaluate.panoptic import average_precision
+from ss_flow.tasks.evaluate.panoptic import average_precision, panoptic_quality
 
 _LEAST_POINTS = 100
 """Instances and predictions with fewer points are left out of the average precision, as ScanNet's evaluation does."""
 _OVERLAPS = tuple(np.arange(50, 95, 5) / 100)
 """IoU thresholds whose mean is AP in ScanNet's evaluation: 0.50 to 0.90."""
+
+_NOTHING_ANNOTATED = "The ground truth holds no annotated point; at least one instance is needed to evaluate."
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,24 @@ class TruePoints:
     """[N, 3] world."""
     instance: Int32
     """[N] the instance of each, negative = not annotated."""
+    names: tuple[str, ...] = ()
+    """What the annotation calls instances 0, 1, ...; none where it does not say."""
+    stuff: Int32 = field(default_factory=lambda: np.zeros(0, np.int32))
+    """The instances that are walls, floors or the like."""
+
+
+@dataclass(frozen=True)
+class InstanceIoUs:
+    """How well each true instance is covered, by the protocol of ScanNet's instances (spec 2.1)."""
+
+    instance: Int32
+    """[G] the true instances that occur, ascending."""
+    best: Int32
+    """[G] the predicted label with the highest IoU; 0 = the unlabelled points are."""
+    iou: Float64
+    """[G] the IoU with that label."""
+    names: tuple[str, ...]
+    """[G] what the annotation calls them; "" where it does not say."""
 
 
 @task(name="evaluate.lifted")
@@ -60,11 +82,20 @@ def lifted(points: PointCloud, seen: Sequence[Visibility], truth: Sequence[Label
         if ids is not None:
             at = ids.ids.ravel()[seen[view].pixel]
             pairs.append(np.stack([seen[view].point_index, at], axis=1)[at > 0])
-    voted, votes = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
-    instance = np.full(len(points.points), -1, np.int32)
-    order = np.lexsort((-voted[:, 1], votes))  # the last one that is written stays
-    instance[voted[order, 0]] = voted[order, 1]
+    instance = most_frequent(np.concatenate(pairs), len(points.points))
     return TruePoints(points.points, instance)
+
+
+def most_frequent(votes: NDArray[np.int64], count: int) -> Int32:
+    """[count] the id that each point has the most votes for, the lowest of equals, -1 without any.
+
+    votes: [V, 2] the row of a point, and an id.
+    """
+    voted, times = np.unique(votes, axis=0, return_counts=True)
+    instance = np.full(count, -1, np.int32)
+    order = np.lexsort((-voted[:, 1], times))  # the last one that is written stays
+    instance[voted[order, 0]] = voted[order, 1]
+    return instance
 
 
 @task(name="evaluate.points")
@@ -82,7 +113,7 @@ def evaluate_points(
     transfer_radius: see `transfer_nearest`. Raises InputError when nothing is annotated, or there is no point.
     """
     predicted = transfer_nearest(points.points, labels.label, truth.points, radius=transfer_radius)
-    return Metrics(point_metrics(truth.instance, predicted, _scores(instances), compat_gap_bug=compat_gap_bug))
+    return Metrics(_all_metrics(truth, predicted, instances, compat_gap_bug=compat_gap_bug))
 
 
 @task(name="evaluate.gaussians")
@@ -96,7 +127,48 @@ def evaluate_gaussians(
 ) -> Metrics:
     """Score labelled Gaussians, by their centres, as `evaluate_points` does points; no opacity counts (spec 2.1)."""
     predicted = transfer_nearest(scene.means, scene.instance_id, truth.points, radius=transfer_radius)
-    return Metrics(point_metrics(truth.instance, predicted, _scores(instances), compat_gap_bug=compat_gap_bug))
+    return Metrics(_all_metrics(truth, predicted, instances, compat_gap_bug=compat_gap_bug))
+
+
+@task(name="evaluate.instance_ious")
+def instance_ious(scene: Gaussians, truth: TruePoints) -> InstanceIoUs:
+    """The best IoU of each true instance with the labelled Gaussians, whose mean is the miou of `ig_metrics`.
+
+    Raises InputError when nothing is annotated, or there is no Gaussian.
+    """
+    predicted = transfer_nearest(scene.means, scene.instance_id, truth.points)
+    annotated = truth.instance >= 0
+    table = contingency(truth.instance[annotated], predicted[annotated])
+    if not len(table.truth_ids):
+        raise InputError(_NOTHING_ANNOTATED)
+    names = tuple(truth.names[i] if i < len(truth.names) else "" for i in table.truth_ids.tolist())
+    best = table.predicted_ids[table.iou.argmax(axis=1)]
+    return InstanceIoUs(table.truth_ids.astype(np.int32), best.astype(np.int32), table.best_iou(), names)
+
+
+def _all_metrics(
+    truth: TruePoints, predicted: Int32, instances: Sequence[InstanceMasks], *, compat_gap_bug: bool
+) -> dict[str, float]:
+    found = point_metrics(truth.instance, predicted, _scores(instances), compat_gap_bug=compat_gap_bug)
+    return found | (quality_by_kind(truth.instance, predicted, truth.stuff) if len(truth.stuff) else {})
+
+
+def quality_by_kind(truth: Labels, predicted: Labels, stuff: Int32) -> dict[str, float]:
+    """The panoptic quality of things and of stuff apart, each class-agnostic.
+
+    truth: [N] instance of each point, negative = not annotated. predicted: [N], 0 = unlabelled. stuff: the true
+    instances that are stuff. A prediction of which more than half lies on the other kind is no false positive here, but
+    one there. Returns pq_things and pq_stuff, without the one that no instance is of.
+    """
+    annotated = truth >= 0
+    table = contingency(truth[annotated], predicted[annotated]).without(predicted=0)
+    is_stuff = np.isin(table.truth_ids, stuff)
+    found = {}
+    for name, own in (("pq_things", ~is_stuff), ("pq_stuff", is_stuff)):
+        if own.any():
+            of_other = 2 * table.intersection[~own].sum(axis=0) > table.predicted_area
+            found[name] = panoptic_quality(table.of_truth(own), of_other).pq
+    return found
 
 
 def _scores(instances: Sequence[InstanceMasks]) -> dict[int, float]:
@@ -143,7 +215,7 @@ def ig_metrics(truth: Labels, predicted: Labels, *, compat_gap_bug: bool = False
     """
     annotated = truth >= 0
     if not annotated.any():
-        raise InputError("The ground truth holds no annotated point; at least one instance is needed to evaluate.")
+        raise InputError(_NOTHING_ANNOTATED)
     table = contingency(truth[annotated], predicted[annotated])
     best = table.best_iou()
     if compat_gap_bug:

@@ -159,7 +159,7 @@ def similarity(
 
     fits = [cosines((term, *model.negatives(term), *(unwanted if wanted else ()))) for term in wanted or unwanted]
     scores = np.stack([found[:, 0] for found in fits], axis=1)
-    relevancies = np.stack([_relevancy(found[:, 0], found[:, 1:]) for found in fits], axis=1)
+    relevancies = np.stack([relevancy_of(found[:, 0], found[:, 1:]) for found in fits], axis=1)
     score, relevancy = (
         (scores.min(axis=1), relevancies.min(axis=1))
         if wanted
@@ -205,7 +205,7 @@ def chosen(found: Similarity, *, params: QueryParams = QueryParams()) -> QueryRe
     )
 
 
-def _relevancy(score: Float32, negatives: Float32) -> Float32:
+def relevancy_of(score: Float32, negatives: Float32) -> Float32:
     """[L] the smallest softmax share against one negative; 1 where there are none. negatives: [L, N] cosines."""
     shares = 1 / (1 + np.exp(_TEMPERATURE * (negatives - score[:, None])))
     return shares.min(axis=1, initial=1.0)

@@ -9,6 +9,7 @@ import pytest
 from tiny_runs import ROOM, run_tiny, ss_flow, write_room
 
 from ss_flow.flows.generated import generate
+from ss_flow.flows.generated.annotations import write_labels
 
 
 def test_the_views_are_measured_as_the_run_measured_them(tiny):
@@ -75,7 +76,73 @@ def test_a_run_without_ground_truth_says_so(tmp_path):
         assert answer.code == 2 and "annotated views" in answer.err and answer.err.count("\n") == 1
 
 
-@pytest.mark.parametrize("wrong", [("--radius", "1"), ("--compat",), ("--protocol", "points", "--radius", "-1")])
+@pytest.fixture(scope="module")
+def labels(tmp_path_factory):
+    """Labels of three views of the tiny room, in LERF-OVS's format; one category names no colour."""
+    folder = tmp_path_factory.mktemp("labels")
+    write_labels(generate(ROOM), folder, (0, 2, 4))
+    file = folder / "label" / "0002.json"
+    document = json.loads(file.read_text())
+    document["objects"].append({"category": "sheep", "segmentation": [[1, 1], [20, 1], [20, 20]]})
+    file.write_text(json.dumps(document))
+    return folder / "label"
+
+
+@pytest.mark.parametrize("protocol", ["lerf-strict", "lerf-oracle", "lerf-2d"])
+def test_texts_are_looked_for_on_labelled_frames(tiny, labels, protocol):
+    options = ("eval", tiny.out, "--protocol", protocol, "--truth", labels, "--json", "--cache", tiny.store)
+    answer = ss_flow(*options)
+    assert answer.code == 0, answer.err
+    document = answer.document()
+    assert set(document["metrics"]) == ({"split", "splat"} if protocol == "lerf-oracle" else {"splat"})
+    found = document["metrics"]["splat"]
+    assert found["num_frames"] == 3 and 0 < found["macc50"] <= found["macc25"] < 1, "nothing is found of the sheep"
+    assert len(document["warnings"]) == 1 and "sheep" in document["warnings"][0]
+
+
+def test_a_category_can_be_asked_for_in_other_words(tiny, labels, tmp_path):
+    texts = tmp_path / "texts.json"
+    texts.write_text('{"sheep": "the white sheep"}')
+    options = ("eval", tiny.out, "--protocol", "lerf-strict", "--truth", labels, "--json", "--cache", tiny.store)
+    assert ss_flow(*options, "--texts", texts).document()["warnings"] == []
+    texts.write_text('["sheep"]')
+    answer = ss_flow(*options, "--texts", texts)
+    assert answer.code == 2 and "holds no texts" in answer.err
+
+
+def test_labels_that_are_not_there_are_asked_for(tiny):
+    answer = ss_flow("eval", tiny.out, "--protocol", "lerf-strict", "--cache", tiny.store)
+    assert answer.code == 2 and "--truth" in answer.err and answer.err.count("\n") == 1
+
+
+def test_objects_are_compared_one_by_one(tiny):
+    document = ss_flow("eval", tiny.out, "--protocol", "objects", "--json", "--cache", tiny.store).document()
+    (views,) = document["metrics"]
+    assert views == "training views", "the tiny room keeps none back"
+    found = document["metrics"][views]
+    rows = document["objects"]["true objects"]
+    assert len(rows) == found_truth(tiny) and all(row["psnr"] > 5 and 0 < row["views"] <= 5 for row in rows)
+    assert found["object_psnr"] == pytest.approx(np.mean([row["psnr"] for row in rows]))
+    taken = document["objects"]["instances taken out"]
+    assert taken and all(0 <= row["residual"] < 0.2 for row in taken)
+    assert found["worst_residual"] == max(row["residual"] for row in taken)
+
+
+def found_truth(tiny) -> int:
+    return json.loads((tiny.out / "run.json").read_text())["metrics"]["split"]["num_truth"]
+
+
+WRONG = [
+    ("--radius", "1"),
+    ("--compat",),
+    ("--protocol", "points", "--radius", "-1"),
+    ("--protocol", "objects", "--truth", "."),
+    ("--protocol", "points", "--texts", "x.json"),
+    ("--protocol", "lerf-2d", "--compat"),
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG)
 def test_options_that_cannot_be_are_refused(tiny, wrong):
     answer = ss_flow("eval", tiny.out, *wrong)
     assert answer.code == 2 and answer.err.count("\n") == 1

@@ -90,7 +90,7 @@ def test_the_oracle_picks_by_ground_truth_and_uses_an_instance_once() -> None:
 
 def test_oracle_scores_are_means_of_frame_means() -> None:
     scores = oracle_scores([[1.0, 0.0], [0.25], []])
-    assert scores == {"miou": pytest.approx((0.5 + 0.25) / 2), "macc25": pytest.approx((0.5 + 1) / 2)}
+    assert scores == pytest.approx({"miou": (0.5 + 0.25) / 2, "macc25": (0.5 + 1) / 2, "macc50": (0.5 + 0) / 2})
 
 
 @pytest.mark.parametrize(

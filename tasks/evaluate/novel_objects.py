@@ -1,0 +1,130 @@
+"""Renderings of a scene object by object: near each object, at its border, and without it (spec 2.3)."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.running import progress
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Frame, Gaussians, Int32, LabelMap
+from ss_flow.tasks.evaluate.novel_view import psnr, ssim, to_8bit
+from ss_flow.tasks.evaluate.objects import change_elsewhere
+from ss_flow.tasks.gaussians.rasterize import backend_identity
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+
+_BAND = 5
+"""Pixels on either side of an instance's border."""
+_REMOVED_IN = 4
+"""Views in which an object is taken away: those that show most of it."""
+
+
+@dataclass(frozen=True)
+class ObjectViews:
+    """How the renderings of a scene compare with photos, as 8-bit images; means over the views."""
+
+    instance: Int32
+    """[G] the true instances."""
+    views: Int32
+    """[G] how many of the views show each."""
+    psnr: Float64
+    """[G] dB in the box around the instance's true mask."""
+    ssim: Float64
+    """[G] in the same box."""
+    whole_psnr: float
+    """dB over whole views."""
+    whole_ssim: float
+    band_psnr: float
+    """dB within 5 pixels of the borders of true instances."""
+
+
+@dataclass(frozen=True)
+class Removals:
+    """What taking instances out of a scene changes elsewhere."""
+
+    instance: Int32
+    """[L] those that have Gaussians and a mask."""
+    residual: Float64
+    """[L] mean absolute difference of colour, 0..1, outside the instance's mask; 0 for a clean object."""
+
+
+@task(name="evaluate.object_views", resources=Resources(cores=1), environment=backend_identity)
+def object_views(frames: Sequence[Frame], cameras: Cameras, scene: Gaussians, truth: Sequence[LabelMap]) -> ObjectViews:
+    """Render the annotated views and compare them with their photos, box by box.
+
+    frames, cameras: the views, those without ground truth among them. truth: true ids, 0 = none.
+    Pixels that a frame's `valid` mask excludes do not count. Raises InputError when no view shows an instance.
+    """
+    from ss_flow.tasks.gaussians.render import render
+
+    row_of = {name: row for row, name in enumerate(cameras.names)}
+    boxes: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    whole, bands = [], []
+    for done, ids in enumerate(truth):
+        frame = frames[row_of[ids.name]]
+        valid, photo = decode_valid(frame), decode_rgb(frame)
+        camera = camera_of(cameras, row_of[ids.name]).scaled(frame.width, frame.height)
+        image = to_8bit(render(scene, camera).rgb)
+        whole.append((psnr(image, photo, valid), ssim(image, photo, valid)))
+        band = border_band(ids.ids) & valid
+        if band.any():
+            bands.append(psnr(image, photo, band))
+        for instance in np.unique(ids.ids[valid & (ids.ids > 0)]).tolist():
+            inside = _box(ids.ids == instance) & valid
+            boxes[instance].append((psnr(image, photo, inside), ssim(image, photo, inside)))
+        progress(done + 1, len(truth), ids.name)
+    if not boxes:
+        raise InputError("The annotated views show no instance; at least one is needed to compare objects.")
+    means = np.array([np.mean(boxes[i], axis=0) for i in sorted(boxes)])
+    return ObjectViews(
+        np.array(sorted(boxes), np.int32),
+        np.array([len(boxes[i]) for i in sorted(boxes)], np.int32),
+        means[:, 0],
+        means[:, 1],
+        *(float(mean) for mean in np.mean(whole, axis=0)),
+        float(np.mean(bands)) if bands else float("nan"),
+    )
+
+
+@task(name="evaluate.removals", resources=Resources(cores=1), environment=backend_identity)
+def removals(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> Removals:
+    """Take each instance out and compare the renderings with and without it, outside its mask.
+
+    maps: the ids that the finished scene shows in each view. Of each instance those four views count that show most of
+    it.
+    """
+    area = np.array([np.bincount(one.ids.ravel(), minlength=1 << 16) for one in maps], np.int64)
+    ids = [i for i in np.unique(scene.instance_id).tolist() if i > 0 and area[:, i].any()]
+    residual = []
+    for done, instance in enumerate(ids):
+        most = np.argsort(-area[:, instance], kind="stable")[:_REMOVED_IN]
+        shown = [int(view) for view in most if area[view, instance]]
+        masks = [maps[view].ids == instance for view in shown]
+        changes = [
+            change_elsewhere(scene, instance, camera_of(cameras, view), mask)
+            for view, mask in zip(shown, masks, strict=True)
+        ]
+        residual.append(float(np.mean(changes)))
+        progress(done + 1, len(ids), f"instance {instance}")
+    return Removals(np.array(ids, np.int32), np.array(residual, np.float64))
+
+
+def border_band(ids: np.ndarray) -> Bool:
+    """[H, W] the pixels within 5 of a border between two ids, one of which may be 0."""
+    import cv2
+
+    window = np.ones((2 * _BAND + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(ids, window) != cv2.dilate(ids, window))
+
+
+def _box(mask: Bool) -> Bool:
+    """The smallest box that holds a mask, as a mask."""
+    inside = np.zeros_like(mask)
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    inside[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
+    return inside
