@@ -1,17 +1,41 @@
-"""Curves that Split&Splat (Monchieri et al.) prints, to lay beside our own sweeps: its figures, nothing added."""
+"""The tables of Split&Splat (Monchieri et al.), from paper.toml, to lay beside what we measure."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table as the paper prints it."""
+
+    source: str
+    title: str
+    data: str
+    """What it was measured on, and with what."""
+    columns: list[str]
+    """Names of the figures."""
+    rows: Mapping[str, list[float]]
+    """By row, a figure a column, in per cent."""
+    parameter: str = ""
+    """The parameter that the rows are values of, if they are."""
+    curves: Mapping[str, str] = field(default_factory=dict)
+    """Which column each figure of ours (flows/measures.py) may be laid beside in the picture of a sweep."""
+    notes: list[str] = field(default_factory=list)
+    """What is to be known of the printed figures."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A figure of the paper over one parameter."""
+    """A column of a table over its parameter."""
 
     parameter: str
     metric: str
-    """The figure of ours (flows/measures.py) that it is to be laid beside."""
+    """The figure of ours that it is to be laid beside."""
     source: str
     label: str
     """What the figures are of."""
@@ -23,23 +47,29 @@ class Curve:
         return [x for x, _ in self.percent], [y / 100 for _, y in self.percent]
 
 
-_TAU_DEPTH = ("split.visibility.tau_depth", "Table 4", "paper, ScanNet 0062_00")
-"""Of the labelled points, in metres; at 0.1 and 0.001 the paper prints a higher mAcc(50) than mAcc(25)."""
+@functools.cache
+def tables() -> dict[str, Table]:
+    """All tables by name."""
+    text = (resources.files("ss_flow.flows") / "paper.toml").read_text(encoding="utf-8")
+    return {name: Table(**table) for name, table in tomllib.loads(text).items()}
 
-CURVES = (
-    Curve(_TAU_DEPTH[0], "split.miou", *_TAU_DEPTH[1:], ((0.001, 51.98), (0.02, 63.98), (0.1, 62.33))),
-    Curve(_TAU_DEPTH[0], "split.macc25", *_TAU_DEPTH[1:], ((0.001, 54.17), (0.02, 100.00), (0.1, 66.67))),
-    Curve(_TAU_DEPTH[0], "split.macc50", *_TAU_DEPTH[1:], ((0.001, 70.83), (0.02, 70.83), (0.1, 95.83))),
-    Curve(  # "average percentage of instances with label l"
-        "semantics.query.tau_corr",
-        "query.matched_share",
-        "Table 6",
-        "paper, LERF",
-        ((0.01, 7.69), (0.02, 12.24), (0.025, 15.67), (0.05, 39.24), (0.075, 67.53), (0.1, 86.23), (0.2, 100.0)),
-    ),
-)
+
+@functools.cache
+def curves() -> tuple[Curve, ...]:
+    """What the paper prints over one parameter."""
+    return tuple(
+        Curve(
+            table.parameter,
+            metric,
+            table.source,
+            f"paper, {table.data.partition(';')[0]}",
+            tuple((float(value), row[table.columns.index(column)]) for value, row in table.rows.items()),
+        )
+        for table in tables().values()
+        for metric, column in table.curves.items()
+    )
 
 
 def curve(parameter: str, metric: str) -> Curve | None:
     """The paper's curve of a figure over a parameter, where it prints one."""
-    return next((c for c in CURVES if (c.parameter, c.metric) == (parameter, metric)), None)
+    return next((c for c in curves() if (c.parameter, c.metric) == (parameter, metric)), None)

@@ -36,6 +36,7 @@ from ss_flow.flows.cli.pins import CachePin, CacheUnpin  # noqa: E402
 from ss_flow.flows.cli.query import Query  # noqa: E402
 from ss_flow.flows.cli.render import Render  # noqa: E402
 from ss_flow.flows.cli.report import WriteReport  # noqa: E402
+from ss_flow.flows.cli.reproduce import Reproduce  # noqa: E402
 from ss_flow.flows.cli.run import Demo, Run  # noqa: E402
 from ss_flow.flows.cli.setup import Doctor, ModelsFetch, ModelsList, ModelsVerify  # noqa: E402
 from ss_flow.flows.cli.sweep import Sweep  # noqa: E402
@@ -89,6 +90,7 @@ Command = tyro.conf.OmitSubcommandPrefixes[
         | Annotated[Diff, _sub("diff")]
         | Annotated[WriteReport, _sub("report")]
         | Annotated[Evaluate, _sub("eval")]
+        | Annotated[Reproduce, _sub("reproduce")]
         | Annotated[Query, _sub("query")]
         | Annotated[Export, _sub("export")]
         | Annotated[Render, _sub("render")]

@@ -85,6 +85,8 @@ class MergeParams:
     """Views that the two are measured on; 0 = nothing is measured and no refinement undone, as in the paper."""
     crop: CropParams = CropParams()
     """The part of each view that is rendered."""
+    seed: Natural = 0
+    """Another one trains on the views in another order, and before other random backgrounds."""
 
     def iterations(self, num_views: int) -> int:
         """Training steps of a pair that so many views see (spec row 34)."""
@@ -159,7 +161,7 @@ def merge_pair(
         seen,
         params=settings,
         extent=_extent(colliding, seen, params),
-        seed=int(ids[0]),
+        seed=int(ids[0]) + (params.seed << 32),
         label_ids=ids.tolist(),
     ).gaussians
     refined = select(trained, ~reach | _shows(trained, seen, params))
@@ -249,7 +251,7 @@ def global_pass(
         seen,
         params=settings,
         extent=_extent(scene, seen, params),
-        seed=0,
+        seed=params.seed << 32,
         label_ids=ids.tolist(),
     ).gaussians
     return _guarded(scene, refined, seen, ids, params)

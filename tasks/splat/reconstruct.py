@@ -86,6 +86,8 @@ class ReconstructParams:
     """Pixels by which masks are dilated for the first training; 1 in the code of the paper's authors."""
     crop: CropParams = CropParams()
     """The part of each view that is rendered."""
+    seed: Natural = 0
+    """Another one trains on the views in another order, and before other random backgrounds."""
 
     def iterations(self, instance: InstanceMasks) -> int:
         """Training steps for an instance, by the number of its views (spec row 22)."""
@@ -208,7 +210,7 @@ def _trained(
         views,
         params=_settings(params, iterations, params.scale_of(instance)),
         extent=extent,
-        seed=instance.instance_id,
+        seed=instance.instance_id + (params.seed << 32),
     )
     if not len(result.gaussians):
         warn(f"Training left nothing of instance {instance.instance_id}; it stays as its points.")

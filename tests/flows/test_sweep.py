@@ -272,7 +272,7 @@ def test_the_papers_curves_are_of_parameters_and_figures_that_there_are():
     from ss_flow.flows import settings
     from ss_flow.flows.params import Params
 
-    for curve in paper.CURVES:
+    for curve in paper.curves():
         assert curve.parameter in settings.flat(Params())
         assert curve.metric in {name for names in NAMES.values() for name in names}
         x, y = curve.points()
