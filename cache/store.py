@@ -6,6 +6,7 @@
     claims/<key>            who is computing what, now
     roots/runs/, roots/pins/    what must be kept: a manifest and an event log for every run; what the user pinned
     checkpoints/            what long tasks keep of half-done work, by key
+    closures/               what the code of functions depends on, as it was worked out last
     tmp/                    what is being written
 
 Notes
@@ -111,6 +112,11 @@ class Store:
     def runs(self) -> Path:
         """The folder of the runs, one folder each."""
         return self.root / "roots" / "runs"
+
+    @property
+    def closures(self) -> Path:
+        """The folder for what the code of functions depends on."""
+        return self.root / "closures"
 
     @property
     def location(self) -> str:

@@ -10,12 +10,12 @@ from typing import Any
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
-from ss_flow.closure import code_closure
 from ss_flow.engine import Report
 from ss_flow.flows import settings
 from ss_flow.flows.params import Params
 from ss_flow.flows.results import Results
 from ss_flow.flows.split import Networks
+from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_masks, write_scene
@@ -110,7 +110,8 @@ def deliver(folder: Path, store: Store, document: dict[str, Any], scene: SceneFi
 
     undistorted: whether to write the frames too, as a capture of their own.
     """
-    asked = {"lenses": scene.lenses, "undistorted": undistorted, "code": code_closure(write_all)}
+    code = kept_closure(write_all, store.closures).definitions
+    asked = {"lenses": scene.lenses, "undistorted": undistorted, "code": code}
     document["content"] = digest(asked | {name: document[name] for name in ("results", "warnings")})
     if _content_of(folder) == document["content"]:
         write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))

@@ -11,7 +11,6 @@ from typing import Any
 
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.store import Store
-from ss_flow.closure import code_closure
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.events import Reporter
@@ -20,6 +19,7 @@ from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check
 from ss_flow.flows.results import FinishedRun, finished_run, read_run
 from ss_flow.graph import labelled
+from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
 from ss_flow.tasks.artifacts import EditedScene
 from ss_flow.tasks.deliver.output import RUN_FILE, check_place, replacing, write_scene
@@ -129,7 +129,8 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
             "num_filled": int(scene.filled.sum()),
         },
     }
-    document["content"] = digest({"results": report.values, "instances": instances, "code": code_closure(_deliver)})
+    code = kept_closure(_deliver, store.closures).definitions
+    document["content"] = digest({"results": report.values, "instances": instances, "code": code})
     pictures = before_and_after(store.get(results["scene"]), scene, store.get(results["cameras"]))
     with replacing(out) as filling:
         write_scene(filling, scene, instances)

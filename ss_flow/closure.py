@@ -34,6 +34,13 @@ Imports = dict[str, list[Origin]]
 """What each local name may be: more than one thing, where it is imported in one branch and in another."""
 
 
+@dataclass(frozen=True)
+class _Source:
+    path: Path
+    is_package: bool
+    text: str
+
+
 @dataclass
 class _Module:
     name: str
@@ -51,6 +58,21 @@ class Closure:
     """Digests by qualified name, "package.module.name", the function included; of a native source by its file name."""
     modules: frozenset[str]
     """Top-level names of the imported modules that are neither ours nor Python's own."""
+    sources: dict[str, str]
+    """Digests of all files that this was read from, by the names that `source_digest` takes; "" for a module that was
+    looked for in vain. While they are the same, so is the closure."""
+
+
+@dataclass(frozen=True)
+class _Needs:
+    """What one definition leads to."""
+
+    names: tuple[tuple[str, str], ...]
+    """Modules that are followed, and names in them."""
+    imported: frozenset[str]
+    """Top-level modules that it imports or names."""
+    looked_for: frozenset[str]
+    """Modules that may or may not exist: `b` of `from a import b`, where it says `b.c`."""
 
 
 def closure_of(function: Callable[..., Any]) -> Closure:
@@ -65,8 +87,23 @@ def code_closure(function: Callable[..., Any]) -> dict[str, str]:
 
 def forget() -> None:
     """Read the sources anew the next time; a process reads each of them once."""
-    for remembered in (_closure, _digests, _needed, _read, _module):
+    for remembered in (_closure, _digests, _needed, _read, _module, _source, source_digest):
         remembered.cache_clear()
+
+
+@functools.cache
+def source_digest(name: str) -> str:
+    """The digest of a module's source, or of the native source "module:file"; "" when there is none."""
+    module, _, native = name.partition(":")
+    source = _source(module)
+    if source is None:
+        return ""
+    if not native:
+        return blake3(source.text.encode()).hexdigest()
+    try:
+        return blake3((source.path.parent / native).read_bytes()).hexdigest()
+    except FileNotFoundError:
+        return ""
 
 
 @functools.cache
@@ -76,9 +113,11 @@ def _closure(module_name: str, function_name: str) -> Closure:
     known = sys.stdlib_module_names | {ENGINE, own}
     found: dict[str, str] = {}
     modules: set[str] = set()
+    sources: set[str] = set()
     pending = [(module_name, function_name.partition(".")[0])]
     while pending:
         module_name, name = pending.pop()
+        sources.add(module_name)
         module = _module(module_name)
         if module is None or f"{module_name}.{name}" in found:
             continue
@@ -89,10 +128,14 @@ def _closure(module_name: str, function_name: str) -> Closure:
                     pending.append((origin, attribute))
             continue
         found |= _digests(module_name, name)
-        needed, imported = _needed(module_name, name, followed)
-        pending.extend(needed)
-        modules |= imported
-    return Closure(dict(sorted(found.items())), frozenset(modules - known))
+        needs = _needed(module_name, name, followed)
+        pending.extend(needs.names)
+        modules |= needs.imported
+        sources |= needs.looked_for
+    sources |= {name for name in found if ":" in name}
+    return Closure(
+        dict(sorted(found.items())), frozenset(modules - known), {name: source_digest(name) for name in sorted(sources)}
+    )
 
 
 @functools.cache
@@ -100,18 +143,13 @@ def _digests(module_name: str, name: str) -> dict[str, str]:
     """The digest of one definition, and of the native sources of its module."""
     module = _module(module_name)
     assert module is not None
-    native = {
-        f"{module_name}:{source}": blake3((module.path.parent / source).read_bytes()).hexdigest()
-        for source in _native_sources(module)
-    }
+    native = {(file := f"{module_name}:{source}"): source_digest(file) for source in _native_sources(module)}
     return {f"{module_name}.{name}": blake3(_read(module_name, name)[0].encode()).hexdigest()} | native
 
 
 @functools.cache
-def _needed(
-    module_name: str, name: str, followed: tuple[str, ...]
-) -> tuple[tuple[tuple[str, str], ...], frozenset[str]]:
-    """What one definition names in the packages that are followed, and which top-level modules it imports or names."""
+def _needed(module_name: str, name: str, followed: tuple[str, ...]) -> _Needs:
+    """What one definition leads to in the packages that are followed."""
     module = _module(module_name)
     assert module is not None
     nodes = _read(module_name, name)[1]
@@ -119,8 +157,9 @@ def _needed(
     named = {node.id for node in nodes if isinstance(node, ast.Name)} & module.imports.keys()
     origins = [*own.values(), *(module.imports[name] for name in named)]
     imported = {origin.partition(".")[0] for several in origins for origin, _ in several}
-    needed = dict.fromkeys(_dependencies(module, nodes, module.imports | own, followed))
-    return tuple(needed), frozenset(imported.union(_loaded_by_name(nodes)))
+    looked_for: set[str] = set()
+    needed = dict.fromkeys(_dependencies(module, nodes, module.imports | own, followed, looked_for))
+    return _Needs(tuple(needed), frozenset(imported.union(_loaded_by_name(nodes))), frozenset(looked_for))
 
 
 @functools.cache
@@ -133,15 +172,19 @@ def _read(module_name: str, name: str) -> tuple[str, list[ast.AST]]:
 
 
 def _dependencies(
-    module: _Module, nodes: list[ast.AST], local: Imports, followed: tuple[str, ...]
+    module: _Module, nodes: list[ast.AST], local: Imports, followed: tuple[str, ...], looked_for: set[str]
 ) -> Iterator[tuple[str, str]]:
     for node in nodes:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             for origin, attribute in local.get(node.value.id, ()):
-                if attribute is not None and origin.startswith(followed) and _module(f"{origin}.{attribute}"):
-                    yield f"{origin}.{attribute}", node.attr
-                elif attribute is None and origin.startswith(followed):
+                if not origin.startswith(followed):
+                    continue
+                if attribute is None:
                     yield origin, node.attr
+                    continue
+                looked_for.add(f"{origin}.{attribute}")
+                if _source(f"{origin}.{attribute}"):
+                    yield f"{origin}.{attribute}", node.attr
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
             if node.id in module.definitions:
                 yield module.name, node.id
@@ -162,15 +205,28 @@ def _loaded_by_name(nodes: list[ast.AST]) -> Iterator[str]:
 
 
 @functools.cache
-def _module(name: str) -> _Module | None:
+def _source(name: str) -> _Source | None:
+    """A module as it is written; None when there is none, or none in Python."""
+    parent = _source(package) if (package := name.rpartition(".")[0]) else None
+    if parent is not None and not parent.is_package:
+        return None  # a name in a module; to look further would import that
     try:
         spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):
         return None
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         return None
-    module = _Module(name, Path(spec.origin), spec.submodule_search_locations is not None)
-    tree = ast.parse(module.path.read_text(encoding="utf-8"))
+    path = Path(spec.origin)
+    return _Source(path, spec.submodule_search_locations is not None, path.read_text(encoding="utf-8"))
+
+
+@functools.cache
+def _module(name: str) -> _Module | None:
+    source = _source(name)
+    if source is None:
+        return None
+    module = _Module(name, source.path, source.is_package)
+    tree = ast.parse(source.text)
     for statement in _top_level(tree.body):
         for bound in _bound_names(statement):
             module.definitions.setdefault(bound, []).append(statement)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ss_flow.cache.canonical import digest
-from ss_flow.closure import closure_of
+from ss_flow.closure import Closure, closure_of
 from ss_flow.distributions import version, versions_of
 from ss_flow.task import FileRef, Task
 
@@ -34,8 +34,9 @@ class Recipe:
     digest: str
 
     @classmethod
-    def of(cls, task: Task[..., Any]) -> Recipe:
-        closure = closure_of(task.function)
+    def of(cls, task: Task[..., Any], closure: Closure | None = None) -> Recipe:
+        """closure: of the task's function, where it is known already."""
+        closure = closure or closure_of(task.function)
         packages = {name: version(name) for name in task.uses}
         for module in sorted(closure.modules):
             packages |= versions_of(module)
@@ -49,9 +50,13 @@ class Recipe:
 
 
 class Keys:
-    """Makes the keys of one run. What calls share (a task's recipe, a set of parameters) is digested once."""
+    """Makes the keys of one run. What calls share (a task's recipe, a set of parameters) is digested once.
 
-    def __init__(self) -> None:
+    closure: says what the code of a function depends on.
+    """
+
+    def __init__(self, closure: Callable[[Callable[..., Any]], Closure] = closure_of) -> None:
+        self._closure = closure
         self._recipes: dict[int, tuple[object, Recipe]] = {}
         self._parameters: dict[int, tuple[object, str]] = {}
         self._lists: dict[tuple[str, ...], str] = {}
@@ -59,7 +64,7 @@ class Keys:
     def recipe(self, task: Task[..., Any]) -> Recipe:
         """What all calls of the task have in common."""
         if id(task) not in self._recipes:
-            self._recipes[id(task)] = (task, Recipe.of(task))
+            self._recipes[id(task)] = (task, Recipe.of(task, self._closure(task.function)))
         return self._recipes[id(task)][1]
 
     def key(self, task: Task[..., Any], inputs: Mapping[str, Value], parameters: Mapping[str, Any]) -> str:

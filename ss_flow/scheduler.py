@@ -18,14 +18,15 @@ from typing import Any
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.store import Action, Store
-from ss_flow.errors import InputError
+from ss_flow.errors import ExecutorLost, InputError
 from ss_flow.events import Reporter
 from ss_flow.execute import Invocation
-from ss_flow.executors import Executor, ExecutorLost
+from ss_flow.executors import Executor
 from ss_flow.executors.worker import WorkerDied
 from ss_flow.explain import changed_items, first_difference
 from ss_flow.graph import Call, Flow, Node
 from ss_flow.jobs import Job, Queue, Tokens
+from ss_flow.kept_closures import kept_closure
 from ss_flow.keys import Components, Keys, Value
 from ss_flow.resolution import Failure, NotRun, Resolution
 from ss_flow.task import Resources
@@ -70,7 +71,7 @@ class Scheduler:
         self._importance = {flow: position for position, flow in enumerate(flows)}
         self._memory_is_strict = memory_is_strict
         self._dry = dry
-        self._keys = Keys()
+        self._keys = Keys(functools.partial(kept_closure, folder=store.closures))
         self._tokens = Tokens(capacity)
         self._graph = Resolution(store.get, self._call, self._skip)
         self._jobs: dict[str, Job] = {}

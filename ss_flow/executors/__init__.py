@@ -18,10 +18,6 @@ OnProgress = Callable[[str, int, int, str], None]
 """Called from any thread with the key of a call, how much is done, of how much, and a note."""
 
 
-class ExecutorLost(RuntimeError):
-    """Whoever runs the calls is gone, or must not run them, and the run ends; says why, and what to do."""
-
-
 class Executor(Protocol):
     """Runs calls concurrently. Whoever submits holds back what there is no room for."""
 

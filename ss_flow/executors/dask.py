@@ -32,9 +32,9 @@ from typing import Any
 
 from ss_flow.cache.location import is_url
 from ss_flow.cache.store import Action
-from ss_flow.errors import InputError
+from ss_flow.errors import ExecutorLost, InputError
 from ss_flow.execute import Cancelled, Invocation
-from ss_flow.executors import ExecutorLost, OnProgress, dask_worker
+from ss_flow.executors import OnProgress, dask_worker
 from ss_flow.executors.worker import WorkerDied
 from ss_flow.task import Resources
 

@@ -13,8 +13,8 @@ from typing import Any
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.location import is_url
 from ss_flow.cache.store import Action
+from ss_flow.errors import ExecutorLost
 from ss_flow.execute import Cancelled, Invocation, execute_here, find_task
-from ss_flow.executors import ExecutorLost
 from ss_flow.executors.worker import Worker
 from ss_flow.explain import first_difference
 from ss_flow.keys import Components, Recipe

@@ -19,10 +19,10 @@ import ss_flow_toy as toy
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
-from ss_flow.errors import InputError
+from ss_flow.errors import ExecutorLost, InputError
 from ss_flow.events import Reporter
 from ss_flow.execute import Cancelled, Invocation
-from ss_flow.executors import ExecutorLost, open_executor
+from ss_flow.executors import open_executor
 from ss_flow.executors.worker import WorkerDied
 from ss_flow.graph import each
 from ss_flow.keys import Keys

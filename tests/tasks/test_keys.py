@@ -76,7 +76,7 @@ def test_the_key_of_a_task_knows_every_distribution_that_its_code_imports(name):
 
 def test_a_key_that_lacks_a_distribution_is_found_by_that_test(monkeypatch):
     task = TASKS["splat.plan"]
-    monkeypatch.setattr(keys, "closure_of", lambda function: Closure(code_closure(function), frozenset({"numpy"})))
+    monkeypatch.setattr(keys, "closure_of", lambda function: Closure(code_closure(function), frozenset({"numpy"}), {}))
     assert set(unknown(task)) == {"scipy"}
 
 

@@ -1,0 +1,64 @@
+"""Code closures kept in a folder, so that not every process walks through the same sources.
+
+A closure is worked out anew as soon as anything that it was read from has another content: a source of ours, a native
+one, a module that was looked for and is there now, the analysis itself, Python's version. All of these are read each
+time, which takes milliseconds; it is their syntax trees that take a second. No time of change is trusted.
+
+Notes
+-----
+*Concurrent writers.* Each writes whole files by rename, the same bytes from the same sources.
+
+*Damage* is noticed by the digest in the first line. *A full disk*: what cannot be kept is worked out again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from blake3 import blake3
+
+from ss_flow import closure
+from ss_flow.cache.files import write_atomically
+from ss_flow.closure import Closure, closure_of, source_digest
+
+_SIGNS = {"python": platform.python_version(), "analysis": blake3(Path(closure.__file__).read_bytes()).hexdigest()}
+"""What a closure depends on besides what it is read from."""
+
+
+def kept_closure(function: Callable[..., Any], folder: Path) -> Closure:
+    """What `closure_of` says, from the folder where it holds that; it is kept there otherwise."""
+    file = folder / f"{function.__module__}-{function.__qualname__}.txt"
+    if (known := _read(file)) is not None:
+        return known
+    found = closure_of(function)
+    content = {**_SIGNS, **vars(found), "modules": sorted(found.modules)}
+    text = json.dumps(content, separators=(",", ":"))
+    with contextlib.suppress(OSError):
+        write_atomically(file, f"{_digest(text)}\n{text}")
+    return found
+
+
+def _read(file: Path) -> Closure | None:
+    """The closure in a file, if it still holds."""
+    try:
+        stated, _, text = file.read_text(encoding="utf-8").partition("\n")
+    except (OSError, ValueError):
+        return None
+    if stated != _digest(text):
+        return None
+    content = json.loads(text)
+    if any(content[name] != value for name, value in _SIGNS.items()):
+        return None
+    sources = content["sources"]
+    if any(source_digest(name) != known for name, known in sources.items()):
+        return None
+    return Closure(content["definitions"], frozenset(content["modules"]), sources)
+
+
+def _digest(text: str) -> str:
+    return blake3(text.encode()).hexdigest()
