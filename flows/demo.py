@@ -1,77 +1,126 @@
-"""Generated rooms on disk: the scene of `ss-flow demo`, and those that tables are measured on."""
+"""Generated rooms on disk: the scene of `ss-flow demo`, and those that tables are measured on.
+
+A room is photographed by a task, so its files come from the store whatever the folder that they are written to.
+"""
 
 from __future__ import annotations
 
-import functools
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
-from pathlib import Path
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
-from ss_flow.cache.canonical import digest
-from ss_flow.closure import code_closure
+import numpy as np
+
+from ss_flow.cache.store import Store
+from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
+from ss_flow.events import Reporter
 from ss_flow.flows.generated import RoomParams, generate, write_scene
-from ss_flow.flows.generated.annotations import write_clicks, write_labels, write_scan
-from ss_flow.flows.reproduce import CLICKS
+from ss_flow.resolution import Failure
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import UInt8
 from ss_flow.tasks.deliver.output import replacing
 
 RECIPE = "recipe.json"
 
+Masks = Literal["auto", "truth", "degraded"]
 
-def demo_scene(out: Path, masks: Literal["auto", "truth", "degraded"], objects: int, views: int, seed: int) -> Path:
-    """Build the room's capture in `out`/scene, unless the same one lies there. Returns its folder.
 
-    Raises InputError when `out` holds something else.
+@dataclass(frozen=True)
+class CaptureFile:
+    """One file of a capture."""
+
+    name: str
+    """Its place in the capture's folder, with "/"."""
+    content: UInt8
+    """[bytes]."""
+
+
+@task(name="demo.photographs")
+def photographs(*, room: RoomParams, masks: Masks, annotated: str) -> tuple[CaptureFile, ...]:
+    """Build a room and take its photos: the files of its capture, by name.
+
+    masks: ready-made ones that lie beside the photos; "auto" is none. annotated: the name of the scan under which the
+    capture also has all that tables are measured by, see `generated_scenes`; "" leaves that out.
     """
-    folder = out / "scene"
-    params = RoomParams(objects=objects, views=views, seed=seed)
-    recipe = {
-        "room": asdict(params),
-        "masks": masks,
-        "code": digest(code_closure(generate) | code_closure(write_scene)),
-    }
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        built = generate(room)
+        write_scene(built, folder, masks=None if masks == "auto" else masks)
+        if annotated:
+            from ss_flow.flows.generated.annotations import write_clicks, write_labels, write_scan
+            from ss_flow.flows.reproduce import CLICKS
 
-    def fill(filling: Path) -> None:
-        write_scene(generate(params), filling, masks=None if masks == "auto" else masks)
+            write_scan(built, folder, annotated)
+            write_labels(built, folder, [i * len(built) // 3 for i in range(3)])
+            write_clicks(built, folder / CLICKS)
+        return tuple(
+            CaptureFile(file.relative_to(folder).as_posix(), np.fromfile(file, np.uint8))
+            for file in sorted(folder.rglob("*"))
+            if file.is_file()
+        )
 
-    return _built(folder, recipe, fill)
+
+def demo_scene(out: Path, room: RoomParams, masks: Masks, store: Store, reporter: Reporter) -> Path:
+    """Have a room's capture in `out`/scene; where the same one lies there already, no file is touched.
+
+    reporter: hears of the photographing. Returns the folder. Raises InputError when `out` holds something else.
+    """
+    return _placed(out / "scene", room, masks, "", store, reporter)
 
 
-def generated_scenes(out: Path, rooms: Sequence[RoomParams], masks: Literal["auto", "truth", "degraded"]) -> None:
-    """Build rooms that have all that tables are measured by, in `out`/room-SEED, unless the same ones lie there.
+def generated_scenes(out: Path, rooms: Sequence[RoomParams], masks: Masks, store: Store, reporter: Reporter) -> None:
+    """Have rooms with all that tables are measured by in `out`/room-SEED.
 
     Beside the capture itself: the annotated scan in ScanNet's files, the labels of three views in LERF-OVS's, and
     clicks on every object in the views that show most of it. Raises InputError when `out` holds something else.
     """
-    for params in rooms:
-        folder = out / f"room-{params.seed}"
-        code = digest(code_closure(_annotated))
-        recipe = {"room": asdict(params), "masks": masks, "code": code}
-        _built(folder, recipe, functools.partial(_annotated, params, masks, folder.name))
+    for room in rooms:
+        folder = out / f"room-{room.seed}"
+        _placed(folder, room, masks, folder.name, store, reporter)
 
 
-def _annotated(params: RoomParams, masks: Literal["auto", "truth", "degraded"], name: str, filling: Path) -> None:
-    room = generate(params)
-    write_scene(room, filling, masks=None if masks == "auto" else masks)
-    write_scan(room, filling, name)
-    write_labels(room, filling, [i * len(room) // 3 for i in range(3)])
-    write_clicks(room, filling / CLICKS)
+def _placed(folder: Path, room: RoomParams, masks: Masks, annotated: str, store: Store, reporter: Reporter) -> Path:
+    known = _recipe(folder) if folder.exists() else None
 
-
-def _built(folder: Path, recipe: dict[str, Any], fill: Callable[[Path], None]) -> Path:
-    """A folder that `fill` writes, unless it is already there by the same recipe."""
-    if folder.exists():
-        try:
-            known = json.loads((folder / RECIPE).read_text())
-        except (OSError, ValueError):
-            raise InputError(
-                f"{folder} holds something else than a generated scene; name another folder with --out."
-            ) from None
+    def done(report: Report) -> None:
+        digests = report.values["files"]
+        if isinstance(digests, Failure):
+            raise digests.error
+        recipe = {"room": asdict(room), "files": list(digests)}
         if known == recipe:
-            return folder
-    with replacing(folder) as filling:
-        fill(filling)
-        (filling / RECIPE).write_text(json.dumps(recipe, indent=1), encoding="utf-8")
+            return
+        with replacing(folder) as filling:
+            for digest in digests:
+                _write(store.get(digest), filling)
+            (filling / RECIPE).write_text(json.dumps(recipe, indent=1), encoding="utf-8")
+
+    def build() -> dict[str, Any]:
+        return {"files": photographs(room=room, masks=masks, annotated=annotated)}
+
+    request = Request(build, str(folder.resolve()), reporter=reporter, done=done)
+    run_flows([request], store, recorded=False)
     return folder
+
+
+def _recipe(folder: Path) -> Any:
+    """What was written to a folder. Raises InputError when that was not a generated scene."""
+    try:
+        return json.loads((folder / RECIPE).read_text())
+    except (OSError, ValueError):
+        raise InputError(
+            f"{folder} holds something else than a generated scene; name another folder with --out."
+        ) from None
+
+
+def _write(file: CaptureFile, folder: Path) -> None:
+    """Raises InputError for a name that leads out of the folder: the store may be someone else's."""
+    name = PurePosixPath(file.name)
+    if name.is_absolute() or ".." in name.parts:
+        raise InputError(f"the store holds a capture with a file {file.name!r} outside of it; use another store.")
+    place = folder / name
+    place.parent.mkdir(parents=True, exist_ok=True)
+    file.content.tofile(place)

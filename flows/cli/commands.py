@@ -36,7 +36,9 @@ class Group:
 
 
 COMMANDS: Mapping[str, Entry | Group] = {
-    "demo": Entry("run:Demo", "Build a small room, run everything on it, and measure the result against its ground truth."),
+    "demo": Entry(
+        "run:Demo", "Build a small room, run everything on it, and measure the result against its ground truth."
+    ),
     "run": Entry("run:Run", "Turn a capture into instance-labelled Gaussians."),
     "sweep": Entry(
         "sweep:Sweep",
@@ -54,9 +56,7 @@ lo:hi:nlog the same evenly in the logarithm. What variants share is computed onc
         "inspect:Why",
         "Tell why a step ran in the latest run: the first part of its key that had changed, back to the first cause.",
     ),
-    "graph": Entry(
-        "inspect:Graph", "Draw what feeds what in the latest run, a box a step, in Mermaid's notation."
-    ),
+    "graph": Entry("inspect:Graph", "Draw what feeds what in the latest run, a box a step, in Mermaid's notation."),
     "diff": Entry(
         "diff:Diff",
         """Tell what two results differ in: parameters, networks, metrics, steps, and which objects are which.
@@ -94,7 +94,8 @@ A cell that was not measured stays empty.""",
             "unpin": Entry("pins:CacheUnpin", "Let go what was pinned; `cache gc` may then delete it."),
             "gc": Entry(
                 "care:CacheCollect",
-                "Delete results that neither a pin nor a run needs; with limits, also those that were not used for long.",
+                "Delete results that neither a pin nor a run needs; with limits, also those that were not used for "
+                "long.",
             ),
             "verify": Entry(
                 "care:CacheVerify",
@@ -137,7 +138,7 @@ def _union(commands: Mapping[str, Entry | Group], named: list[str] | None) -> An
         else:
             kind = _made(name, entry.summary, {})
         kinds.append(Annotated[kind, tyro.conf.subcommand(name)])
-    return Union[tuple(kinds)]
+    return Union[tuple(kinds)]  # noqa: UP007 - as many as there are commands
 
 
 def _made(name: str, summary: str, fields: Mapping[str, Any]) -> Any:

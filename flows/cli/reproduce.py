@@ -95,10 +95,10 @@ class Reproduce:
         if options.dry_run or options.until:
             raise InputError("a table is always measured whole; leave out --dry-run and --until.")
         options.engine()  # refuses what is out of range before anything is written
-        scenes = self._scenes(plan)
         store = options.store.open_store()
         digests = file_digests(store, verify=options.verify)
         tell = console(json=options.json)
+        scenes = self._scenes(plan, store, tell)
         runs = [
             Run(section, variant, scene, seed)
             for section in plan.sections
@@ -127,12 +127,14 @@ class Reproduce:
             _tell(document, tell)
         return 0
 
-    def _scenes(self, plan: Plan) -> list[Path]:
+    def _scenes(self, plan: Plan, store: Store, tell: Console) -> list[Path]:
         data = Path(self.data)
         if self.data == GENERATED:
             room = RoomParams(views=self.views, width=self.width, height=self.width * 3 // 4, held_out=0)
             data = self.out
-            generated_scenes(data, [replace(room, seed=seed) for seed in range(self.rooms)], self.masks)
+            rooms = [replace(room, seed=seed) for seed in range(self.rooms)]
+            with display(tell) as screen:
+                generated_scenes(data, rooms, self.masks, store, screen)
         return scenes_of(data, plan.data, one=self.table in _OF_ONE_SCENE)
 
     def _params(self, plan: Plan, variant: Variant, seed: int) -> Params:

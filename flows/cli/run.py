@@ -77,9 +77,12 @@ class Demo:
 
     def run(self) -> int:
         from ss_flow.flows.demo import demo_scene
+        from ss_flow.flows.generated import RoomParams
 
         check_place(self.out / "result")
-        scene = demo_scene(self.out, self.masks, self.objects, self.views, self.seed)
+        room = RoomParams(objects=self.objects, views=self.views, seed=self.seed)
+        with display(console(json=self.execution.json)) as screen:
+            scene = demo_scene(self.out, room, self.masks, self.execution.store.open_store(), screen)
         params = settings.preset(Params(), self.execution.preset)
         return run_scene(open_scene(scene), self.out / "result", params, self.execution)
 

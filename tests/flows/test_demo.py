@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 
-from tiny_runs import ss_flow
+import numpy as np
+import pytest
+from tiny_runs import bytes_of, ss_flow
+
+from ss_flow.errors import InputError
+from ss_flow.flows.demo import CaptureFile, _write
 
 
 def test_the_demo_builds_a_room_and_measures_the_result(tmp_path):
@@ -18,6 +24,36 @@ def test_the_demo_builds_a_room_and_measures_the_result(tmp_path):
     assert (tmp_path / "demo/scene/recipe.json").stat().st_mtime_ns == stamp
     other = ss_flow("demo", "--out", tmp_path / "demo", "--cache", tmp_path / "store", "--seed", "1", *arguments)
     assert other.code == 0 and other.computed()["capture.ingest"] == 1
+
+
+def test_a_room_is_photographed_once_whatever_the_folder(tmp_path, monkeypatch):
+    room = ["--objects", "1", "--views", "3", "--masks", "truth", "--until", "cameras", "--cache", tmp_path / "store"]
+    assert ss_flow("demo", "--out", tmp_path / "a", *room).code == 0
+    monkeypatch.setattr("ss_flow.flows.demo.generate", lambda params: pytest.fail("photographed again"))
+    assert ss_flow("demo", "--out", tmp_path / "b", *room).code == 0
+    files = bytes_of(tmp_path / "a/scene")
+    assert files == bytes_of(tmp_path / "b/scene") and len(files) > 20
+    shutil.rmtree(tmp_path / "a/scene")
+    assert ss_flow("demo", "--out", tmp_path / "a", *room).code == 0
+    assert bytes_of(tmp_path / "a/scene") == files
+
+
+def test_a_damaged_photo_in_the_store_is_taken_anew(tmp_path):
+    room = ["--objects", "1", "--views", "3", "--until", "cameras", "--cache", tmp_path / "store"]
+    assert ss_flow("demo", "--out", tmp_path / "a", *room).code == 0
+    digest = json.loads((tmp_path / "a/scene/recipe.json").read_text())["files"][0]
+    for file in (tmp_path / "store/objects" / digest[:2] / digest).rglob("*"):
+        if file.is_file():
+            file.write_bytes(b"damaged")
+    assert ss_flow("demo", "--out", tmp_path / "b", *room).code == 0
+    assert bytes_of(tmp_path / "a/scene") == bytes_of(tmp_path / "b/scene")
+
+
+@pytest.mark.parametrize("name", ["../outside.txt", "/etc/outside.txt", "color/../../outside.txt"])
+def test_a_photo_of_a_foreign_store_stays_in_the_folder(tmp_path, name):
+    with pytest.raises(InputError, match="outside of it"):
+        _write(CaptureFile(name, np.zeros(3, np.uint8)), tmp_path / "scene")
+    assert not list(tmp_path.rglob("*.txt"))
 
 
 def test_demo_run_sweep_and_batch_measure_one_scene_alike(tmp_path):
@@ -45,7 +81,7 @@ def test_the_demo_leaves_a_scene_folder_of_something_else_alone(tmp_path):
     (tmp_path / "demo/scene/holiday.jpg").write_text("mine")
     called = ss_flow("demo", "--out", tmp_path / "demo", "--cache", tmp_path / "store")
     assert called.code == 2
-    assert "holds something else than a demo scene" in called.err
+    assert "holds something else than a generated scene" in called.err
     assert (tmp_path / "demo/scene/holiday.jpg").read_text() == "mine"
 
 

@@ -45,7 +45,9 @@ def test_the_overview_loads_no_command_and_nothing_that_takes_long(arguments):
 def test_a_command_loads_no_other():
     loaded = loaded_by("status", "--cache", "/nowhere")
     assert "ss_flow.flows.cli.inspect" in loaded
-    assert not loaded & {f"ss_flow.flows.cli.{name}" for name in ("run", "prepare", "sweep", "batch", "query", "export")}
+    assert not loaded & {
+        f"ss_flow.flows.cli.{name}" for name in ("run", "prepare", "sweep", "batch", "query", "export")
+    }
 
 
 @pytest.mark.parametrize("words", ENTRIES, ids=" ".join)

@@ -67,7 +67,6 @@ def test_a_closure_is_found_again_as_it_was(probe, walks):
     assert walks == ["run"] and "probe.step:loop.cpp" in again.definitions
 
 
-
 @pytest.mark.parametrize(
     ("file", "text"),
     [
@@ -89,7 +88,9 @@ def test_it_is_worked_out_anew_when_what_it_was_read_from_changes(probe, walks, 
 
 def test_a_helper_that_is_gone_is_noticed(probe, walks):
     kept_closure(probe(), probe.folder)
-    (probe.package / "step.py").write_text(STEP.replace("helpers.double(x)", "x").replace("from probe import helpers", ""))
+    (probe.package / "step.py").write_text(
+        STEP.replace("helpers.double(x)", "x").replace("from probe import helpers", "")
+    )
     (probe.package / "helpers.py").unlink()
     assert kept_closure(probe(), probe.folder) == closure_of(probe())
 
@@ -102,7 +103,9 @@ def test_another_python_or_another_analysis_counts(probe, walks, monkeypatch):
     assert walks == ["run"] * 3
 
 
-@pytest.mark.parametrize("damage", [lambda b: b[:-9], lambda b: b.replace(b"probe", b"prone"), lambda b: b"", lambda b: b"\xff"])
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:-9], lambda b: b.replace(b"probe", b"prone"), lambda b: b"", lambda b: b"\xff"]
+)
 def test_a_damaged_file_is_not_believed(probe, walks, damage):
     first = kept_closure(probe(), probe.folder)
     (file,) = probe.folder.iterdir()
