@@ -46,10 +46,11 @@ def _top_level(distribution: importlib.metadata.Distribution) -> Iterator[str]:
     if declared is not None:
         yield from declared.split()
         return
-    for line in (distribution.read_text("RECORD") or "").splitlines():
-        yield line.partition("/")[0].partition(",")[0].partition(".")[0]
+    yield from _FIRST.findall(distribution.read_text("RECORD") or "")
 
 
+_FIRST = re.compile(r"^[^/,.\n]+", re.MULTILINE)
+"""The top-level module or folder that a line of RECORD is about."""
 _HEADER = re.compile(r"^(Name|Version): *(.+?) *$", re.MULTILINE)
 
 

@@ -123,8 +123,7 @@ def chosen(arguments: list[str]) -> Any:
     The others are there for the overview, and for what is said of a wrong word. A shell's completion asks for all.
     """
     every = bool(arguments) and arguments[0].replace("_", "-").startswith("--tyro-")
-    union = _union(COMMANDS, None if every else arguments)
-    return tyro.conf.OmitSubcommandPrefixes[tyro.conf.FlagCreatePairsOff[union]]
+    return _union(COMMANDS, None if every else arguments)
 
 
 def _union(commands: Mapping[str, Entry | Group], named: list[str] | None) -> Any:

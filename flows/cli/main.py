@@ -43,6 +43,7 @@ def main(arguments: list[str]) -> int:
             description="From a capture to instance-labelled 3D Gaussians; nothing is computed twice. "
             "`ss-flow demo` shows it on a room of its own, `ss-flow run PATH` takes yours.",
             args=arguments,
+            config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
         )
         return int(command.run())
     except InputError as error:
