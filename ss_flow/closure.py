@@ -98,8 +98,8 @@ def source_digest(name: str) -> str:
     source = _source(module)
     if source is None:
         return ""
-    if not native:
-        return blake3(source.text.encode()).hexdigest()
+    if not native:  # in a package, relative imports mean others
+        return blake3(f"{source.is_package} {source.text}".encode()).hexdigest()
     try:
         return blake3((source.path.parent / native).read_bytes()).hexdigest()
     except FileNotFoundError:

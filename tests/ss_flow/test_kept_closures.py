@@ -95,6 +95,18 @@ def test_a_helper_that_is_gone_is_noticed(probe, walks):
     assert kept_closure(probe(), probe.folder) == closure_of(probe())
 
 
+def test_a_module_that_became_a_package_is_read_anew(probe, walks):
+    (probe.package / "helpers.py").write_text("from .late import factor\n\n\ndef double(x):\n    return factor * x\n")
+    (probe.package / "late.py").write_text("factor = 2\n")
+    before = kept_closure(probe(), probe.folder)
+    (probe.package / "helpers").mkdir()
+    (probe.package / "helpers.py").rename(probe.package / "helpers" / "__init__.py")
+    (probe.package / "helpers" / "late.py").write_text("factor = 3\n")
+    after = kept_closure(probe(), probe.folder)
+    assert after == closure_of(probe()) and "probe.helpers.late.factor" in after.definitions
+    assert "probe.late.factor" in before.definitions and "probe.late.factor" not in after.definitions
+
+
 def test_another_python_or_another_analysis_counts(probe, walks, monkeypatch):
     kept_closure(probe(), probe.folder)
     for name in ("python", "analysis"):
