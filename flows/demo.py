@@ -72,15 +72,19 @@ def demo_scene(out: Path, room: RoomParams, masks: Masks, store: Store, reporter
     return _placed(out / "scene", room, masks, "", store, reporter)
 
 
-def generated_scenes(out: Path, rooms: Sequence[RoomParams], masks: Masks, store: Store, reporter: Reporter) -> None:
+def generated_scenes(
+    out: Path, rooms: Sequence[RoomParams], masks: Masks, store: Store, reporter: Reporter
+) -> list[Path]:
     """Have rooms with all that tables are measured by in `out`/room-SEED.
 
     Beside the capture itself: the annotated scan in ScanNet's files, the labels of three views in LERF-OVS's, and
-    clicks on every object in the views that show most of it. Raises InputError when `out` holds something else.
+    clicks on every object in the views that show most of it. Returns their folders. Raises InputError when `out` holds
+    something else.
     """
-    for room in rooms:
-        folder = out / f"room-{room.seed}"
+    folders = [out / f"room-{room.seed}" for room in rooms]
+    for folder, room in zip(folders, rooms, strict=True):
         _placed(folder, room, masks, folder.name, store, reporter)
+    return folders
 
 
 def _placed(folder: Path, room: RoomParams, masks: Masks, annotated: str, store: Store, reporter: Reporter) -> Path:

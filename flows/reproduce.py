@@ -16,7 +16,6 @@ from ss_flow.flows.evaluate import (
     Reference,
     after_splat,
     after_split,
-    labels_of,
     scan_truth,
 )
 from ss_flow.tasks.artifacts import Metrics
@@ -184,8 +183,3 @@ def measured(
         return LERF[section.protocol](nodes, labelled)["splat"]
     assert variant.measure is not None
     return variant.measure(nodes, scan_truth(folder, reference))
-
-
-def labels_folder(folder: Path) -> Path:
-    """Where the label files of a scene of LERF-OVS lie."""
-    return labels_of(open_scene(folder))

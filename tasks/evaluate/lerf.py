@@ -157,7 +157,8 @@ def langsplat_2d(
         weights, ids = _weights(scene, cameras, view)
         features = np.array([own.get(int(i), np.zeros(model.dimension)) for i in ids], np.float32)
         features = features.reshape(len(ids), model.dimension)
-        length = np.sqrt(np.maximum(np.einsum("lp,lk,kp->p", weights, features @ features.T, weights), 1e-12))
+        square = np.einsum("lp,lp->p", weights, (features @ features.T) @ weights)
+        length = np.sqrt(np.maximum(square, 1e-12))
         scores = {}
         for category, target in strict_targets(label).items():
             if category not in text_of:
@@ -166,7 +167,7 @@ def langsplat_2d(
                 continue
             text = text_of[category]
             words = model.encode_texts([text, *model.negatives(text)])
-            cosines = np.einsum("tl,lp->pt", words @ features.T, weights) / length[:, None]
+            cosines = ((words @ features.T) @ weights).T / length[:, None]
             raw = relevancy_of(cosines[:, 0], cosines[:, 1:]).reshape(frames[view].height, frames[view].width)
             mask, peak = _found_2d(carried(raw.astype(np.float32)))
             scores[category] = iou(mask, target)

@@ -6,7 +6,7 @@ import pytest
 from tiny_runs import SHORT, ss_flow
 
 from ss_flow.flows import paper, settings
-from ss_flow.flows.cli.reproduce import MEAN
+from ss_flow.flows.cli.reproduce_report import MEAN
 from ss_flow.flows.params import Params
 from ss_flow.flows.reproduce import PLANS
 
