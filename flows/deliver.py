@@ -89,6 +89,7 @@ def node_records(report: Report) -> list[dict[str, Any]]:
             "outputs": node["outputs"],
             "hit": node["event"] == "hit",
             "seconds": node["seconds"],
+            "ended": node["time"],
             "peak_rss_mb": node["peak_rss_mb"],
             "warnings": node["warnings"],
         }
@@ -146,12 +147,31 @@ def write_all(
 
 def write_report(file: Path, results: Results, document: dict[str, Any], instances: dict[str, Any]) -> None:
     """Write report.html, whole or not at all. instances: the document of instances.json."""
-    from ss_flow.tasks.deliver.report import report_html, report_pictures
+    from ss_flow.tasks.deliver.report import Insight, Votes, report_html, report_pictures
+    from ss_flow.tasks.deliver.suspects import suspects
+    from ss_flow.tasks.deliver.thumbnails import shares_of_views, thumbnails
 
-    frames, cameras, depths = results.all("ingest"), results.one("cameras"), results.all("depth")
-    maps = results.all("masks_split"), results.all("masks")
-    pictures = report_pictures(frames, cameras, depths, *maps, results.one("scene"))
-    write_atomically(file, report_html(document, pictures=pictures, instances=instances))
+    frames, cameras, depths, maps = (
+        results.all("ingest"),
+        results.one("cameras"),
+        results.all("depth"),
+        results.all("masks"),
+    )
+    pictures = report_pictures(frames, cameras, depths, results.all("masks_split"), maps, results.one("scene"))
+    doubtful = suspects(
+        results.all("refine"),
+        instances,
+        results.one("hierarchy"),
+        spacing=results.one("dense").spacing,
+        num_views=len(frames),
+    )
+    insight = Insight(
+        thumbnails(frames, maps, [entry["id"] for entry in instances["instances"]]),
+        shares_of_views(maps),
+        doubtful,
+        Votes.of(results.one("propagate"), document["params"]["split.propagate.tau_label"]),
+    )
+    write_atomically(file, report_html(document, pictures=pictures, instances=instances, insight=insight))
 
 
 def _content_of(folder: Path) -> str | None:

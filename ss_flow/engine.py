@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -53,7 +54,7 @@ class Report:
     values: dict[str, Value | Failure]
     """The flow's outputs by name: digests, or why there are none."""
     nodes: list[dict[str, Any]]
-    """One event for every node that was reached: hit, finished, failed, skipped or would run."""
+    """One event for every node that was reached, with its time: hit, finished, failed, skipped or would run."""
     failures: list[Failure]
     run_folder: str
 
@@ -64,7 +65,7 @@ class _Recorder(Reporter):
 
     def event(self, kind: str, **details: Any) -> None:
         if kind in ENDS:
-            self.events.append({"event": kind, **details})
+            self.events.append({"event": kind, "time": round(time.time(), 3), **details})
 
 
 def usable_cores() -> int:

@@ -12,7 +12,10 @@ from rich.markup import escape
 from ss_flow.flows.cli.context import StoreOptions, console, open_run
 from ss_flow.flows.deliver import write_report
 
-_SHOWN = ("ingest", "cameras", "depth", "masks_split", "masks", "scene")
+_SHOWN = (
+    *("ingest", "cameras", "depth", "dense", "propagate", "hierarchy"),
+    *("refine", "masks_split", "masks", "scene"),
+)
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, UInt8
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, PointLabels, UInt8
 from ss_flow.tasks.deliver.draw import draw
 from ss_flow.tasks.deliver.palette import instance_colors
 from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
+from ss_flow.tasks.deliver.timeline import timeline
 from ss_flow.tasks.geometry.images import encode_png
 
 _KINDS = {
@@ -44,19 +46,66 @@ _METRIC_NAMES = {
     "num_truth": "True instances",
     "num_predicted": "Predicted instances",
 }
-_STAGES = {"split": "After Split", "splat": "After Splat", "novel_view": "Novel views", "openvocab": "Open vocabulary"}
+_STAGES = {"split": "After Split", "refined": "Refined masks", "splat": "After Splat", "novel_view": "Novel views"}
 _WIDEST = 960
+_BINS = 10
+
+
+@dataclass(frozen=True)
+class Votes:
+    """How far the views agree on the dense points (Split&Splat, Sec. 3.1.2)."""
+
+    labelled: float
+    """Share of the points that got a label."""
+    contested: float
+    """Share of which the best label has less than tau_label of the votes."""
+    without: float
+    """Share that no mask voted for."""
+    tau_label: float
+    histogram: tuple[float, ...]
+    """Of the points with votes, the share in each tenth of agreement, 0..1, relative to the largest."""
+
+    @classmethod
+    def of(cls, pieces: PointLabels, tau_label: float) -> Votes:
+        """pieces: the points as `split.propagate` labels them."""
+        voted = pieces.confidence[pieces.confidence > 0]
+        counts, _ = np.histogram(voted, _BINS, (0, 1))
+        return cls(
+            float((pieces.label > 0).mean()),
+            float((voted < tau_label).sum() / max(len(pieces.label), 1)),
+            1 - len(voted) / max(len(pieces.label), 1),
+            tau_label,
+            tuple((counts / max(counts.max(), 1)).tolist()),
+        )
+
+
+@dataclass(frozen=True)
+class Insight:
+    """What a report tells of a run besides its documents."""
+
+    thumbnails: Mapping[int, UInt8]
+    """A small picture of each instance."""
+    shares: Mapping[int, float]
+    """How much of all pixels of all views each instance fills."""
+    suspects: Sequence[Mapping[str, Any]]
+    """What `suspects.suspects` found."""
+    votes: Votes
 
 
 def report_html(
-    run: Mapping[str, Any], *, pictures: Mapping[str, UInt8 | bytes], instances: Mapping[str, Any] | None = None
+    run: Mapping[str, Any],
+    *,
+    pictures: Mapping[str, UInt8 | bytes],
+    instances: Mapping[str, Any] | None = None,
+    insight: Insight | None = None,
 ) -> str:
     """The report of a run.
 
     run: the document of run.json ("status", "scene", "params", "models", "metrics", "nodes", "warnings", "failures";
     any may be missing). pictures: each [H, W, 3] RGB or the bytes of a PNG or JPEG, under "view/kind" with the kinds
     photo, masks_split, masks, render, depth, which are shown in one row a view; any other name is the picture's
-    caption. instances: the document of instances.json.
+    caption. instances: the document of instances.json. Those that fill most of the views come first, walls and floors
+    after things, and crumbs are folded away.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -64,13 +113,17 @@ def report_html(
     template = resources.files(__package__ or "").joinpath("report.html.jinja").read_text(encoding="utf-8")
     views, others = _views(pictures)
     nodes = list(run.get("nodes") or ())
-    # Large things first, walls and floors after them.
-    listed = sorted((instances or {}).get("instances", []), key=lambda e: (e["kind"] == "stuff", -e["num_points"]))
+    shares = insight.shares if insight else {}
+    listed = sorted(
+        (instances or {}).get("instances", []),
+        key=lambda e: (e["kind"] == "stuff", -shares.get(e["id"], 0.0), -e["num_points"]),
+    )
     return environment.from_string(template).render(
         scene=PurePath(str(run.get("scene") or "")).name or "scene",
         status=run.get("status") or "unknown",
         models=_flat(run.get("models") or {}),
         metrics=_metrics(run.get("metrics") or {}),
+        stages=_stages(run.get("metrics") or {}),
         params=_flat(run.get("params") or {}),
         failures=[_failure(failure) for failure in run.get("failures") or ()],
         warnings=run.get("warnings") or (),
@@ -83,6 +136,11 @@ def report_html(
         others=others,
         instances=[entry for entry in listed if not entry["crumb"]],
         crumbs=[entry for entry in listed if entry["crumb"]],
+        shares=shares,
+        thumbnails={i: data_uri(picture) for i, picture in insight.thumbnails.items()} if insight else {},
+        suspects=insight.suspects if insight else (),
+        votes=insight.votes if insight else None,
+        timeline=timeline(nodes),
     )
 
 
@@ -154,11 +212,28 @@ def data_uri(picture: UInt8 | bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
+_BY_STAGE = ("split", "refined", "splat")
+
+
+def _stages(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """What was measured of the masks after each stage, as one table: heads, and a row a figure."""
+    found = {stage: metrics[stage] for stage in _BY_STAGE if isinstance(metrics.get(stage), Mapping)}
+    names = dict.fromkeys(name for values in found.values() for name in values)
+    rows = [
+        (_words(name), [_figure(name, values[name]) if name in values else "" for values in found.values()])
+        for name in names
+    ]
+    return {"heads": [_STAGES[stage] for stage in found], "rows": rows}
+
+
 def _metrics(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What else was measured, a group each."""
     groups: list[dict[str, Any]] = []
     loose = []
     for stage, values in metrics.items():
         if isinstance(values, Mapping):
+            if stage in _BY_STAGE:
+                continue
             figures = [(_words(name), _figure(name, value)) for name, value in values.items()]
             groups.append({"stage": _STAGES.get(stage) or _words(stage), "figures": figures})
         else:
@@ -184,7 +259,8 @@ def _steps(nodes: list[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Nodes of one step together, in the order in which the steps first appear."""
     found: dict[str, dict[str, Any]] = {}
     for node in nodes:
-        step = found.setdefault(str(node.get("step", "?")), {"hits": 0, "misses": 0, "seconds": 0.0})
+        step = found.setdefault(str(node.get("step", "?")), {"hits": 0, "misses": 0, "seconds": 0.0, "peak": 0.0})
+        step["peak"] = max(step["peak"], float(node.get("peak_rss_mb") or 0))
         if node.get("hit"):
             step["hits"] += 1
         else:
@@ -198,6 +274,7 @@ def _steps(nodes: list[Mapping[str, Any]]) -> list[dict[str, Any]]:
             "hits": step["hits"],
             "time": _duration(step["seconds"]) if step["misses"] else "from the cache",
             "share": 100 * step["seconds"] / longest if longest > 0 else 0.0,
+            "peak": f"{step['peak']:.0f} MB" if step["peak"] else "",
         }
         for name, step in found.items()
     ]

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap
-from ss_flow.tasks.deliver.report import data_uri, report_html, report_pictures
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, PointLabels
+from ss_flow.tasks.deliver.report import Insight, Votes, data_uri, report_html, report_pictures
+from ss_flow.tasks.deliver.timeline import timeline
 from ss_flow.tasks.geometry.images import encode_png
 
 PHOTO = np.random.default_rng(0).integers(0, 256, (60, 80, 3), np.uint8)
@@ -144,6 +145,61 @@ def test_pictures_of_a_view_stand_together_in_a_fixed_order():
     html = report_html(RUN, pictures=pictures)
     assert re.findall(r"<figcaption>(.*?)</figcaption>", html) == ["Photo", "Depth", "Photo", "Cameras"]
     assert re.findall(r"<h3>View (.*?)</h3>", html) == ["a", "b"]
+
+
+def test_objects_are_pictured_by_how_much_they_matter_and_the_doubtful_ones_named():
+    def entry(number: int, name: str):
+        return INSTANCE | {"id": number, "name": name, "weak": False}
+
+    votes = Votes.of(labels([0, 0.5, 0.9, 1.0], [0, 0, 3, 3]), 0.7)
+    doubt = {"id": 3, "name": "small mug", "reasons": ["few views: it is seen in 2 of 20", "low <confidence>"]}
+    insight = Insight({3: PHOTO, 4: PHOTO}, {3: 0.001, 4: 0.25}, [doubt], votes)
+    listed = [entry(3, "small mug"), entry(4, "large box"), entry(5, "never shown")]
+    html = report_html(RUN, pictures={}, instances={"instances": listed}, insight=insight)
+    text = Page(html).text
+    assert "small mug (3) : few views: it is seen in 2 of 20; low <confidence>" in text
+    pictured = re.findall(r'alt="(.*?)" loading', html)
+    assert pictured == ["large box", "small mug"] and "25.0 % of the pixels" in text
+    assert "50.0 % of the dense points carry a label" in text and "Of 25.0 % the best label" in text
+    assert "voted for 25.0 %" in text
+
+
+def labels(confidence: list[float], label: list[int]) -> PointLabels:
+    nothing = np.zeros(0, np.int32)
+    return PointLabels(np.int32(label), np.float32(confidence), 3, nothing, nothing, nothing, np.zeros(0, np.float32))
+
+
+def test_agreement_is_told_by_tenths_of_the_points_that_have_votes():
+    votes = Votes.of(labels([0, 0, 0.05, 0.95, 1.0], [0, 0, 1, 1, 1]), 0.7)
+    assert votes.histogram == (0.5, *[0.0] * 8, 1.0)
+    assert (votes.labelled, votes.contested, votes.without) == pytest.approx((3 / 5, 1 / 5, 2 / 5))
+
+
+def test_stages_stand_side_by_side():
+    metrics = {"split": {"miou": 0.5, "pq": 0.25}, "refined": {"miou": 0.625}, "splat": {"miou": 0.75, "pq": 0.125}}
+    text = Page(report_html({"metrics": metrics}, pictures={})).text
+    assert "After Split Refined masks After Splat mIoU 0.500 0.625 0.750 PQ 0.250 0.125" in text
+
+
+def test_the_timeline_places_what_was_computed_and_leaves_out_the_cache():
+    nodes = [
+        {"step": "b", "hit": False, "seconds": 5.0, "ended": 110.0},
+        {"step": "a", "hit": False, "seconds": 2.0, "ended": 102.0},
+        {"step": "a", "hit": False, "seconds": 2.0, "ended": 104.0},
+        {"step": "a", "hit": False, "seconds": 1.0, "ended": 110.0},
+        {"step": "c", "hit": True, "seconds": 9.0, "ended": 101.0},
+    ]
+    a, b = timeline(nodes)
+    assert (a["name"], b["name"]) == ("a", "b")
+    assert a["bars"] == [(0, 40), (90, 10)], "bars that touch are one"
+    assert b["bars"] == [(50, 50)]
+    assert timeline([nodes[-1], {"step": "d", "hit": False, "seconds": 1.0}]) == []
+    instant = timeline([{"step": "a", "hit": False, "seconds": 0.0, "ended": 1.0}, nodes[0]])
+    assert all(left >= 0 and left + width <= 100 and width > 0 for row in instant for left, width in row["bars"])
+
+
+def test_memory_is_told_by_step():
+    assert "split.segment 2 1 4.00 s 812 MB" in Page(report_html(RUN, pictures={})).text
 
 
 def test_an_empty_run_has_a_report_too():

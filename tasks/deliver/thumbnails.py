@@ -1,0 +1,65 @@
+"""A small picture of each object: cut out of the view that shows most of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Frame, LabelMap, UInt8
+from ss_flow.tasks.geometry.images import decode_rgb
+
+_SIDE = 128
+_MARGIN = 0.15
+"""Share of the object's longer side that is shown around it."""
+_DIMMED = 0.3
+"""Brightness that the surroundings keep, towards white."""
+
+
+def thumbnails(frames: Sequence[Frame], maps: Sequence[LabelMap], ids: Iterable[int]) -> dict[int, UInt8]:
+    """A square picture [128, 128, 3] of each instance that a view shows, its surroundings faded.
+
+    frames, maps: of all views, in one order. Each photo is decoded once.
+    """
+    asked = set(ids)
+    best: dict[int, tuple[int, int]] = {}
+    """Pixels and view of each instance; the first of equals."""
+    for view, one in enumerate(maps):
+        present, area = np.unique(one.ids, return_counts=True)
+        for instance, pixels in zip(present.tolist(), area.tolist(), strict=True):
+            if instance in asked and pixels > best.get(instance, (0, 0))[0]:
+                best[instance] = pixels, view
+    pictures: dict[int, UInt8] = {}
+    for view in sorted({view for _, view in best.values()}):
+        photo = decode_rgb(frames[view])
+        for instance in (i for i, (_, of) in best.items() if of == view):
+            pictures[instance] = _cut_out(photo, maps[view].ids == instance)
+    return pictures
+
+
+def shares_of_views(maps: Sequence[LabelMap]) -> dict[int, float]:
+    """How much of all pixels of all views each instance fills: what it matters to who looks."""
+    area: dict[int, int] = {}
+    for one in maps:
+        for instance, pixels in zip(*(x.tolist() for x in np.unique(one.ids, return_counts=True)), strict=True):
+            area[instance] = area.get(instance, 0) + pixels
+    whole = sum(one.ids.size for one in maps)
+    return {instance: pixels / whole for instance, pixels in area.items()}
+
+
+def _cut_out(photo: UInt8, mask: np.ndarray) -> UInt8:
+    import cv2
+
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    side = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
+    side = int(side * (1 + 2 * _MARGIN)) + 2
+    top, left = (rows[0] + rows[-1] + 1 - side) // 2, (columns[0] + columns[-1] + 1 - side) // 2
+    down = np.clip(np.arange(top, top + side), 0, photo.shape[0] - 1)
+    across = np.clip(np.arange(left, left + side), 0, photo.shape[1] - 1)
+    inside = np.outer(down == np.arange(top, top + side), across == np.arange(left, left + side))
+    square, shown = photo[np.ix_(down, across)], mask[np.ix_(down, across)] & inside
+    faded = 255 - _DIMMED * (255 - square.astype(np.float32))
+    picture = np.where(shown[..., None], square, faded)
+    picture[~inside] = 255
+    way = cv2.INTER_AREA if side > _SIDE else cv2.INTER_CUBIC
+    return np.clip(np.rint(cv2.resize(picture, (_SIDE, _SIDE), interpolation=way)), 0, 255).astype(np.uint8)
