@@ -14,6 +14,7 @@ from ss_flow.graph import INDEX, each
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import (
     Cameras,
+    CaptureChecks,
     Clicks,
     ColourTransform,
     DepthMap,
@@ -25,6 +26,7 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.capture import depth as depth_steps
 from ss_flow.tasks.capture import ingest, recordings, sensor_depth, views
+from ss_flow.tasks.capture.checks import checks
 from ss_flow.tasks.capture.coco_masks import coco_masks
 from ss_flow.tasks.capture.colours import colours
 from ss_flow.tasks.capture.hints import clicks
@@ -64,6 +66,8 @@ class Capture:
     """Of a sensor's depth."""
     colours: tuple[ColourTransform, ...] = ()
     """One a view; none where photos are trained on as they are."""
+    checks: CaptureChecks | None = None
+    """Whether the views fit together."""
 
 
 def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, monodepth: Model | None) -> Capture:
@@ -119,7 +123,10 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     evened: tuple[ColourTransform, ...] = ()
     if params.colours.transform != "none":
         evened = colours(frames, cameras, depths, length, params=params.colours)
-    return Capture(frames, cameras, by_view, depths, length, masks, truth, names, pointed, objects, placing, evened)
+    fitting = checks(frames, cameras, depths, params=params.checks)
+    return Capture(
+        frames, cameras, by_view, depths, length, masks, truth, names, pointed, objects, placing, evened, fitting
+    )
 
 
 def _known_names(scene: SceneFiles) -> tuple[str, ...] | None:

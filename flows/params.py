@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ss_flow.tasks.capture.checks import CheckParams
 from ss_flow.tasks.capture.colours import ColourParams
 from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
 from ss_flow.tasks.capture.ingest import IngestParams
@@ -60,6 +61,7 @@ class CaptureParams:
     registration: RegistrationParams = field(default_factory=RegistrationParams)
     mono: MonoParams = field(default_factory=MonoParams)
     colours: ColourParams = field(default_factory=ColourParams)
+    checks: CheckParams = field(default_factory=CheckParams)
 
 
 @dataclass(frozen=True)

@@ -110,6 +110,24 @@ class Registration:
     """0..1 share of the agreement between edges of depth and of photo that is lost where the maps stay as they are."""
 
 
+@dataclass(frozen=True)
+class CaptureChecks:
+    """How well each view fits its neighbours; NaN where it shares too little with any."""
+
+    names: tuple[str, ...]
+    """Of the views."""
+    depth_error: Float64
+    """[K] relative difference between its depth, carried to a neighbour, and the neighbour's: median."""
+    likeness: Float64
+    """[K] correlation of its grey values with a neighbour's, -1..1."""
+    exposure: Float64
+    """[K] factor of its brightness; 1 on average."""
+    depth_scale: float
+    """The factor on all depth by which neighbours agree clearly better; 1 where there is none."""
+    duplicates: tuple[str, ...]
+    """Views whose photo is that of an earlier one."""
+
+
 class PackedMasks:
     """Masks of one size, a bit a pixel."""
 

@@ -1,0 +1,104 @@
+"""Seeded defects of a generated room are told of, each by its own sentence; a clean room and turned views are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ss_flow.flows.generated import Room, RoomParams, generate
+from ss_flow.running import Surroundings, running
+from ss_flow.tasks.artifacts import Cameras, CaptureChecks, DepthMap, Frame
+from ss_flow.tasks.capture.checks import checks
+from ss_flow.tasks.geometry.images import encode_png
+
+
+@pytest.fixture(scope="module")
+def room() -> Room:
+    return generate(RoomParams(objects=6, views=12, width=96, height=72, held_out=0))
+
+
+def _checked(
+    room: Room, rgb: np.ndarray | None = None, depth: np.ndarray | None = None, cameras: Cameras | None = None
+) -> tuple[list[str], CaptureChecks]:
+    rgb = room.rgb if rgb is None else rgb
+    depth = room.depth if depth is None else depth
+    cameras = cameras or room.cameras
+    h, w = rgb.shape[1:3]
+    frames = [
+        Frame(name, w, h, encode_png(image), np.zeros(0, np.uint8), w, h)
+        for name, image in zip(cameras.names, rgb, strict=True)
+    ]
+    depths = [DepthMap(name, one, "sensor") for name, one in zip(cameras.names, depth, strict=True)]
+    heard: list[str] = []
+    with running(Surroundings(warned=heard)):
+        return heard, checks(frames, cameras, depths)
+
+
+def _jittered(room: Room, degrees: float, metres: float, views: range | list[int]) -> Cameras:
+    import cv2
+
+    rng = np.random.default_rng(1)
+    poses = room.cameras.world_to_camera.copy()
+    for view in views:
+        shaken = np.eye(4)
+        shaken[:3, :3] = cv2.Rodrigues(rng.normal(0, np.radians(degrees), 3))[0]
+        shaken[:3, 3] = rng.normal(0, metres, 3)
+        poses[view] = shaken @ poses[view]
+    return replace(room.cameras, world_to_camera=poses)
+
+
+def test_nothing_is_said_of_a_clean_room(room: Room) -> None:
+    heard, found = _checked(room)
+    assert heard == []
+    assert np.nanmedian(found.depth_error) < 0.01 and np.nanmin(found.likeness) > 0.8
+    assert found.exposure == pytest.approx(np.ones(len(room)), abs=0.1) and found.depth_scale == 1
+
+
+def test_jitter_of_all_poses_is_told_with_its_size(room: Room) -> None:
+    (said,), found = _checked(room, cameras=_jittered(room, 2.0, 0.06, range(len(room))))
+    assert "poses, intrinsics and depth disagree" in said and f"{np.nanmedian(found.depth_error):.1%}" in said
+
+
+def test_a_single_wrong_pose_is_named(room: Room) -> None:
+    (said,), found = _checked(room, cameras=_jittered(room, 6.0, 0.2, [5]))
+    assert "do not fit their depth" in said and "0005" in said
+    assert int(np.nanargmax(found.depth_error)) in (4, 5, 6)
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.3])
+def test_depth_of_a_wrong_scale_is_told_with_the_right_one(room: Room, factor: float) -> None:
+    (said,), found = _checked(room, depth=room.depth * np.float32(factor))
+    assert "is its unit right?" in said and found.depth_scale == pytest.approx(1 / factor, rel=0.06)
+
+
+def test_duplicates_are_counted_and_named(room: Room) -> None:
+    rgb, depth, poses = room.rgb.copy(), room.depth.copy(), room.cameras.world_to_camera.copy()
+    for view in (3, 7):
+        rgb[view], depth[view], poses[view] = rgb[view - 1], depth[view - 1], poses[view - 1]
+    (said,), found = _checked(room, rgb, depth, replace(room.cameras, world_to_camera=poses))
+    assert found.duplicates == ("0003", "0007") and said == "2 photos (17%) repeat an earlier one: 0003, 0007."
+
+
+def test_exchanged_intrinsics_are_told_by_the_principal_point(room: Room) -> None:
+    wrong = room.cameras.intrinsics.copy()
+    wrong[:, 2:] = wrong[:, 3:1:-1]
+    heard, _ = _checked(room, cameras=replace(room.cameras, intrinsics=wrong))
+    assert any("(36, 48) of 96 x 72 pixels; are its intrinsics exchanged?" in said for said in heard)
+
+
+def test_a_turned_photo_is_named(room: Room) -> None:
+    rgb = room.rgb.copy()
+    rgb[4] = rgb[4][::-1, ::-1]
+    (said,), found = _checked(room, rgb)
+    assert "do not show what their neighbours do" in said and "0004" in said and int(np.nanargmin(found.likeness)) == 4
+
+
+def test_rolling_exposure_is_told_with_its_factor(room: Room) -> None:
+    factor = 1 + 0.3 * np.sin(np.arange(len(room)) / len(room) * 2 * np.pi)
+    rgb = np.clip(0.7 * room.rgb * factor[:, None, None, None], 0, 255).astype(np.uint8)
+    (said,), found = _checked(room, rgb)
+    assert "exposure changes by a factor of 1." in said
+    assert np.corrcoef(np.log(found.exposure), np.log(factor))[0, 1] > 0.95
+    assert found.exposure.max() / found.exposure.min() == pytest.approx(1.3 / 0.7, rel=0.15)
