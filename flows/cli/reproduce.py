@@ -198,17 +198,22 @@ class Reproduce:
         names = ", ".join(scene.name for scene in scenes)
         rooms = f"{len(scenes)} generated rooms of {self.views} views" if self.data == GENERATED else names
         networks = ready[0].prepared.networks
-        segmenter = networks.segmenter.name if networks.segmenter else FALLBACKS["segmenter"]
-        given = ready[0].prepared.scene.has_masks
+        masks = dict.fromkeys(self._masks_of(one.prepared) for one in ready)
         encoder = networks.encoder.name if networks.encoder else FALLBACKS["encoder"]
         strides = sorted({one.prepared.params.capture.stride for one in ready})
         return [
             f"data: {printed.data.partition(';')[0]} in the paper, {rooms} here",
-            f"masks: SAM 2 in the paper, {'the ' + self.masks + ' masks of the rooms' if given else segmenter} here",
+            f"masks: SAM 2 in the paper, {' and '.join(masks)} here",
             *([f"encoder: CLIP in the paper, {encoder} here"] if ready[0].labelled else []),
             f"preset: {' '.join((self.execution.preset, *self.execution.texts))}; every n-th frame: "
             f"{', '.join(map(str, strides))}",
         ]
+
+    def _masks_of(self, prepared: Prepared) -> str:
+        """Where the masks of a run come from."""
+        if prepared.scene.has_masks:
+            return f"the {self.masks} masks of the rooms" if self.data == GENERATED else "ready-made masks"
+        return prepared.networks.segmenter.name if prepared.networks.segmenter else str(FALLBACKS["segmenter"])
 
 
 class _Ready(NamedTuple):

