@@ -86,7 +86,8 @@ def object_views(frames: Sequence[Frame], cameras: Cameras, scene: Gaussians, tr
         np.array([len(boxes[i]) for i in sorted(boxes)], np.int32),
         means[:, 0],
         means[:, 1],
-        *(float(mean) for mean in np.mean(whole, axis=0)),
+        float(np.mean([decibels for decibels, _ in whole])),
+        float(np.mean([similarity for _, similarity in whole])),
         float(np.mean(bands)) if bands else float("nan"),
     )
 
