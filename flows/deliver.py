@@ -37,6 +37,7 @@ FALLBACKS = {
     "segmenter": "colour, depth and normals (no network)",
     "encoder": "colour words (no network)",
     "monodepth": None,
+    "patches": None,
 }
 
 
@@ -128,6 +129,7 @@ def write_all(
 ) -> None:
     """Write everything but run.json."""
     from ss_flow.tasks.capture.lens import photo_lens
+    from ss_flow.tasks.deliver.descriptors import write_descriptors
     from ss_flow.tasks.deliver.instances_json import instances_document
     from ss_flow.tasks.deliver.undistorted import write_undistorted
 
@@ -142,6 +144,8 @@ def write_all(
     write_masks(maps, frames, lenses)
     if undistorted:
         write_undistorted(folder / "undistorted", frames, cameras, maps[folder / "masks"])
+    if "dense_descriptors" in document["results"]:
+        write_descriptors(folder, scene, results.one("dense_descriptors"), cameras)
     write_report(folder / "report.html", results, document, instances)
 
 

@@ -17,6 +17,7 @@ from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.capture.stereo import StereoParams
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction
+from ss_flow.tasks.semantics.dense_describe import DenseDescribeParams
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams
 from ss_flow.tasks.splat.merge import MergeParams
@@ -110,6 +111,10 @@ class SemanticsParams:
     """What the encoder is shown of an instance: its "refined" masks, or the masks "rendered" from its Gaussians (M^gs),
     as in the paper."""
     describe: DescribeParams = field(default_factory=DescribeParams)
+    patches: str = "none"
+    """The network that gives every Gaussian of an object a vector: a name of the catalogue, "auto" (DINOv2 where it is
+    here, else a segmenter), or "none" for no such vectors."""
+    dense: DenseDescribeParams = field(default_factory=DenseDescribeParams)
     query: QueryParams = field(default_factory=QueryParams)
 
 

@@ -47,6 +47,8 @@ class Networks:
     segmenter: Model | None
     encoder: Model | None
     monodepth: Model | None
+    patches: Model | None = None
+    """For vectors of single Gaussians; there is no fallback, as these are made on request only."""
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,12 @@ from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import Params
 from ss_flow.flows.splat import splat
 from ss_flow.flows.split import Networks, split
-from ss_flow.graph import labelled
+from ss_flow.graph import each, labelled
+from ss_flow.tasks.artifacts import Cameras, DenseDescriptors, Gaussians
 from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.evaluate.novel_view import novel_view
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.semantics.dense_describe import apart, dense_describe, together
 from ss_flow.tasks.semantics.name import given_names, name
 from ss_flow.tasks.splat.resolve import resolve
 
@@ -64,7 +67,19 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         if held_out.truth is not None:
             results["truth_held_out"] = held_out.truth
         results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])
+    if networks.patches is not None:
+        results["dense_descriptors"] = dense_descriptors(results["scene"], capture.cameras, networks.patches, params)
     results["names"] = name(results["describe"], encoder=networks.encoder)
     if found.hinted is not None:
         results["names"] = given_names(results["names"], found.hinted, found.labels, objects=capture.objects)
     return results
+
+
+def dense_descriptors(scene: Gaussians, cameras: Cameras, network: Model, params: Params) -> DenseDescriptors:
+    """A vector for every Gaussian of the instances: one step an instance, as the finished scene has it."""
+    described = each(
+        apart(scene),
+        build=lambda own: dense_describe(own, cameras, network=network, params=params.semantics.dense),
+        on_error="skip",
+    )
+    return together(scene, described, network=network.name)

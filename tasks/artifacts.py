@@ -408,6 +408,24 @@ class Descriptors:
     """Name of the text-image encoder."""
 
 
+NO_VECTOR, FROM_PICTURES, FROM_NEIGHBOURS = 0, 1, 2
+"""Where the vector of a Gaussian comes from."""
+
+
+@dataclass(frozen=True)
+class DenseDescriptors:
+    """A vector for each of some Gaussians (Split&Splat, appendix "Dense Semantic Embeddings")."""
+
+    instance_id: Int32
+    """[N] of the Gaussians, in their order."""
+    features: Float32
+    """[N, D] of no particular length; zeros where there is none."""
+    origin: UInt8
+    """[N] NO_VECTOR, FROM_PICTURES, or FROM_NEIGHBOURS where no picture shows the Gaussian."""
+    network: str
+    """Name of the network."""
+
+
 class ViewLists:
     """Some of a scene's views for each row, one list after the other."""
 

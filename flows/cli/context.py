@@ -111,6 +111,24 @@ def choose_model(kind: str, name: str, digests: FileDigests, *, wanted: bool = T
     return model
 
 
+def choose_patches(name: str, digests: FileDigests) -> catalogue.Model | None:
+    """The network for vectors of single Gaussians; None for "none".
+
+    name: "auto" takes DINOv2 where it is on this machine, else a segmenter; a segmenter may be named too.
+    Raises InputError as `choose_model` does, and when "auto" finds neither.
+    """
+    if name != "auto":
+        named = name != "none" and catalogue.entry_of(name).kind == "segmenter"
+        return choose_model("segmenter" if named else catalogue.PATCHES, name, digests)
+    model = choose_model(catalogue.PATCHES, name, digests) or choose_model("segmenter", name, digests)
+    if model is None:
+        raise InputError(
+            "semantics.patches=auto needs DINOv2 or a segmenter, and neither is on this machine; run "
+            "`ss-flow models fetch dinov2-small`."
+        )
+    return model
+
+
 def open_run(folder: Path, options: StoreOptions, needed: Sequence[str]) -> FinishedRun:
     """A finished run by its output folder, with the store that it names, unless the options name one.
 

@@ -19,7 +19,7 @@ from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows import settings
 from ss_flow.flows.capture import Capture, capture
-from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model
+from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model, choose_patches
 from ss_flow.flows.deliver import deliver, run_document, weight_free
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
@@ -133,6 +133,7 @@ def prepare(
         segmenter=choose_model("segmenter", params.split.segmenter, digests, wanted=not scene.has_masks),
         encoder=choose_model("text-image", params.semantics.encoder, digests),
         monodepth=choose_model("monodepth", params.capture.monodepth, digests, wanted=params.capture.depth == "mono"),
+        patches=choose_patches(params.semantics.patches, digests),
     )
 
     def reference(path: Path) -> FileRef:

@@ -100,7 +100,10 @@ class Doctor:
             ("Open3D", lambda: str(_open3d())),
             ("onnxruntime", _onnxruntime),
             *((name, lambda n=name, m=module: _library(n, m)) for name, module in _LIBRARIES),
-            *((f"{kind} network", lambda k=kind: _model(k)) for kind in ("segmenter", "text-image", "monodepth")),
+            *(
+                (f"{kind} network", lambda k=kind: _model(k))
+                for kind in ("segmenter", "text-image", "monodepth", catalogue.PATCHES)
+            ),
         ]
         table = Table("what", "state", box=None)
         bad = 0
@@ -164,6 +167,7 @@ def _model(kind: str) -> str:
         "segmenter": "none; colour, depth and normals segment instead",
         "text-image": "none; colour words answer queries instead",
         "monodepth": "none; depth comes from the sensor or from several views",
+        catalogue.PATCHES: "none; a segmenter can give vectors of single Gaussians instead",
     }
     here = catalogue.available(kind)
     return ", ".join(entry.name for entry in here) if here else fallback[kind]

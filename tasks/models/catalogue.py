@@ -16,6 +16,8 @@ from ss_flow.cache.files import user_cache
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 
+PATCHES = "patch-features"
+"""The kind of networks that describe a picture patch by patch."""
 LOCK = "sha256.lock"
 """Beside the weights: digests of files whose publisher's digest the catalogue does not know."""
 
@@ -45,7 +47,7 @@ class ModelEntry:
 
     name: str
     kind: str
-    """ "segmenter", "text-image" or "monodepth"."""
+    """ "segmenter", "text-image", "monodepth" or "patch-features"."""
     licence: str
     about: str
     hub: str

@@ -95,6 +95,7 @@ def test_run_json_holds_what_was_asked_what_was_done_and_what_was_measured(tiny)
         "segmenter": "ready-made masks",
         "encoder": "colour words (no network)",
         "monodepth": None,
+        "patches": None,
     }
     assert set(document["metrics"]) == {"split", "refined", "splat"}
     assert document["metrics"]["split"]["miou"] > 0.9

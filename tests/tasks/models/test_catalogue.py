@@ -33,7 +33,7 @@ def tiny(monkeypatch, tmp_path):
 def test_every_entry_names_a_source_a_licence_and_files_with_distinct_roles():
     for name, model in load_catalogue().items():
         assert model.name == name and model.licence and bool(model.hub) != bool(model.npm)
-        assert model.kind in ("segmenter", "text-image", "monodepth")
+        assert model.kind in ("segmenter", "text-image", "monodepth", "patch-features")
         assert len({file.role for file in model.files}) == len({file.name for file in model.files}) == len(model.files)
         assert all(file.sha256 is None or len(file.sha256) == 64 for file in model.files)
 
