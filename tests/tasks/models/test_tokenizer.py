@@ -61,6 +61,43 @@ def test_text_is_cut_and_joined_as_worked_out_by_hand(text, expected):
     assert tokens_of(text) == expected
 
 
+PUBLISHED = {
+    19: "t o</w>",
+    24: "a t</w>",
+    27: "o f</w>",
+    47: "r a",
+    58: "d i",
+    90: "a g",
+    94: "h o",
+    127: "d o",
+    304: "p ho",
+    613: "pho to</w>",
+    1417: "do g</w>",
+    1495: "ra m</w>",
+    1856: "c at</w>",
+    1935: "ag ram</w>",
+    22185: "di agram</w>",
+}
+"""Those of CLIP's 48,894 merges that the texts below need, by their rank."""
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [("a photo of a cat", [320, 1125, 539, 320, 2368]), ("a diagram", [320, 22697]), ("A dog", [320, 1929])],
+)
+def test_texts_have_the_ids_that_are_published_for_clip(text, expected):
+    """CLIP numbers first the 256 bytes, those that print before the others, then these at the end of a word, then the
+    merges in their order, then start and end."""
+    characters = byte_characters()
+    alphabet = sorted(characters, key=lambda c: (characters.index(c) != ord(c), characters.index(c)))
+    vocabulary = {token: i for i, token in enumerate([*alphabet, *(c + "</w>" for c in alphabet)])}
+    vocabulary |= {pair.replace(" ", ""): 512 + rank for rank, pair in PUBLISHED.items()}
+    vocabulary |= {START: 49406, END: 49407}
+    tokenizer = ClipTokenizer(vocabulary, [tuple(pair.split()) for pair in PUBLISHED.values()])
+    assert tokenizer.tokens(text) == expected
+    assert tokenizer([text])[0, : len(expected) + 2].tolist() == [49406, *expected, 49407]
+
+
 def test_of_two_learnt_pairs_the_one_learnt_first_is_joined():
     vocabulary = {**VOCABULARY, "ab": 900, "bc</w>": 901}
     assert ClipTokenizer(vocabulary, [("a", "b"), ("b", "c</w>")]).tokens("abc") == [900, VOCABULARY["c</w>"]]
