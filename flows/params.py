@@ -106,7 +106,8 @@ class SemanticsParams:
     """Gaussians -> descriptors -> text."""
 
     encoder: str = "auto"
-    """The network that compares texts and pictures: a name of the catalogue, "auto", or "none" for colour words."""
+    """The network that compares texts and pictures: a name of the catalogue, "auto", or "none" for colour words. With
+    "imagenet-class-names" (the extra `names`), pictures are mixtures of ImageNet's class names."""
     masks: Literal["refined", "rendered"] = "refined"
     """What the encoder is shown of an instance: its "refined" masks, or the masks "rendered" from its Gaussians (M^gs),
     as in the paper."""

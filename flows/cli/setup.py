@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.errors import InputError
@@ -36,7 +37,7 @@ class ModelsList:
                     "kind": entry.kind,
                     "licence": entry.licence,
                     "about": entry.about,
-                    "source": entry.hub or f"npm:{entry.npm}",
+                    "source": f"pip:ss-flow[{entry.extra}]" if entry.extra else entry.hub or f"npm:{entry.npm}",
                     "here": where,
                 }
             )
@@ -45,7 +46,7 @@ class ModelsList:
             return 0
         table = Table("name", "kind", "licence", "source", "here", box=None)
         for row in rows:
-            table.add_row(*(row[k] for k in ("name", "kind", "licence", "source")), row["here"] or "[dim]no[/]")
+            table.add_row(*(escape(row[k]) for k in ("name", "kind", "licence", "source")), row["here"] or "[dim]no[/]")
         console(json=False).print(table)
         return 0
 

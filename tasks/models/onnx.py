@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
@@ -63,6 +63,20 @@ def open_session(
     return session
 
 
+def open_written(weights: FileRef, write: Callable[[], bytes], *, threads: int = 1) -> onnxruntime.InferenceSession:
+    """The session of a network that is written down from a file of weights, on the CPU; one a caller.
+
+    write: gives the network as an ONNX file's content. threads: as for `open_session`.
+    Raises InputError when the file lacks a weight that the network has.
+    """
+    try:
+        return _session(write(), str(weights.path), threads)
+    except KeyError as error:
+        raise InputError(
+            f"{weights.path} has no weights {error}: it is another network than the catalogue describes."
+        ) from error
+
+
 @functools.lru_cache(maxsize=8)
 def _open(
     path: str,
@@ -72,16 +86,20 @@ def _open(
     batched: tuple[str, ...],
     wires: tuple[tuple[str, str, str], ...],
 ) -> onnxruntime.InferenceSession:
-    onnxruntime = load_onnxruntime()
     if not Path(path).is_file():
         raise InputError(f"{path} does not exist; it should be an ONNX network.")
+    return _session(expose(Path(path), outputs, batched, wires) if outputs else path, path, threads)
+
+
+def _session(source: str | bytes, path: str, threads: int) -> onnxruntime.InferenceSession:
+    """source: a file, or its content. path: what to call it."""
+    onnxruntime = load_onnxruntime()
     options = onnxruntime.SessionOptions()
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
     options.log_severity_level = 3
-    source: str | bytes = expose(Path(path), outputs, batched, wires) if outputs else path
     try:
         return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has a class for every cause, with no common base

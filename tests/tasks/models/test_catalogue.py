@@ -1,6 +1,7 @@
 """The catalogue of networks."""
 
 import hashlib
+import importlib
 import os
 import subprocess
 import sys
@@ -32,7 +33,7 @@ def tiny(monkeypatch, tmp_path):
 
 def test_every_entry_names_a_source_a_licence_and_files_with_distinct_roles():
     for name, model in load_catalogue().items():
-        assert model.name == name and model.licence and bool(model.hub) != bool(model.npm)
+        assert model.name == name and model.licence and sum(map(bool, (model.hub, model.npm, model.extra))) == 1
         assert model.kind in ("segmenter", "text-image", "monodepth", "patch-features")
         assert len({file.role for file in model.files}) == len({file.name for file in model.files}) == len(model.files)
         assert all(file.sha256 is None or len(file.sha256) == 64 for file in model.files)
@@ -78,6 +79,39 @@ def test_folders_of_the_environment_come_before_the_cache(monkeypatch, tmp_path)
     folders = catalogue.default_folders()
     assert folders[:2] == (tmp_path / "a", tmp_path / "b")
     assert folders[2] == catalogue.cache_folder()
+
+
+@pytest.fixture
+def packaged(monkeypatch, tmp_path):
+    """A model whose file lies in a package that can be imported."""
+    file = FileEntry("network", "net.bin", "data/net.bin", None, None, (), (), "packaged_weights")
+    one = ModelEntry("packed", "text-image", "MIT", "a test", "", "", (file,), (), (), extra="weights", on_request=True)
+    monkeypatch.setattr(catalogue, "load_catalogue", lambda: {"packed": one})
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path / "packaged_weights" / "data" / "net.bin"
+
+
+def test_a_model_that_a_package_brings_is_found_without_importing_it(packaged):
+    assert find("packed", []) is None
+    packaged.parent.mkdir(parents=True)
+    (packaged.parents[1] / "__init__.py").write_text("raise RuntimeError('imported')")
+    assert find("packed", []) is None
+    packaged.write_bytes(b"weights")
+    importlib.invalidate_caches()
+    model = find("packed", [])
+    assert model.file("network").path == packaged and model.file("network").digest == catalogue.blake3_of(packaged)
+
+
+def test_a_model_for_those_who_ask_for_it_is_not_found_by_its_kind(packaged):
+    packaged.parent.mkdir(parents=True)
+    packaged.write_bytes(b"weights")
+    importlib.invalidate_caches()
+    assert find("packed", []) is not None and available("text-image", []) == []
+
+
+def test_a_model_that_an_extra_installs_is_not_downloaded(packaged, tmp_path):
+    with pytest.raises(InputError, match=r"pip install 'ss-flow\[weights\]'"):
+        fetch.fetch("packed", tmp_path)
 
 
 def test_unknown_name_is_refused_with_the_names_that_exist():

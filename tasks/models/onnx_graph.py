@@ -1,0 +1,60 @@
+"""ONNX networks that are written down here, from the weights that others publish without one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Float32
+
+_OPSET, _IR_VERSION = 20, 9  # ONNX 1.15, which has GELU; read by ONNX Runtime from 1.17 on
+
+
+class GraphWriter:
+    """A network, operator by operator; tensors are known by their names."""
+
+    def __init__(self, weights: Mapping[str, Float32]) -> None:
+        """weights: arrays by the names under which `weight` finds them."""
+        self.weights = weights
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+
+    def operator(self, kind: str, *inputs: str | np.ndarray, **attributes: Any) -> str:
+        """Add an operator with one output, whose name is returned; an array among its inputs becomes a constant."""
+        from onnx import helper
+
+        name = f"t{len(self._nodes)}"
+        read = [tensor if isinstance(tensor, str) else self._constant(tensor) for tensor in inputs]
+        self._nodes.append(helper.make_node(kind, read, [name], **attributes))
+        return name
+
+    def linear(self, tensor: str, name: str) -> str:
+        """x Wᵀ + b with the weights `name`.weight [out, in] and `name`.bias [out], on the last axis."""
+        product = self.operator("MatMul", tensor, np.ascontiguousarray(self.weights[f"{name}.weight"].T))
+        return self.operator("Add", product, self.weights[f"{name}.bias"])
+
+    def finished(self, entry: str, shape: Sequence[int | str], result: str) -> bytes:
+        """The network as a file's content: one input of this name and shape, one output; both are float32.
+
+        shape: a word stands for a size that varies.
+        """
+        from onnx import TensorProto, helper
+
+        graph = helper.make_graph(
+            self._nodes,
+            "network",
+            [helper.make_tensor_value_info(entry, TensorProto.FLOAT, shape)],
+            [helper.make_tensor_value_info(result, TensorProto.FLOAT, None)],
+            self._constants,
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
+        return bytes(model.SerializeToString())
+
+    def _constant(self, array: np.ndarray) -> str:
+        from onnx import numpy_helper
+
+        name = f"c{len(self._constants)}"
+        self._constants.append(numpy_helper.from_array(array, name))
+        return name
