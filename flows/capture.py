@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 from ss_flow.errors import InputError
 from ss_flow.flows.params import CaptureParams
 from ss_flow.flows.poses import poses, refined_poses
-from ss_flow.graph import INDEX, each
+from ss_flow.graph import INDEX, each, expand, pick
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import (
     Cameras,
@@ -32,6 +33,7 @@ from ss_flow.tasks.capture.colours import colours
 from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.mono import mono
+from ss_flow.tasks.capture.neighbors import Neighbors, neighbors
 from ss_flow.tasks.capture.registration import calibrated, registration
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.sfm import registered
@@ -186,16 +188,7 @@ def _depths(
         )
     if source == "mono" and monodepth is None:
         raise InputError("capture.depth=mono needs a monocular depth network; `ss-flow models list` names some.")
-    swept = each(
-        frames,
-        INDEX,
-        names=names,
-        build=lambda _, index: depth_steps.sweep(frames, cameras, view=index, params=params.sweep),
-    )
-    found, agreed = swept, depth_steps.agree(swept, cameras, params=params.agreement)
-    for _ in range(params.stereo.rounds):
-        found = _refined(frames, cameras, found, agreed, names, params)
-        agreed = depth_steps.agree(found, cameras, params=params.agreement)
+    agreed = _compared(frames, cameras, names, params)
     if source == "mvs" or monodepth is None:
         return agreed
     # What several views agree on gives the network's depth its scale.
@@ -205,20 +198,37 @@ def _depths(
     )
 
 
-def _refined(
-    frames: tuple[Frame, ...],
-    cameras: Cameras,
-    found: tuple[DepthMap, ...],
-    agreed: tuple[DepthMap, ...],
-    names: tuple[str, ...] | None,
-    params: CaptureParams,
+def _compared(
+    frames: tuple[Frame, ...], cameras: Cameras, names: tuple[str, ...] | None, params: CaptureParams
 ) -> tuple[DepthMap, ...]:
-    return each(
-        frames,
-        INDEX,
-        names=names,
-        build=lambda _, index: stereo(frames, cameras, found, agreed, view=index, params=params.stereo),
-    )
+    """The depth that several views agree on. That of each view depends on its neighbours alone."""
+    beside, by_view = neighbors(cameras, params=params.neighbors), views.by_view(cameras)
+
+    def of_each(build: Callable[[int, Neighbors], DepthMap]) -> tuple[DepthMap, ...]:
+        return each(frames, INDEX, names=names, build=lambda _, view: expand(beside, functools.partial(build, view)))
+
+    def swept(view: int, near: Neighbors) -> DepthMap:
+        around = near.around(view)
+        return depth_steps.sweep(
+            pick(frames, around), pick(by_view, around), span=near.span_of(view), params=params.sweep
+        )
+
+    def refined(found: tuple[DepthMap, ...], agreed: tuple[DepthMap, ...], view: int, near: Neighbors) -> DepthMap:
+        around = near.around(view)
+        return stereo(
+            pick(frames, around), pick(by_view, around), found[view], pick(agreed, around), params=params.stereo
+        )
+
+    def confirmed(found: tuple[DepthMap, ...], view: int, near: Neighbors) -> DepthMap:
+        around = near.around(view)
+        return depth_steps.agree(pick(found, around), pick(by_view, around), params=params.agreement)
+
+    found = of_each(swept)
+    agreed = of_each(functools.partial(confirmed, found))
+    for _ in range(params.stereo.rounds):
+        found = of_each(functools.partial(refined, found, agreed))
+        agreed = of_each(functools.partial(confirmed, found))
+    return agreed
 
 
 def _all(reference: Reference, paths: Sequence[Path | None]) -> tuple[Any, ...]:

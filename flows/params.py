@@ -10,6 +10,7 @@ from ss_flow.tasks.capture.colours import ColourParams
 from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
 from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.mono import MonoParams
+from ss_flow.tasks.capture.neighbors import NeighborParams
 from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.refine_poses import RefinePosesParams
 from ss_flow.tasks.capture.registration import RegistrationParams
@@ -56,6 +57,7 @@ class CaptureParams:
     video: VideoParams = field(default_factory=VideoParams)
     sfm: SfmParams = field(default_factory=SfmParams)
     refine: RefinePosesParams = field(default_factory=RefinePosesParams)
+    neighbors: NeighborParams = field(default_factory=NeighborParams)
     sweep: SweepParams = field(default_factory=SweepParams)
     agreement: AgreementParams = field(default_factory=AgreementParams)
     stereo: StereoParams = field(default_factory=StereoParams)

@@ -18,6 +18,9 @@ from ss_flow.tasks.semantics.name import given_names, name
 from ss_flow.tasks.splat.resolve import resolve
 
 LEADS_TO = {
+    "sweep": "depth",
+    "stereo": "depth",
+    "agree": "depth",
     "exclusive": "merge",
     "retrain": "merge",
     "plan": "merge",

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from ss_flow.errors import InputError
-from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame
-from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view
+from ss_flow.tasks.artifacts import DepthMap, Float32, Frame
+from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.geometry.plane_sweep import (
     SweepView,
@@ -71,24 +70,22 @@ class AgreementParams:
 @task(name="capture.sweep")
 def sweep(
     frames: tuple[Frame, ...],
-    cameras: Cameras,
+    cameras: tuple[Camera, ...],
     *,
-    view: int,
+    span: tuple[float, float] | None = None,
     params: SweepParams = SweepParams(),
 ) -> DepthMap:
-    """The depth of one view by plane sweep. Much of it is wrong until `agree` has seen all views' depth.
+    """The depth of a view by plane sweep. Much of it is wrong until `agree` has compared it with its neighbours'.
 
-    The range of depths comes from the sparse points that the view sees or, without them, from a coarse sweep. The
-    depth of a view that no other overlaps is unknown throughout.
+    frames, cameras: of the view, then of its neighbours. span: the nearest and the farthest depth that are tried, world
+    units; None = as a coarse sweep finds them. The depth of a view that no other overlaps is unknown throughout.
     """
-    all_cameras = [camera_of(cameras, k) for k in range(len(cameras))]
-    camera = all_cameras[view]
-    near, far = _depth_range(frames, cameras, all_cameras, view, params)
-    sources = source_views(all_cameras, view, 2 / (1 / near + 1 / far), params.sources)
-    reference = photo_at_size(frames[view], camera, params.max_side)
+    near, far = span or _coarse_span(frames, cameras, params)
+    sources = source_views(cameras, 2 / (1 / near + 1 / far), params.sources)
+    reference = photo_at_size(frames[0], cameras[0], params.max_side)
     if not sources:
-        return DepthMap(frames[view].name, np.zeros_like(reference.gray), "mvs")
-    others = [photo_at_size(frames[k], all_cameras[k], params.max_side) for k in sources]
+        return DepthMap(frames[0].name, np.zeros_like(reference.gray), "mvs")
+    others = [photo_at_size(frames[k], cameras[k], params.max_side) for k in sources]
     planes = inverse_depth_planes(near, far, params.planes)
     cost = matching_cost(reference, others, planes, params.window | 1, params.best)
     smooth = smooth_cost(cost, reference.gray, params.small_step, params.large_step)
@@ -97,45 +94,30 @@ def sweep(
     matched = np.take_along_axis(cost, best[..., None], axis=2)[..., 0] <= params.max_cost
     inner = (best > 0) & (best < params.planes - 1)
     keep = matched & inner & reference.valid
-    return DepthMap(frames[view].name, np.where(keep, depth, 0).astype(np.float32), "mvs")
+    return DepthMap(frames[0].name, np.where(keep, depth, 0).astype(np.float32), "mvs")
 
 
 @task(name="capture.agree")
 def agree(
-    maps: tuple[DepthMap, ...],
-    cameras: Cameras,
-    *,
-    params: AgreementParams = AgreementParams(),
-) -> tuple[DepthMap, ...]:
-    """Swept depth where enough other views found the same, averaged over them; elsewhere unknown.
+    maps: tuple[DepthMap, ...], cameras: tuple[Camera, ...], *, params: AgreementParams = AgreementParams()
+) -> DepthMap:
+    """A view's depth where enough neighbours found the same, averaged over them; elsewhere unknown.
 
-    maps: one a view, in the cameras' order.
-    Raises InputError when nothing remains in any view.
+    maps, cameras: of the view, then of its neighbours.
     """
-    all_cameras = [camera_of(cameras, k) for k in range(len(cameras))]
-    sized = [c.scaled(m.depth.shape[1], m.depth.shape[0]) for m, c in zip(maps, all_cameras, strict=True)]
-    result = []
-    for k, own in enumerate(maps):
-        known = own.depth[own.depth > 0]
-        depth = own.depth
-        if known.size:
-            near = source_views(all_cameras, k, float(np.median(known)), params.neighbors)
-            depth = agreeing_depth(
-                depth,
-                sized[k],
-                [(maps[n].depth, sized[n]) for n in near],
-                params.max_pixels,
-                params.max_relative,
-                min(params.min_views, max(1, len(maps) - 1)),
-            )
-        result.append(DepthMap(own.name, depth, own.source))
-        progress(k + 1, len(maps), own.name)
-    if not any(m.depth.any() for m in result):
-        raise InputError(
-            f"no depth is found in any of the {len(maps)} views by comparing them; photos that overlap by two thirds "
-            "from different places are needed, or depth from a sensor."
-        )
-    return tuple(result)
+    own, *others = ((m.depth, c.scaled(m.depth.shape[1], m.depth.shape[0])) for m, c in zip(maps, cameras, strict=True))
+    known = own[0][own[0] > 0]
+    if not known.size:
+        return maps[0]
+    asked = source_views(cameras, float(np.median(known)), params.neighbors)
+    depth = agreeing_depth(
+        *own,
+        [others[k - 1] for k in asked],
+        params.max_pixels,
+        params.max_relative,
+        min(params.min_views, max(1, len(others))),
+    )
+    return DepthMap(maps[0].name, depth, maps[0].source)
 
 
 def photo_at_size(frame: Frame, camera: Camera, max_side: int) -> SweepView:
@@ -152,28 +134,27 @@ def photo_at_size(frame: Frame, camera: Camera, max_side: int) -> SweepView:
     return SweepView(gray, valid > 0.999, camera.scaled(*size))
 
 
-def source_views(cameras: list[Camera], view: int, depth: float | Float32, count: int) -> list[int]:
-    """The views that tell most of one view's depth, best first; depth: typical, or [h, w] of the view, world units."""
-    others = [k for k in range(len(cameras)) if k != view]
-    return [others[i] for i in best_views(cameras[view], [cameras[k] for k in others], depth, count)]
+def source_views(cameras: Sequence[Camera], depth: float | Float32, count: int) -> list[int]:
+    """Those of the others that tell most of the first view's depth, best first.
+
+    depth: typical of the view, or [h, w], world units. Returns places among the cameras.
+    """
+    return [1 + k for k in best_views(cameras[0], cameras[1:], depth, count)]
 
 
-def _depth_range(
-    frames: tuple[Frame, ...], cameras: Cameras, all_cameras: list[Camera], view: int, params: SweepParams
+def _coarse_span(
+    frames: Sequence[Frame], cameras: Sequence[Camera], params: SweepParams
 ) -> tuple[float, float]:
-    camera = all_cameras[view]
-    *_, seen = pixels_in_view(cameras.sparse_points, camera)
-    if len(seen) >= 50:
-        low, high = np.quantile(seen, (0.01, 0.98))
-        return float(low) * 0.8, float(high) * 1.25
-    guess = typical_depth(all_cameras)
-    sources = source_views(all_cameras, view, guess, params.sources)
+    """The nearest and the farthest depth of the first view, world units, by a coarse sweep."""
+    camera = cameras[0]
+    guess = typical_depth(cameras)
+    sources = source_views(cameras, guess, params.sources)
     if not sources:
         return guess / 4, guess * 4
-    baseline = float(np.median([np.linalg.norm(all_cameras[k].center - camera.center) for k in sources]))
+    baseline = float(np.median([np.linalg.norm(cameras[k].center - camera.center) for k in sources]))
     baseline = max(baseline, 1e-6 * guess)
-    reference = photo_at_size(frames[view], camera, _COARSE_SIDE)
-    others = [photo_at_size(frames[k], all_cameras[k], _COARSE_SIDE) for k in sources]
+    reference = photo_at_size(frames[0], camera, _COARSE_SIDE)
+    others = [photo_at_size(frames[k], cameras[k], _COARSE_SIDE) for k in sources]
     planes = inverse_depth_planes(1.5 * baseline, 60 * baseline, _COARSE_PLANES)
     cost = matching_cost(reference, others, planes, 7, params.best)
     smooth = smooth_cost(cost, reference.gray, params.small_step, params.large_step)

@@ -19,6 +19,10 @@ from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.matches import descriptor_matches
 from ss_flow.tasks.ranges import Count, Natural
 
+_FIRST, _LIKELY = 4, 4
+"""A quarter of the features of the first look, which takes an eighth of the time, tells which photos may be similar:
+four times as many as are wanted. This is all that grows with the square of the photos."""
+
 
 @dataclass(frozen=True)
 class PairParams:
@@ -74,13 +78,22 @@ def partners(photo: Look, others: Sequence[Look], *, place: int, params: PairPar
     near = range(max(0, place - params.overlap), min(count, place + params.overlap))
     if params.matching == "sequential":
         return Partners(np.array(near, np.int32))
-    own = photo.descriptors.astype(np.float32)
     looks = [others[row] for row in range(count)]
-    similar = np.array([len(descriptor_matches(own, other.descriptors.astype(np.float32))) for other in looks])
+    first = _similar(photo, looks, params.look_features // _FIRST)
+    likely = np.sort(np.argsort(-first, kind="stable")[: _LIKELY * params.partners])
+    similar = np.zeros(count, np.int32)
+    similar[likely] = _similar(photo, [looks[row] for row in likely], params.look_features)
     nearest = np.argsort(-similar, kind="stable")[: params.partners]
     beside = [row for row in near if in_series(looks[row].name, photo.name)]
     chosen = {*nearest[similar[nearest] >= params.min_similar].tolist(), *beside}
     return Partners(np.array(sorted(chosen or nearest.tolist()), np.int32))
+
+
+def _similar(photo: Look, others: Sequence[Look], count: int) -> Int32:
+    """[len(others)] how many of the first `count` features of a photo match those of each other one."""
+    own = photo.descriptors[:count].astype(np.float32)
+    found = [len(descriptor_matches(own, other.descriptors[:count].astype(np.float32))) for other in others]
+    return np.array(found, np.int32)
 
 
 def in_series(a: str, b: str) -> bool:

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame
+from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Frame
 from ss_flow.tasks.capture.depth import photo_at_size, source_views
 from ss_flow.tasks.capture.patchmatch import PatchMatchParams, Source, patchmatch, stereo_identity
-from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view
 from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.ranges import Count, Fraction, Natural
 
@@ -30,8 +30,6 @@ class StereoParams:
     """Longer side of the depth map, in pixels; on blurred photos larger maps know less."""
     sources: Count = 8
     """Other photos that each photo is compared with."""
-    lenders: Count = 24
-    """Other views whose depth is carried into each view."""
     max_cost: Fraction = 0.45
     """Pixels that match worse are unknown; 0.45 is a correlation of 0.1."""
     patchmatch: PatchMatchParams = field(default_factory=PatchMatchParams)
@@ -40,29 +38,28 @@ class StereoParams:
 @task(name="capture.stereo", environment=stereo_identity)
 def stereo(
     frames: tuple[Frame, ...],
-    cameras: Cameras,
-    found: tuple[DepthMap, ...],
+    cameras: tuple[Camera, ...],
+    found: DepthMap,
     agreed: tuple[DepthMap, ...],
     *,
-    view: int,
     params: StereoParams = StereoParams(),
 ) -> DepthMap:
-    """The depth of one view by PatchMatch, from what the views found so far; `agree` must see it again.
+    """The depth of a view by PatchMatch, from what it and its neighbours found so far; `agree` must see it again.
 
-    found: each view's depth by itself; agreed: what of it other views confirm; one map a view each, in the cameras'
-        order. Where a view has agreed depth, it starts from that, or else from other views' depth, or else its own.
+    frames, cameras: of the view, then of its neighbours. found: the view's depth by itself; agreed: what other views
+        confirm, of the view and its neighbours. Where the view has agreed depth, it starts from that, or else from its
+        neighbours', or else from its own.
     Depth stays unknown throughout where the view has none yet.
     """
-    all_cameras = [camera_of(cameras, k) for k in range(len(cameras))]
-    reference = photo_at_size(frames[view], all_cameras[view], params.max_side)
-    guess = _at_size(agreed[view].depth, reference.gray)
-    if not found[view].depth.any():
-        return DepthMap(frames[view].name, np.zeros_like(reference.gray), "mvs")
-    typical = float(np.median(found[view].depth[found[view].depth > 0]))
-    lenders = source_views(all_cameras, view, typical, params.lenders)
+    reference = photo_at_size(frames[0], cameras[0], params.max_side)
+    guess = _at_size(agreed[0].depth, reference.gray)
+    if not found.depth.any():
+        return DepthMap(frames[0].name, np.zeros_like(reference.gray), "mvs")
+    typical = float(np.median(found.depth[found.depth > 0]))
+    lent = zip(agreed[1:], cameras[1:], strict=True)
     for other in (
-        carried([(agreed[k].depth, all_cameras[k]) for k in lenders], reference.camera),
-        _at_size(found[view].depth, reference.gray),
+        carried([(lender.depth, camera) for lender, camera in lent], reference.camera),
+        _at_size(found.depth, reference.gray),
         np.full_like(guess, typical),
     ):
         guess = np.where(guess > 0, guess, other)
@@ -70,14 +67,14 @@ def stereo(
     guess = np.clip(guess, 0.8 * near, 1.25 * far)
     sources = [
         Source(other, _at_size(agreed[k].depth, other.gray))
-        for k in source_views(all_cameras, view, guess, params.sources)
-        for other in (photo_at_size(frames[k], all_cameras[k], params.max_side),)
+        for k in source_views(cameras, guess, params.sources)
+        for other in (photo_at_size(frames[k], cameras[k], params.max_side),)
     ]
     if not sources:
-        return DepthMap(frames[view].name, np.zeros_like(reference.gray), "mvs")
-    depth, cost = patchmatch(reference, sources, guess, view, params.patchmatch)
+        return DepthMap(frames[0].name, np.zeros_like(reference.gray), "mvs")
+    depth, cost = patchmatch(reference, sources, guess, 0, params.patchmatch)
     keep = (cost <= params.max_cost) & reference.valid
-    return DepthMap(frames[view].name, np.where(keep, depth, 0).astype(np.float32), "mvs")
+    return DepthMap(frames[0].name, np.where(keep, depth, 0).astype(np.float32), "mvs")
 
 
 def carried(maps: list[tuple[Float32, Camera]], camera: Camera) -> Float32:

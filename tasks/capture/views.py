@@ -22,8 +22,13 @@ def unit(cameras: Cameras, depths: tuple[DepthMap, ...]) -> SceneUnit:
     """The length that plays the part of one metre: 1.0 where the scale is known (spec 3.0).
 
     Otherwise half the median, over the views, of the median known depth; where none is known, of the depth of the
-    sparse points. Raises InputError when there are none either.
+    sparse points. Raises InputError when there are none either, or when views were compared without any result.
     """
+    if all(depth.source == "mvs" and not depth.depth.any() for depth in depths):
+        raise InputError(
+            f"no depth is found in any of the {len(depths)} views by comparing them; photos that overlap by two thirds "
+            "from different places are needed, or depth from a sensor."
+        )
     if not any(depth.depth.any() for depth in depths):
         depths = with_sparse_points(cameras, depths)
     medians = [float(np.median(d.depth[d.depth > 0])) for d in depths if (d.depth > 0).any()]

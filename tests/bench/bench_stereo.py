@@ -1,6 +1,7 @@
 """How much depth several views give without a sensor, how right it is, and what it costs.
 
-    python tests/bench/bench_stereo.py CAPTURE [--rounds 1] [--stride 1] [--max-side 320] [--pictures FOLDER]
+    python tests/bench/bench_stereo.py CAPTURE [--rounds 1] [--stride 1] [--neighbors 12] [--max-side 320]
+                                       [--pictures FOLDER]
     python tests/bench/bench_stereo.py --room 0 [--views 24]
 
 CAPTURE is a posed capture; where it has a sensor's depth, that is the truth, else only what is known is told. A room is
@@ -27,8 +28,10 @@ from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame
 from ss_flow.tasks.capture import ingest, sensor_depth
 from ss_flow.tasks.capture.depth import agree, sweep
+from ss_flow.tasks.capture.neighbors import NeighborParams, neighbors
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.stereo import StereoParams, stereo
+from ss_flow.tasks.geometry.cameras import cameras_by_view
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 
 T = TypeVar("T")
@@ -83,9 +86,8 @@ def tell(step: str, maps: Sequence[DepthMap], truth: Sequence[Float32], seconds:
     print(f"{line}; {seconds / len(maps):.2f} CPU s a view", flush=True)
 
 
-def timed(work: Callable[[], T]) -> tuple[T, float]:
-    begun = time.process_time()
-    return work(), time.process_time() - begun
+def some(items: Sequence[T], places: list[int]) -> tuple[T, ...]:
+    return tuple(items[k] for k in places)
 
 
 def picture(frame: Frame, maps: Sequence[Float32]) -> np.ndarray:
@@ -107,30 +109,41 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=24, help="of the room")
     parser.add_argument("--stride", type=int, default=1, help="every n-th view of the capture")
     parser.add_argument("--rounds", type=int, default=StereoParams().rounds)
+    parser.add_argument("--neighbors", type=int, default=NeighborParams().count)
     parser.add_argument("--max-side", type=int, default=StereoParams().max_side)
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     cv2.setNumThreads(1)
+    params = replace(StereoParams(), max_side=options.max_side)
     frames, cameras, truth = (
         captured(options.capture, options.stride) if options.capture else generated(options.room, options.views)
     )
-    views = range(len(frames))
-    found, seconds = timed(lambda: tuple(sweep(frames, cameras, view=k) for k in views))
-    tell("swept", found, truth, seconds)
-    agreed, seconds = timed(lambda: agree(found, cameras))
-    tell("swept, agreed", agreed, truth, seconds)
-    swept, params = agreed, replace(StereoParams(), max_side=options.max_side)
+    near, by_view = neighbors(cameras, params=NeighborParams(options.neighbors)), cameras_by_view(cameras)
+
+    def of_each(step: str, work: Callable[[int, list[int]], DepthMap]) -> tuple[DepthMap, ...]:
+        """A step of all views; `work` is told a view, and it with its neighbours."""
+        begun = time.process_time()
+        maps = tuple(work(k, near.around(k)) for k in range(len(frames)))
+        tell(step, maps, truth, time.process_time() - begun)
+        return maps
+
+    def agreement(step: str, maps: tuple[DepthMap, ...]) -> tuple[DepthMap, ...]:
+        return of_each(f"{step}, agreed", lambda _, around: agree(some(maps, around), some(by_view, around)))
+
+    found = of_each("swept", lambda k, around: sweep(some(frames, around), some(by_view, around), span=near.span_of(k)))
+    swept = agreed = agreement("swept", found)
     for number in range(options.rounds):
-        before = (found, agreed)
-        found, seconds = timed(
-            lambda b=before: tuple(stereo(frames, cameras, *b, view=k, params=params) for k in views)
+        before, confirmed, step = found, agreed, f"round {number + 1}"
+        found = of_each(
+            step,
+            lambda k, around, before=before, confirmed=confirmed: stereo(
+                some(frames, around), some(by_view, around), before[k], some(confirmed, around), params=params
+            ),
         )
-        tell(f"round {number + 1}", found, truth, seconds)
-        agreed, seconds = timed(lambda f=found: agree(f, cameras))
-        tell(f"round {number + 1}, agreed", agreed, truth, seconds)
+        agreed = agreement(step, found)
     if options.pictures:
         options.pictures.mkdir(parents=True, exist_ok=True)
-        for k in views[:: max(1, len(views) // 10)]:
+        for k in range(0, len(frames), max(1, len(frames) // 10)):
             maps = [*([truth[k]] if truth else []), swept[k].depth, agreed[k].depth]
             cv2.imwrite(str(options.pictures / f"{frames[k].name}.png"), picture(frames[k], maps))
 

@@ -16,6 +16,7 @@ import pytest
 from tiny_runs import SHORT, bytes_of, run_tiny, ss_flow, start_tiny, write_room
 
 from ss_flow import closure
+from ss_flow.flows.generated import RoomParams
 from ss_flow.flows.results import read_run
 
 BEFORE_PROPAGATE = {
@@ -262,3 +263,20 @@ def write_depth_uncompressed(file: Path, values: np.ndarray) -> None:
     import cv2
 
     file.write_bytes(cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 0])[1].tobytes())
+
+
+def test_a_photo_more_leaves_the_depth_of_views_that_are_no_neighbours_of_its_own(tmp_path):
+    views = RoomParams(objects=2, views=12, width=48, height=36, held_out=0)
+    scene = write_room(tmp_path / "room", masks=None, params=views)
+    later = {file: file.read_bytes() for file in scene.rglob("0006.*")}
+    for file in later:
+        file.unlink()
+    options = ["--cache", tmp_path / "store", "--until", "depth", "--json", "--set", "capture.depth=mvs"]
+    options += ["--set", "capture.neighbors.count=2", "--set", "capture.sweep.planes=8"]
+    assert ss_flow("run", scene, *options).code == 0
+    for file, content in later.items():
+        file.write_bytes(content)
+    computed = ss_flow("run", scene, *options).computed()
+    # Its own, and those of the views that have it among their two neighbours; then the neighbours of these.
+    assert computed["capture.sweep"] <= 5
+    assert computed["capture.sweep"] < computed["capture.stereo"] <= 9

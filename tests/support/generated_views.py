@@ -54,6 +54,11 @@ def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([level, level * 0.8, 255 - level], axis=-1).astype(np.uint8), depth
 
 
+def around(items, view):
+    """One view's of some items, then the others': as the steps take them that compare a view with its neighbours."""
+    return (items[view], *(item for k, item in enumerate(items) if k != view))
+
+
 def views(eyes, width=160, height=120, focal=150.0, target=(0.0, 0.0, 3.5)):
     """Frames, cameras and the true depth maps of the scene, seen from some places."""
     cameras = [

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from generated_views import views
+from generated_views import around, views
 from patchmatch_reference import Reference
 
 from ss_flow.tasks.artifacts import DepthMap
@@ -10,7 +10,7 @@ from ss_flow.tasks.capture.depth import SweepParams, agree, photo_at_size, sweep
 from ss_flow.tasks.capture.patchmatch import PatchMatchParams, Source, improved, patchmatch, stereo_identity
 from ss_flow.tasks.capture.stereo import StereoParams, carried, stereo
 from ss_flow.tasks.gaussians import library
-from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.cameras import camera_of, cameras_by_view
 from ss_flow.tasks.geometry.images import encode_png
 
 EYES = [(0, 0, 0), (0.35, 0, 0), (-0.35, 0.1, 0), (0, 0.35, 0), (0.1, -0.35, 0.1)]
@@ -23,13 +23,25 @@ def scene():
 
 @pytest.fixture(scope="module")
 def swept(scene):
-    frames, cameras, _ = scene
-    return tuple(sweep(frames, cameras, view=k, params=SweepParams(planes=48)) for k in range(len(EYES)))
+    frames, cameras = scene[0], cameras_by_view(scene[1])
+    params = SweepParams(planes=48)
+    return tuple(sweep(around(frames, k), around(cameras, k), params=params) for k in range(len(EYES)))
 
 
 @pytest.fixture(scope="module")
 def agreed(scene, swept):
-    return agree(swept, scene[1])
+    return agreed_views(scene, swept)
+
+
+def agreed_views(scene, maps):
+    cameras = cameras_by_view(scene[1])
+    return tuple(agree(around(maps, k), around(cameras, k)) for k in range(len(maps)))
+
+
+def refined(scene, swept, agreed, view, params=StereoParams()):
+    """The view's depth by `stereo`, all others being its neighbours."""
+    frames, cameras = around(scene[0], view), around(cameras_by_view(scene[1]), view)
+    return stereo(frames, cameras, swept[view], around(agreed, view), params=params)
 
 
 @pytest.fixture(scope="module")
@@ -93,9 +105,8 @@ def test_planes_come_to_the_truth_from_a_guess_that_is_off_by_several_percent(sc
 
 
 def test_more_pixels_are_right_after_refinement_than_after_the_sweep(scene, swept, agreed):
-    frames, cameras, depth = scene
-    found = tuple(stereo(frames, cameras, swept, agreed, view=k) for k in range(len(EYES)))
-    again = agree(found, cameras)
+    depth = scene[2]
+    again = agreed_views(scene, [refined(scene, swept, agreed, k) for k in range(len(EYES))])
     for k, (before, after) in enumerate(zip(agreed, again, strict=True)):
         errors = [np.where(m.depth > 0, np.abs(m.depth / depth[k] - 1), np.inf) for m in (before, after)]
         assert np.mean(errors[1] < 0.005) > np.mean(errors[0] < 0.005)
@@ -104,18 +115,18 @@ def test_more_pixels_are_right_after_refinement_than_after_the_sweep(scene, swep
 
 
 def test_a_view_without_depth_of_its_own_gets_it_from_the_others(scene, swept, agreed):
-    frames, cameras, depth = scene
+    depth = scene[2]
     wrong = replace(swept[0], depth=np.full_like(swept[0].depth, 9.0))
     nothing = replace(agreed[0], depth=np.zeros_like(agreed[0].depth))
-    found = stereo(frames, cameras, (wrong, *swept[1:]), (nothing, *agreed[1:]), view=0)
+    found = refined(scene, (wrong, *swept[1:]), (nothing, *agreed[1:]), 0)
     error = np.abs(found.depth / depth[0] - 1)[found.depth > 0]
     assert (found.depth > 0).mean() > 0.8
     assert np.mean(error < 0.01) > 0.8
 
 
 def test_the_result_is_of_the_size_asked_for_and_twice_the_same(scene, swept, agreed):
-    frames, cameras, depth = scene
-    first, second = (stereo(frames, cameras, swept, agreed, view=1, params=StereoParams(max_side=80)) for _ in "ab")
+    depth = scene[2]
+    first, second = (refined(scene, swept, agreed, 1, StereoParams(max_side=80)) for _ in "ab")
     assert first.depth.shape == (60, 80)
     np.testing.assert_array_equal(first.depth, second.depth)
     true = depth[1][1::2, 1::2]
@@ -127,7 +138,7 @@ def test_ignored_pixels_have_no_depth_and_do_not_harm_others(scene, swept, agree
     keep = np.ones((120, 160), np.uint8)
     keep[:, :40] = 0
     masked = tuple(replace(f, valid=encode_png(keep * 255)) for f in frames)
-    found = stereo(masked, cameras, swept, agreed, view=0).depth
+    found = refined((masked, cameras, depth), swept, agreed, 0).depth
     assert not found[:, :40].any()
     known = found > 0
     assert known.mean() > 0.6
@@ -138,9 +149,9 @@ def test_a_view_that_no_other_overlaps_or_that_has_nothing_to_start_from_has_no_
     frames, cameras, _ = scene
     away = cameras.world_to_camera.copy()
     away[1:, :3, 3] += (0, 0, -1000)
-    alone = stereo(frames, replace(cameras, world_to_camera=away), swept, agreed, view=0)
+    alone = refined((frames, replace(cameras, world_to_camera=away), None), swept, agreed, 0)
     none = tuple(DepthMap(m.name, np.zeros_like(m.depth), "mvs") for m in swept)
-    blank = stereo(frames, cameras, none, none, view=0)
+    blank = refined(scene, none, none, 0)
     for found in (alone, blank):
         assert found.depth.shape == (120, 160) and not found.depth.any()
 

@@ -1,0 +1,80 @@
+"""Which views the depth of each view is found from, so that it depends on no others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.task import task
+from ss_flow.tasks.artifacts import Cameras, Float64, Int32, ViewLists
+from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view
+from ss_flow.tasks.geometry.plane_sweep import typical_depth, view_scores
+from ss_flow.tasks.ranges import Count
+
+_NEARER_AND_FARTHER = (0.5, 0.7, 1.0, 1.4, 2.0)
+"""The scene may lie at these multiples of the depth that the cameras suggest."""
+_LEAST_POINTS = 50
+
+
+@dataclass(frozen=True)
+class NeighborParams:
+    """Which views are compared at all."""
+
+    count: Count = 12
+    """Other views that the depth of one view may come from; those that overlap it best. A photo that is added changes
+    the depth of its neighbours, and of theirs."""
+
+
+@dataclass(frozen=True)
+class Neighbors(ViewLists):
+    """Each view's neighbours, and the depths between which it is swept."""
+
+    first: Int32
+    """[K + 1] where the neighbours of each view begin in `view`."""
+    view: Int32
+    """[A] places of views in the scene's order, ascending for each view."""
+    span: Float64
+    """[K, 2] the nearest and the farthest depth, world units; NaN where it must be found by a sweep."""
+
+    def around(self, view: int) -> list[int]:
+        """A view, and then its neighbours."""
+        return [view, *self.views(view)]
+
+    def span_of(self, view: int) -> tuple[float, float] | None:
+        near, far = (float(depth) for depth in self.span[view])
+        return None if np.isnan(near) else (near, far)
+
+
+@task(name="capture.neighbors")
+def neighbors(cameras: Cameras, *, params: NeighborParams = NeighborParams()) -> Neighbors:
+    """The views that overlap each view best, and the depths of the sparse points that it sees, widened by a fifth.
+
+    Where hardly any are seen, the cameras alone tell how far the scene is.
+    """
+    by_view = cameras_by_view(cameras)
+    guess = typical_depth(by_view)
+    spans = [_span(cameras, camera) for camera in by_view]
+    chosen = [
+        _best(by_view, view, guess if span is None else float(np.sqrt(span[0] * span[1])), params.count)
+        for view, span in enumerate(spans)
+    ]
+    known = np.array([(np.nan, np.nan) if span is None else span for span in spans], np.float64)
+    return Neighbors(span=known.reshape(-1, 2), **Neighbors.arrays(chosen))
+
+
+def _best(cameras: tuple[Camera, ...], view: int, depth: float, count: int) -> list[int]:
+    """The neighbours of one view, ascending; `depth`: about how far the scene is, world units."""
+    others = [k for k in range(len(cameras)) if k != view]
+    scores = sum(
+        view_scores(cameras[view], [cameras[k] for k in others], factor * depth) for factor in _NEARER_AND_FARTHER
+    )
+    return sorted(others[i] for i in np.argsort(-scores, kind="stable")[:count])
+
+
+def _span(cameras: Cameras, camera: Camera) -> tuple[float, float] | None:
+    *_, seen = pixels_in_view(cameras.sparse_points, camera)
+    if len(seen) < _LEAST_POINTS:
+        return None
+    low, high = np.quantile(seen, (0.01, 0.98))
+    return float(low) * 0.8, float(high) * 1.25
