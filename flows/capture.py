@@ -53,6 +53,8 @@ class Capture:
     by_view: tuple[Camera, ...]
     """The cameras one by one."""
     depths: tuple[DepthMap, ...]
+    presumed: tuple[DepthMap, ...]
+    """The same; where views were compared, with what one view alone found. Split finds and sees points by it."""
     unit: SceneUnit
     masks: tuple[MaskSet, ...] | None
     """Where the capture brought its own masks."""
@@ -109,12 +111,13 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     source = params.depth
     if source == "auto":
         source = "sensor" if scene.depths is not None or scene.kind == "sens" else "mvs"
-    depths, placing = _depths(source, scene, reference, params, monodepth, frames, cameras), None
+    depths, presumed = _depths(source, scene, reference, params, monodepth, frames, cameras)
+    placing = None
     if source == "sensor":
         calibrates = params.calibrate == "depth"
         placing = registration(frames, cameras, depths, advise=not calibrates, params=params.registration)
         if calibrates:
-            depths = calibrated(frames, cameras, depths, placing)
+            depths = presumed = calibrated(frames, cameras, depths, placing)
     elif params.calibrate == "depth":
         raise InputError(
             f"{scene.root} is to be run with depth that no sensor measured (capture.depth={source}), and only a "
@@ -127,7 +130,8 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         evened = colours(frames, cameras, depths, length, params=params.colours)
     fitting = checks(frames, cameras, depths, params=params.checks)
     return Capture(
-        frames, cameras, by_view, depths, length, masks, truth, names, pointed, objects, placing, evened, fitting
+        frames, cameras, by_view, depths, presumed, length, masks, truth, names, pointed, objects, placing, evened,
+        fitting,
     )
 
 
@@ -167,41 +171,48 @@ def _depths(
     monodepth: Model | None,
     frames: tuple[Frame, ...],
     cameras: Cameras,
-) -> tuple[DepthMap, ...]:
-    """The sensor's depth, what several views show together ("mvs"), or a network's ("mono")."""
+) -> tuple[tuple[DepthMap, ...], tuple[DepthMap, ...]]:
+    """The sensor's depth, what several views show together ("mvs"), or a network's ("mono"); and what is presumed."""
     names = _known_names(scene)
     if source == "sensor":
-        if scene.kind == "sens" and scene.recording is not None:
-            return recordings.sens_depth(
-                frames, recording=reference(scene.recording), names=scene.names, entries=scene.entries
-            )
-        if scene.depths is None:
-            raise InputError(f"{scene.root} has no depth files; set capture.depth to mvs or mono.")
-        return sensor_depth.depth(
-            frames,
-            names=scene.names,
-            files=_all(reference, scene.depths),
-            scale=scene.depth_scale,
-            metric=scene.metric,
-            lenses=scene.lenses,
-            depth_lens=scene.depth_lens,
-        )
+        measured = _measured(scene, reference, frames)
+        return measured, measured
     if source == "mono" and monodepth is None:
         raise InputError("capture.depth=mono needs a monocular depth network; `ss-flow models list` names some.")
-    agreed = _compared(frames, cameras, names, params)
+    agreed, presumed = _compared(frames, cameras, names, params)
     if source == "mvs" or monodepth is None:
-        return agreed
+        return agreed, presumed
     # What several views agree on gives the network's depth its scale.
     network = monodepth.file("network")
-    return each(
+    predicted = each(
         frames, names=names, build=lambda frame: mono(frame, cameras, agreed, model=network, params=params.mono)
+    )
+    return predicted, predicted
+
+
+def _measured(scene: SceneFiles, reference: Reference, frames: tuple[Frame, ...]) -> tuple[DepthMap, ...]:
+    """The sensor's depth. Raises InputError when there is none."""
+    if scene.kind == "sens" and scene.recording is not None:
+        return recordings.sens_depth(
+            frames, recording=reference(scene.recording), names=scene.names, entries=scene.entries
+        )
+    if scene.depths is None:
+        raise InputError(f"{scene.root} has no depth files; set capture.depth to mvs or mono.")
+    return sensor_depth.depth(
+        frames,
+        names=scene.names,
+        files=_all(reference, scene.depths),
+        scale=scene.depth_scale,
+        metric=scene.metric,
+        lenses=scene.lenses,
+        depth_lens=scene.depth_lens,
     )
 
 
 def _compared(
     frames: tuple[Frame, ...], cameras: Cameras, names: tuple[str, ...] | None, params: CaptureParams
-) -> tuple[DepthMap, ...]:
-    """The depth that several views agree on. That of each view depends on its neighbours alone."""
+) -> tuple[tuple[DepthMap, ...], tuple[DepthMap, ...]]:
+    """The depth that several views agree on, and what is presumed; each view's depends on its neighbours alone."""
     beside, by_view = neighbors(cameras, params=params.neighbors), views.by_view(cameras)
 
     def of_each(build: Callable[[int, Neighbors], DepthMap]) -> tuple[DepthMap, ...]:
@@ -228,7 +239,9 @@ def _compared(
     for _ in range(params.stereo.rounds):
         found = of_each(functools.partial(refined, found, agreed))
         agreed = of_each(functools.partial(confirmed, found))
-    return agreed
+    if not params.presume:
+        return agreed, agreed
+    return agreed, each(agreed, found, names=names, build=depth_steps.presume)
 
 
 def _all(reference: Reference, paths: Sequence[Path | None]) -> tuple[Any, ...]:

@@ -76,18 +76,20 @@ class Split:
 
 def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     """Photos and depth -> view-consistent instances (Split&Splat, Sec. 3.1)."""
-    views = (capture.frames, capture.cameras, capture.depths)
+    views = (capture.frames, capture.cameras)
     if params.dense_source == "splatting":
-        points = dense_splatting(*views, capture.unit, capture.colours, params=params.dense, splatting=params.splatting)
+        points = dense_splatting(
+            *views, capture.depths, capture.unit, capture.colours, params=params.dense, splatting=params.splatting
+        )
     else:
-        points = dense(*views, capture.unit, params=params.dense)
+        points = dense(*views, capture.presumed, capture.unit, params=params.dense)
     segmenter = networks.segmenter
     embeddings: tuple[Embedding, ...] = ()
     if segmenter is not None:
         embeddings = each(capture.frames, names=capture.names, build=lambda frame: embed(frame, model=segmenter))
     seen = each(
         capture.by_view,
-        capture.depths,
+        capture.presumed,
         names=capture.names,
         build=lambda camera, depth: visibility(points, camera, depth, params=params.visibility),
     )

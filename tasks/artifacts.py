@@ -75,7 +75,7 @@ class DepthMap:
     depth: Float32
     """[h, w] z-depth in world units, 0 where unknown."""
     source: str
-    """Where it came from: "sensor", "mvs" or "mono"."""
+    """Where it came from: "sensor", "mvs", "mono", or "presumed": "mvs" with what one view alone found."""
 
 
 @dataclass(frozen=True)

@@ -120,6 +120,17 @@ def agree(
     return DepthMap(maps[0].name, depth, maps[0].source)
 
 
+@task(name="capture.presume")
+def presume(agreed: DepthMap, found: DepthMap) -> DepthMap:
+    """A view's agreed depth and, where no other view confirms any, its own, of which half is wrong.
+
+    Good enough to look for points, of which two views must confirm each, and to tell which of them a view sees; it
+    proves nothing against a mask, and nothing is trained on it. Its `source` is "presumed".
+    """
+    depth = np.where(agreed.depth > 0, agreed.depth, found.depth)
+    return DepthMap(agreed.name, depth.astype(np.float32), "presumed")
+
+
 def photo_at_size(frame: Frame, camera: Camera, max_side: int) -> SweepView:
     """The gray photo of a view, scaled down to a longer side of `max_side` pixels, with its camera."""
     import cv2
@@ -142,9 +153,7 @@ def source_views(cameras: Sequence[Camera], depth: float | Float32, count: int) 
     return [1 + k for k in best_views(cameras[0], cameras[1:], depth, count)]
 
 
-def _coarse_span(
-    frames: Sequence[Frame], cameras: Sequence[Camera], params: SweepParams
-) -> tuple[float, float]:
+def _coarse_span(frames: Sequence[Frame], cameras: Sequence[Camera], params: SweepParams) -> tuple[float, float]:
     """The nearest and the farthest depth of the first view, world units, by a coarse sweep."""
     camera = cameras[0]
     guess = typical_depth(cameras)

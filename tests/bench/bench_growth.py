@@ -3,10 +3,9 @@
     python tests/bench/bench_growth.py [--photos 50 100 200 400] [--width 200]
 
 A walk along a wall with boxes before it, 5 cm a photo, taken in random order under random names, so that no name helps
-to choose pairs. The photos are added one by one, as the steps see them, without the engine; mapping is done anew at each
-of the numbers. Printed for each: pairs that are matched; CPU seconds so far of features, of choosing pairs and of
-matching, and those of mapping; the peak of memory so far; how many photos found their pose, and how far these lie from
-their true places, median and largest, in metres.
+to choose pairs. The photos are added one by one, without the engine; mapping is done anew at each number. Printed:
+pairs that are matched; CPU seconds so far of features, of choosing pairs and of matching, and those of mapping; the
+peak of memory so far; how many photos found their pose, and how far these lie from their true places, in metres.
 """
 
 from __future__ import annotations
@@ -69,7 +68,9 @@ def photo(name: str, camera: Camera) -> Frame:
         nearest, gray = np.where(shown, distance, nearest), np.where(shown, texture(x, y, salt), gray)
     level = np.clip(128 + 50 * gray, 0, 255)
     image = np.stack([level, level * 0.8, 255 - level], axis=-1).astype(np.uint8)
-    return Frame(name, camera.width, camera.height, encode_png(image), np.zeros(0, np.uint8), camera.width, camera.height)
+    return Frame(
+        name, camera.width, camera.height, encode_png(image), np.zeros(0, np.uint8), camera.width, camera.height
+    )
 
 
 def walk(row: int, width: int, random: np.random.Generator) -> Camera:
@@ -114,7 +115,8 @@ def main() -> None:
         found.append(timed("features", lambda frame=frame: features(frame)))
         looks.append(look(found[row], count=params.look_features))
         chosen = timed("choice", lambda: partners(looks[-1], looks[:-1], place=len(looks) - 1, params=params)).row
-        matches.append(timed("matching", lambda: match(found[-1], [found[k] for k in chosen])))
+        others = [found[k] for k in chosen]
+        matches.append(timed("matching", lambda others=others: match(found[-1], others)))
         pairs += len(chosen)
         if row + 1 in options.photos:
             seconds["mapping"] = 0

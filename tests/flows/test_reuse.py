@@ -280,3 +280,14 @@ def test_a_photo_more_leaves_the_depth_of_views_that_are_no_neighbours_of_its_ow
     # Its own, and those of the views that have it among their two neighbours; then the neighbours of these.
     assert computed["capture.sweep"] <= 5
     assert computed["capture.sweep"] < computed["capture.stereo"] <= 9
+
+
+def test_presumed_depth_changes_what_split_does_and_not_the_depth_itself(tmp_path):
+    scene = write_room(tmp_path / "room", params=RoomParams(objects=2, views=22, width=64, height=48, held_out=0))
+    options = ["--cache", tmp_path / "store", "--until", "visibility", "--json", "--set", "capture.depth=mvs"]
+    options += ["--set", "capture.sweep.planes=24"]
+    first = ss_flow("run", scene, *options)
+    assert first.code == 0, first.err
+    without = ss_flow("run", scene, *options, "--set", "capture.presume=false")
+    assert first.computed()["capture.presume"] == 22
+    assert without.computed() == {"split.dense": 1, "split.visibility": 22}
