@@ -21,7 +21,7 @@ _LEAST_POINTS = 50
 class NeighborParams:
     """Which views are compared at all."""
 
-    count: Count = 12
+    count: Count = 8
     """Other views that the depth of one view may come from; those that overlap it best. A photo that is added changes
     the depth of its neighbours, and of theirs."""
 

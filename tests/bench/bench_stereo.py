@@ -1,6 +1,6 @@
 """How much depth several views give without a sensor, how right it is, and what it costs.
 
-    python tests/bench/bench_stereo.py CAPTURE [--rounds 1] [--stride 1] [--neighbors 12] [--max-side 320]
+    python tests/bench/bench_stereo.py CAPTURE [--rounds 1] [--stride 1] [--neighbors 8] [--max-side 320]
                                        [--pictures FOLDER]
     python tests/bench/bench_stereo.py --room 0 [--views 24]
 
