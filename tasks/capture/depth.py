@@ -122,10 +122,10 @@ def agree(
 
 @task(name="capture.presume")
 def presume(agreed: DepthMap, found: DepthMap) -> DepthMap:
-    """A view's agreed depth and, where no other view confirms any, its own, of which half is wrong.
+    """A view's agreed depth and, where no other view confirms any, its own, much of which is wrong.
 
-    Good enough to look for points, of which two views must confirm each, and to tell which of them a view sees; it
-    proves nothing against a mask, and nothing is trained on it. Its `source` is "presumed".
+    Good enough to look for points, since `split.dense` drops those that other views contradict, and to tell which of
+    them a view sees; it proves nothing against a mask, and nothing is trained on it. Its `source` is "presumed".
     """
     depth = np.where(agreed.depth > 0, agreed.depth, found.depth)
     return DepthMap(agreed.name, depth.astype(np.float32), "presumed")

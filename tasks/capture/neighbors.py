@@ -48,7 +48,7 @@ class Neighbors(ViewLists):
 
 @task(name="capture.neighbors")
 def neighbors(cameras: Cameras, *, params: NeighborParams = NeighborParams()) -> Neighbors:
-    """The views that overlap each view best, and the depths of the sparse points that it sees, widened by a fifth.
+    """The views that overlap each view best, and the depths of the sparse points that it sees, with some more on either side.
 
     Where hardly any are seen, the cameras alone tell how far the scene is.
     """
