@@ -22,8 +22,8 @@ class NeighborParams:
     """Which views are compared at all."""
 
     count: Count = 8
-    """Other views that the depth of one view may come from; those that overlap it best. A photo that is added changes
-    the depth of its neighbours, and of theirs."""
+    """Other views that the depth of one view may come from; those that overlap it best. What a photo
+    more changes ends a few neighbours away."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Neighbors(ViewLists):
 
 @task(name="capture.neighbors")
 def neighbors(cameras: Cameras, *, params: NeighborParams = NeighborParams()) -> Neighbors:
-    """The views that overlap each view best, and the depths of the sparse points that it sees, with some more on either side.
+    """The views that overlap each view best, and the span of the sparse points that it sees, made somewhat wider.
 
     Where hardly any are seen, the cameras alone tell how far the scene is.
     """
