@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from ss_flow.tasks.capture.matches import descriptor_matches
 from ss_flow.tasks.capture.pairs import Look, PairParams, in_series, partners
 
 
@@ -28,6 +29,18 @@ def test_the_photos_that_show_the_same_are_partners():
     photos = looks(NAMES, [0, 1000, 50, 2000, 30, 1050, 2020, 60])
     assert chosen(photos, exhaustive_limit=0) == [0, 2, 4]
     assert chosen(photos, exhaustive_limit=0, partners=1) == [2]
+
+
+def test_of_many_photos_the_first_features_leave_few_to_look_at_in_full(monkeypatch):
+    compared = []
+    monkeypatch.setattr(
+        "ss_flow.tasks.capture.pairs.descriptor_matches",
+        lambda a, b: compared.append(len(a)) or descriptor_matches(a, b),
+    )
+    places = np.random.default_rng(1).permutation(40) * 90
+    photos = looks([f"{chr(97 + i // 10)}{chr(97 + i % 10)}" for i in range(41)], [*places, places[7] + 5])
+    assert chosen(photos, exhaustive_limit=0, partners=2, look_features=80)[0] == 7
+    assert compared == [20] * 40 + [80] * 8
 
 
 def test_few_photos_are_all_partners():
