@@ -191,6 +191,8 @@ TABLE = {
     # 32, 33: both also as the specification words its options (A20, A21).
     "splat.plan.overlap": ("box", "box", "box"),
     "splat.plan.pairing": ("disjoint", "disjoint", "disjoint"),
+    # A22: until nothing collides; ours leaves it to the last pass.
+    "splat.plan.max_rounds": (1_000_000, 1_000_000, 0),
     # 34
     "splat.merge.min_iterations": (1000, 1000, 60),
     "splat.merge.max_iterations": (1000, 1000, 150),

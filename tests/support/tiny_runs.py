@@ -24,6 +24,7 @@ SHORT = [
         "reconstruct.iterations_per_view=2",
         "reconstruct.min_iterations=10",
         "reconstruct.max_iterations=20",
+        "plan.max_rounds=10",
         "merge.iterations_per_view=2",
         "merge.min_iterations=4",
         "merge.max_iterations=8",
@@ -31,7 +32,8 @@ SHORT = [
         "split.dense.max_points=8000",
     )
 ]
-"""Trainings of a few steps: what comes out looks bad, and is made in the same way."""
+"""Trainings of a few steps, and the method's own merging of pairs: what comes out looks bad, and is made in the same
+way."""
 
 
 @dataclass(frozen=True)

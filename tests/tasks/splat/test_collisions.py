@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,7 +10,8 @@ from ss_flow.tasks.artifacts import Appearances, Gaussians
 from ss_flow.tasks.splat.collisions import collision_matrix, group_box, match_pairs
 from ss_flow.tasks.splat.plan import PlanParams, plan
 
-EXACT = PlanParams(bbox_quantile=0.0)
+UNTIL_NONE = PlanParams(max_rounds=1_000_000)
+EXACT = replace(UNTIL_NONE, bbox_quantile=0.0)
 NOWHERE_SHOWN = Appearances(np.zeros(0, np.int32), **Appearances.arrays([]))
 
 
@@ -147,7 +150,15 @@ def test_a_group_without_gaussians_collides_with_nothing():
 
 def test_pairs_below_the_least_score_stay_apart():
     a, b, *_ = table_cup_book_floor_lamp().values()
-    assert not len(plan((a, b), NOWHERE_SHOWN, params=PlanParams(bbox_quantile=0, min_score=0.95), round=0).pairs)
+    assert not len(plan((a, b), NOWHERE_SHOWN, params=replace(EXACT, min_score=0.95), round=0).pairs)
+
+
+def test_after_the_last_round_nothing_is_left_to_merge():
+    groups = tuple(table_cup_book_floor_lamp().values())
+    once = replace(EXACT, max_rounds=1)
+    assert len(plan(groups, NOWHERE_SHOWN, params=once, round=0).pairs)
+    after = plan(groups, NOWHERE_SHOWN, params=once, round=1)
+    assert not len(after.pairs) and after.singles.tolist() == list(range(len(groups)))
 
 
 def test_taken_literally_a_pair_waits_while_it_collides_with_another():
@@ -169,7 +180,7 @@ def test_cubes_tell_what_touches_a_floor_from_what_hangs_over_a_step_of_it():
     groups = (group(steps, 1), group(standing, 2), group(hanging, 3))
     boxes = plan(groups, NOWHERE_SHOWN, params=EXACT, round=0).collisions
     assert boxes[1, 0] == boxes[2, 0] == 1
-    cubes = plan(groups, NOWHERE_SHOWN, params=PlanParams(overlap="voxel"), round=0).collisions
+    cubes = plan(groups, NOWHERE_SHOWN, params=replace(UNTIL_NONE, overlap="voxel"), round=0).collisions
     assert cubes[1, 0] == 1 and cubes[0, 1] > 0 and not cubes[2].any() and not cubes[:, 2].any()
 
 
@@ -186,7 +197,7 @@ def merged_to_the_end(groups: list[Gaussians], params: PlanParams) -> tuple[set[
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.sampled_from(["box", "voxel"]), st.booleans())
 def test_merging_ends_and_the_order_of_the_instances_does_not_matter(seed, count, overlap, literal):
     rng = np.random.default_rng(seed)
-    params = PlanParams(overlap=overlap, pairing="collision_free" if literal else "disjoint")
+    params = replace(UNTIL_NONE, overlap=overlap, pairing="collision_free" if literal else "disjoint")
     corners = rng.random((count, 3)) * 3
     groups = [
         group(corner + rng.random((rng.integers(1, 12), 3)), i + 1) for i, corner in enumerate(corners)

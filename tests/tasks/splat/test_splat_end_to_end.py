@@ -103,7 +103,7 @@ def test_training_twice_gives_the_same_bytes_and_the_order_of_a_pair_does_not_ma
 
 def test_touching_instances_collide_and_are_planned_as_a_pair(built):
     shown = Appearances(np.array([0, 1, 2], np.int32), **Appearances.arrays([[0, 1, 2], [0], [0, 2]]))
-    made = plan((built.ball, built.box), shown, params=PlanParams(), round=0)
+    made = plan((built.ball, built.box), shown, params=PlanParams(max_rounds=1), round=0)
     assert made.pairs.tolist() == [[1, 0]] and made.views(0) == [0, 2]
 
 
