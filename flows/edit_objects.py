@@ -228,7 +228,7 @@ def object_of_run(folder: Path, called: int | str) -> tuple[Entry, list[int], Pa
 
     Raises ValueError when there is no such object, InputError when the folder is not one of a run.
     """
-    from ss_flow.tasks.deliver.ply import read_columns
+    from ss_flow.tasks.gaussians.read_ply import read_columns
 
     try:
         document = json.loads((folder / "instances.json").read_text(encoding="utf-8"))

@@ -362,7 +362,7 @@ class Gaussians:
     means: Float32
     """[N, 3] world."""
     quaternions: Float32
-    """[N, 4] w x y z, of unit length."""
+    """[N, 4] w x y z; of unit length where they were trained here, of any but 0 where a file brought them."""
     log_scales: Float32
     """[N, 3] natural logarithm of the standard deviations, world units."""
     opacity_logits: Float32
@@ -383,6 +383,12 @@ class Gaussians:
     def opacities(self) -> Float64:
         """[N] 0..1."""
         return 1 / (1 + np.exp(-self.opacity_logits.astype(np.float64)))
+
+    @property
+    def unit_quaternions(self) -> Float32:
+        """[N, 4] w x y z, of unit length; those that are so already are the same to the bit."""
+        length = np.linalg.norm(self.quaternions, axis=1, keepdims=True)
+        return np.where(np.abs(length - 1) < 1e-6, self.quaternions, self.quaternions / np.maximum(length, 1e-12))
 
 
 @dataclass(frozen=True)

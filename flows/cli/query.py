@@ -144,8 +144,9 @@ def write_answer(folder: Path, result: Path, document: dict[str, Any]) -> None:
     import cv2
     import numpy as np
 
-    from ss_flow.tasks.deliver.ply import read_gaussians, write_gaussians
+    from ss_flow.tasks.deliver.ply import write_gaussians
     from ss_flow.tasks.gaussians.initialise import select
+    from ss_flow.tasks.gaussians.read_ply import read_gaussians
     from ss_flow.tasks.geometry.images import encode_png
 
     ids = [row["id"] for row in document["instances"] if row["matched"]]

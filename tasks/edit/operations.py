@@ -98,7 +98,7 @@ def recolour(scene: EditedScene, *, instances: tuple[int, ...], color: tuple[int
 @task(name="edit.read_object")
 def read_object(*, file: FileRef) -> Gaussians:
     """The Gaussians of a PLY file. Raises InputError when it holds none."""
-    from ss_flow.tasks.deliver.ply import read_gaussians
+    from ss_flow.tasks.gaussians.read_ply import read_gaussians
 
     found = read_gaussians(file.path)
     if not len(found):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_runs import bytes_of, ss_flow
 
-from ss_flow.tasks.deliver.ply import read_columns, read_gaussians
+from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
 
 SCENE_FILES = ("scene.ply", "scene_labeled.ply", "instances.json")
 

@@ -10,7 +10,7 @@ import pytest
 from tiny_runs import bytes_of, ss_flow
 
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.deliver.ply import read_columns, read_gaussians
+from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
 
 
 def ids_of(tiny) -> list[int]:

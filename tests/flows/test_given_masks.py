@@ -13,7 +13,7 @@ import pytest
 from tiny_runs import ROOM, run_tiny, ss_flow
 
 from ss_flow.flows.generated import generate
-from ss_flow.tasks.deliver.ply import read_columns
+from ss_flow.tasks.gaussians.read_ply import read_columns
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 
 WEIGHTS = Path(__file__).parents[3] / "shared" / "models"

@@ -7,7 +7,7 @@ import json
 import pytest
 from tiny_runs import ss_flow
 
-from ss_flow.tasks.deliver.ply import read_gaussians
+from ss_flow.tasks.gaussians.read_ply import read_gaussians
 
 
 def colours(tiny) -> dict[str, int]:

@@ -14,7 +14,7 @@ from tiny_runs import run_tiny, ss_flow, write_room
 from ss_flow.cache.store import Store
 from ss_flow.flows.generated import RoomParams
 from ss_flow.tasks.artifacts import Gaussians
-from ss_flow.tasks.deliver.ply import read_columns
+from ss_flow.tasks.gaussians.read_ply import read_columns
 from ss_flow.tasks.splat import reconstruct as reconstruct_module
 
 STANDARD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]

@@ -92,7 +92,7 @@ def _attributes(own: Gaussians, buffer: Buffer) -> dict[str, int]:
     display = base_colors(own).clip(0, 1)
     linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
     columns = {
-        f"{_EXTENSION}:ROTATION": own.quaternions[:, [1, 2, 3, 0]],
+        f"{_EXTENSION}:ROTATION": own.unit_quaternions[:, [1, 2, 3, 0]],
         f"{_EXTENSION}:SCALE": np.exp(own.log_scales),
         f"{_EXTENSION}:OPACITY": opacities,
         "COLOR_0": np.column_stack([linear, opacities]),  # what viewers without the extension show, as points

@@ -22,6 +22,6 @@ def splat(gaussians: Gaussians) -> FileContent:
     rows["scale"] = np.exp(gaussians.log_scales)
     rows["rgba"][:, :3] = levels(base_colors(gaussians), 8)
     rows["rgba"][:, 3] = levels(gaussians.opacities, 8)
-    rows["rotation"] = np.clip(np.rint(gaussians.quaternions * 128 + 128), 0, 255)
+    rows["rotation"] = np.clip(np.rint(gaussians.unit_quaternions * 128 + 128), 0, 255)
     weight = gaussians.log_scales.sum(axis=1, dtype=np.float64) + np.log(gaussians.opacities)
     return FileContent.of(rows[np.argsort(-weight, kind="stable")].tobytes())

@@ -66,7 +66,7 @@ def usda(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str]) ->
                 name=json.dumps(name, ensure_ascii=False),
                 extent=_tuples(np.stack([(own.means - reach).min(axis=0), (own.means + reach).max(axis=0)])),
                 positions=_tuples(own.means),
-                orientations=_tuples(own.quaternions),
+                orientations=_tuples(own.unit_quaternions),
                 scales=_tuples(np.exp(own.log_scales)),
                 opacities=_tuples(own.opacities.astype(np.float32)),
                 degree=degree_of(own),

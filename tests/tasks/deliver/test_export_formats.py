@@ -22,7 +22,7 @@ from ss_flow.tasks.deliver.export.gltf import gltf
 from ss_flow.tasks.deliver.export.splat import splat
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.export.usda import usda
-from ss_flow.tasks.deliver.ply import read_gaussians
+from ss_flow.tasks.gaussians.read_ply import read_gaussians
 
 SIZES = st.sampled_from([0, 1, 2, 255, 256, 257, 700])
 DEGREES = st.integers(0, 3)

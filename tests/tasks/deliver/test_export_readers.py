@@ -24,7 +24,7 @@ from ss_flow.tasks.deliver.export.gltf import gltf
 from ss_flow.tasks.deliver.export.splat import splat
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.export.usda import usda
-from ss_flow.tasks.deliver.ply import read_gaussians
+from ss_flow.tasks.gaussians.read_ply import read_gaussians
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Gaussians, PointCloud, PointLabels, PointParts
-from ss_flow.tasks.deliver.ply import read_columns, read_gaussians, write_cloud, write_gaussians
+from ss_flow.tasks.deliver.ply import write_cloud, write_gaussians
+from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
 
 
 def gaussians_of(n: int, degree: int, seed: int = 0) -> Gaussians:

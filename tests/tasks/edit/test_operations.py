@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import EditedScene, Gaussians
-from ss_flow.tasks.deliver.ply import read_columns, write_gaussians
+from ss_flow.tasks.deliver.ply import write_gaussians
 from ss_flow.tasks.edit import operations
 from ss_flow.tasks.edit.operations import Motion, some_rows
 from ss_flow.tasks.gaussians.initialise import SH_ZERO
+from ss_flow.tasks.gaussians.read_ply import read_columns
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera
 
