@@ -14,11 +14,12 @@ from ss_flow.tasks.deliver.export.content import FileContent, chosen
 from ss_flow.tasks.deliver.export.gaussian_ply import gaussian_ply
 from ss_flow.tasks.deliver.export.gltf import gltf
 from ss_flow.tasks.deliver.export.mesh import TriangleMesh, mesh
+from ss_flow.tasks.deliver.export.sog import sog
 from ss_flow.tasks.deliver.export.splat import splat
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.export.usda import usda
 
-Gaussian = Literal["ply", "labelled-ply", "compressed-ply", "splat", "spz", "gltf", "usda"]
+Gaussian = Literal["ply", "labelled-ply", "compressed-ply", "splat", "spz", "sog", "gltf", "usda"]
 Surface = Literal["mesh-ply", "mesh-obj", "mesh-glb"]
 Workspace = Literal["colmap", "nerfstudio"]
 Format = Gaussian | Surface | Literal["coco"] | Workspace
@@ -57,6 +58,7 @@ GAUSSIANS: dict[str, tuple[str, Callable[[Source], FileContent]]] = {
     "compressed-ply": (".compressed.ply", lambda source: compressed_ply(source.gaussians())),
     "splat": (".splat", lambda source: splat(source.gaussians())),
     "spz": (".spz", lambda source: spz(source.gaussians())),
+    "sog": (".sog", lambda source: sog(source.gaussians())),
     "gltf": (".glb", lambda source: gltf(source.gaussians(), source.cameras, names=source.names)),
     "usda": (".usda", lambda source: usda(source.gaussians(), source.cameras, names=source.names)),
 }

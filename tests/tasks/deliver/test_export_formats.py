@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import gzip
+import io
 import itertools
 import json
 import struct
+import zipfile
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -19,6 +22,7 @@ from ss_flow.tasks.deliver.export.compressed_ply import compressed_ply
 from ss_flow.tasks.deliver.export.content import FileContent, chosen, morton_order, smallest_three, y_up
 from ss_flow.tasks.deliver.export.gaussian_ply import gaussian_ply
 from ss_flow.tasks.deliver.export.gltf import gltf
+from ss_flow.tasks.deliver.export.sog import _kinds, sog
 from ss_flow.tasks.deliver.export.splat import splat
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.export.usda import usda
@@ -195,6 +199,73 @@ def test_spz_spends_fewer_bits_on_fractions_where_coordinates_are_large():
         spz(far)
 
 
+def sog_parts(data: bytes) -> tuple[dict, dict[str, np.ndarray]]:
+    """What is in the archive: meta.json, and the pixels of each image [n, 4] RGBA."""
+    archive = zipfile.ZipFile(io.BytesIO(data))
+    meta = json.loads(archive.read("meta.json"))
+    images = {}
+    for name in archive.namelist():
+        if name.endswith(".webp"):
+            data = archive.read(name)
+            assert data[:4] == b"RIFF" and data[8:16] == b"WEBPVP8L"  # lossless
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            if pixels.shape[2] == 3:  # opaque all over
+                pixels = np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
+            images[name] = pixels[..., [2, 1, 0, 3]].astype(int).reshape(-1, 4)
+    listed = [file for entry in meta.values() if isinstance(entry, dict) for file in entry.get("files", ())]
+    assert sorted(listed) == sorted(images)
+    return meta, images
+
+
+@given(count=SIZES, degree=DEGREES)
+def test_sog_decodes_within_its_steps(count, degree):
+    made = made_gaussians(count, degree)
+    meta, images = sog_parts(bytes_of(sog(made)))
+    assert (meta["version"], meta["count"]) == (2, count)
+    assert ("shN" in meta) == (count > 0 and degree > 0)
+    order = morton_order(made.means)
+    low, high = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+    whole = (images["means_l.webp"] + 256 * images["means_u.webp"])[:count, :3]
+    logs = low + whole / 65535 * (high - low)
+    truth = np.sign(made.means[order]) * np.log1p(np.abs(made.means[order].astype(float)))
+    assert (np.abs(logs - truth) <= (high - low) / 65535 * 0.5 + 1e-12).all()
+    for file, entry, values in (
+        ("scales.webp", meta["scales"], made.log_scales[order]),
+        ("sh0.webp", meta["sh0"], made.sh[order, 0]),
+    ):
+        book = np.array(entry["codebook"])
+        assert len(book) == 256 and (np.diff(book) >= 0).all()
+        found = book[images[file][:count, :3]]
+        # What stands for a number is the nearest of all there are.
+        nearest = np.abs(values.reshape(-1, 1) - book).min(axis=1, initial=np.inf).reshape(values.shape)
+        np.testing.assert_allclose(np.abs(found - values), nearest, atol=1e-6)
+        assert np.abs(found - values).max(initial=0) < 0.05
+    alpha = images["sh0.webp"][:count, 3]
+    assert alpha.min(initial=255) >= 1 and np.abs(alpha / 255 - made.opacities[order]).max(initial=0) <= 1 / 255
+    largest, three = smallest_three(made.quaternions[order])
+    np.testing.assert_array_equal(images["quats.webp"][:count, 3], 252 + largest)
+    assert np.abs((images["quats.webp"][:count, :3] / 255 - 0.5) * 2**0.5 - three).max(initial=0) <= 0.5 * 2**0.5 / 255
+    if "shN" in meta:
+        entry, coefficients = meta["shN"], (degree + 1) ** 2 - 1
+        assert (entry["bands"], entry["count"], len(entry["codebook"])) == (degree, count, 256)
+        label = images["shN_labels.webp"][:count] @ [1, 256, 0, 0]
+        grid = images["shN_centroids.webp"].reshape(-1, 64, coefficients, 4)[label // 64, label % 64, :, :3]
+        assert np.abs(np.array(entry["codebook"])[grid] - made.sh[order, 1:]).max() < 0.05
+
+
+def test_harmonics_of_more_kinds_than_there_may_be_are_joined_with_their_like():
+    different = np.random.default_rng(0).normal(size=(40, 24)).astype(np.float32)
+    rows = np.repeat(different, 50, axis=0)[np.random.default_rng(1).permutation(2000)]
+    kind, kinds = _kinds(rows, 256)
+    assert kinds.shape == (256, 24) and np.bincount(kind).min() >= 7 and np.bincount(kind).max() <= 8
+    # Forty kinds of rows in 256 groups: most groups hold one kind, and then nothing is lost.
+    off = np.abs(kinds[kind] - rows).max(axis=1)
+    assert (off < 1e-6).mean() > 0.7
+    assert np.square(kinds[kind] - rows).mean() < 0.2 * rows.var()
+    kind, kinds = _kinds(rows, 2000)
+    np.testing.assert_array_equal(kinds[kind], rows)
+
+
 @given(count=st.sampled_from([0, 1, 300]), degree=DEGREES, labelled=st.booleans())
 def test_ply_reads_back_equal(tmp_path_factory, count, degree, labelled):
     made = made_gaussians(count, degree)
@@ -225,6 +296,7 @@ def test_the_same_gaussians_give_the_same_bytes(degree, count):
     for write in (
         splat,
         spz,
+        sog,
         compressed_ply,
         lambda g: gltf(g, cameras, names={}),
         lambda g: usda(g, cameras, names={}),

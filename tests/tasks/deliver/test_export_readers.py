@@ -19,8 +19,10 @@ from made_gaussians import made_cameras, made_gaussians
 
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.deliver.export.compressed_ply import compressed_ply
+from ss_flow.tasks.deliver.export.content import morton_order
 from ss_flow.tasks.deliver.export.gaussian_ply import gaussian_ply
 from ss_flow.tasks.deliver.export.gltf import gltf
+from ss_flow.tasks.deliver.export.sog import sog
 from ss_flow.tasks.deliver.export.splat import splat
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.export.usda import usda
@@ -69,8 +71,9 @@ def gltf_issues(data: bytes, folder: Path) -> list[dict]:
         (compressed_ply, ".compressed.ply", 38),
         (spz, ".spz", 33),
         (splat, ".splat", 38),
+        (sog, ".sog", 36),
     ],
-    ids=["ply", "compressed-ply", "spz", "splat"],
+    ids=["ply", "compressed-ply", "spz", "splat", "sog"],
 )
 def test_a_rendering_of_what_was_read_is_that_of_what_was_written(tmp_path, write, suffix, decibels, degree):
     made = made_gaussians(3000, degree)
@@ -81,6 +84,16 @@ def test_a_rendering_of_what_was_read_is_that_of_what_was_written(tmp_path, writ
     camera = camera_of(made_cameras(), 0)
     ours, theirs = (render(g, camera).rgb.clip(0, 1) for g in (made, read))
     assert -10 * np.log10(np.square(ours - theirs).mean() + 1e-12) > decibels
+
+
+@pytest.mark.parametrize("count", [1, 3, 17])
+def test_sog_of_few_gaussians_is_read_too(tmp_path, count):
+    made = made_gaussians(count, 3)
+    read = through_splat_transform(sog(made).content.tobytes(), tmp_path, ".sog")
+    order = morton_order(made.means)
+    np.testing.assert_allclose(read.means, made.means[order], atol=1e-4)
+    np.testing.assert_allclose(read.log_scales, made.log_scales[order], atol=1e-6)
+    np.testing.assert_allclose(read.sh, made.sh[order], atol=0.02)
 
 
 def test_labels_survive_in_the_labelled_ply(tmp_path):

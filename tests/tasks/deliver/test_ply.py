@@ -159,12 +159,6 @@ def test_points_and_labels_of_different_length_are_an_error(tmp_path: Path):
         write_cloud(tmp_path / "c.ply", cloud, replace(labels, label=labels.label[:4]), parts)
 
 
-def test_quaternions_of_any_length_are_read_as_unit(tmp_path: Path):
-    some = gaussians_of(4, 0)
-    write_gaussians(tmp_path / "a.ply", replace(some, quaternions=some.quaternions * 3))
-    np.testing.assert_allclose(read_gaussians(tmp_path / "a.ply").quaternions, some.quaternions, atol=1e-6)
-
-
 @pytest.mark.parametrize("cut", [1, 68])
 def test_a_file_cut_short_is_refused(tmp_path: Path, cut):
     path = tmp_path / "a.ply"
