@@ -60,6 +60,7 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
         "scene": str(scene.place),
         "params": settings.flat(params),
         "models": models,
+        "given_scene": None if scene.given_scene is None else str(scene.given_scene),
         "reference_photo": store.get(wanted["colours"][0]).reference if "colours" in wanted else None,
         "metrics": {
             METRICS[name]: store.get(value).values

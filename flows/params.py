@@ -8,6 +8,7 @@ from typing import Literal
 from ss_flow.tasks.capture.checks import CheckParams
 from ss_flow.tasks.capture.colours import ColourParams
 from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
+from ss_flow.tasks.capture.given_scene import GivenSceneParams
 from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.neighbors import NeighborParams
@@ -21,6 +22,7 @@ from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.semantics.dense_describe import DenseDescribeParams
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams
+from ss_flow.tasks.splat.label import LabelParams
 from ss_flow.tasks.splat.merge import MergeParams
 from ss_flow.tasks.splat.plan import PlanParams
 from ss_flow.tasks.splat.reconstruct import ReconstructParams
@@ -45,8 +47,9 @@ class CaptureParams:
 
     stride: Count = 1
     """Take every n-th view of a posed capture (ScanNet is evaluated at 20)."""
-    depth: Literal["auto", "sensor", "mvs", "mono"] = "auto"
-    """Where depth comes from; "auto" is the sensor where there is one, else several views (mvs)."""
+    depth: Literal["auto", "sensor", "mvs", "mono", "rendered"] = "auto"
+    """Where depth comes from; "auto" is the sensor where there is one, else the scene of --scene where one is given
+    ("rendered"), else several views (mvs)."""
     calibrate: Literal["none", "depth"] = "none"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
     refine_poses: bool = False
@@ -65,6 +68,7 @@ class CaptureParams:
     """Whether Split may find and see points by depth that one view alone found (only where views are compared)."""
     registration: RegistrationParams = field(default_factory=RegistrationParams)
     mono: MonoParams = field(default_factory=MonoParams)
+    given: GivenSceneParams = field(default_factory=GivenSceneParams)
     colours: ColourParams = field(default_factory=ColourParams)
     checks: CheckParams = field(default_factory=CheckParams)
 
@@ -103,6 +107,7 @@ class SplatParams:
     plan: PlanParams = field(default_factory=PlanParams)
     merge: MergeParams = field(default_factory=MergeParams)
     masks: RenderMasksParams = field(default_factory=RenderMasksParams)
+    label: LabelParams = field(default_factory=LabelParams)
 
 
 @dataclass(frozen=True)

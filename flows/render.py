@@ -9,8 +9,9 @@ from ss_flow.graph import each
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, Gaussians
 from ss_flow.tasks.deliver.camera_paths import along, given, round_instance, round_scene
-from ss_flow.tasks.deliver.export.content import chosen
-from ss_flow.tasks.deliver.pictures import What, film, picture
+from ss_flow.tasks.deliver.export.content import FileContent, chosen
+from ss_flow.tasks.deliver.pictures import What, film, picture, side_by_side
+from ss_flow.tasks.geometry.cameras import Camera
 
 CameraPath = Literal["input", "orbit"] | FileRef
 
@@ -33,11 +34,19 @@ class Shot:
 
 
 def shoot(
-    scene: Gaussians, cameras: Cameras, ids: tuple[int, ...] | None, shot: Shot, *, whole: bool, is_film: bool
+    scene: Gaussians,
+    cameras: Cameras,
+    ids: tuple[int, ...] | None,
+    shot: Shot,
+    *,
+    whole: bool,
+    is_film: bool,
+    before: Gaussians | None = None,
 ) -> dict[str, Any]:
     """The nodes of the pictures, of their cameras, and of the film where one is wanted.
 
-    ids: the instances that an orbit goes round, and that are rendered unless `whole`; None = the scene.
+    ids: the instances that an orbit goes round, and that are rendered unless `whole`; None = the scene. before: the
+    scene before it was edited, shown on the left of every picture.
     """
     own = scene if ids is None else chosen(scene, instances=ids)
     if isinstance(shot.path, FileRef):
@@ -48,10 +57,16 @@ def shoot(
         path = round_scene(scene, cameras, frames=shot.frames)
     else:
         path = round_instance(own, cameras, frames=shot.frames, elevation_deg=shot.elevation_deg)
-    shown = scene if whole else own
-    pictures = each(
-        path,
-        build=lambda camera: picture(shown, camera, what=shot.what, width=shot.width, depth_unit=shot.depth_unit),
-    )
+
+    def taken(shown: Gaussians, camera: Camera) -> FileContent:
+        return picture(shown, camera, what=shot.what, width=shot.width, depth_unit=shot.depth_unit)
+
+    shown, left = scene if whole else own, before
+    if before is not None and not whole and ids is not None:
+        left = chosen(before, instances=ids)
+    if left is None:
+        pictures = each(path, build=lambda camera: taken(shown, camera))
+    else:
+        pictures = each(path, build=lambda camera: side_by_side(taken(left, camera), taken(shown, camera)))
     films = {"film": film(pictures, what=shot.what, fps=shot.fps)} if is_film else {}
     return {"cameras": path, "pictures": pictures, **films}

@@ -33,16 +33,13 @@ R = TypeVar("R")
 
 def splat(capture: Capture, found: Split, networks: Networks, params: Params) -> dict[str, Any]:
     """Instances -> Gaussians, each on its own; refined masks; one scene (Split&Splat, Sec. 3.2)."""
-    views = Views(capture.frames, capture.by_view, capture.depths, capture.unit, capture.colours)
+    views = capture.views
     settings, visibility = params.splat, params.split.visibility
-
-    def of_instance(row: int, build: Callable[[list[int]], R]) -> R:
-        """What `build` makes of the views that see an instance: a step for one instance depends on no others."""
-        return expand(found.appearances, lambda seen_in: build(seen_in.views(row)))
 
     @functools.cache
     def reconstructed(row: int) -> Gaussians:
         return of_instance(
+            found,
             row,
             lambda seen: reconstruct(
                 some(views, seen), found.instances[row], params=settings.reconstruct, visibility=visibility
@@ -52,6 +49,7 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
     @functools.cache
     def refined(row: int) -> InstanceMasks:
         return of_instance(
+            found,
             row,
             lambda seen: refine(
                 some(views, seen),
@@ -66,6 +64,7 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
 
     def retrained(row: int) -> Gaussians:
         return of_instance(
+            found,
             row,
             lambda seen: retrain(
                 some(views, seen),
@@ -73,24 +72,6 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
                 reconstructed(row),
                 params=settings.reconstruct,
                 visibility=visibility,
-            ),
-        )
-
-    def pictured(row: int, seen: list[int]) -> InstanceMasks:
-        if params.semantics.masks == "refined":
-            return refined(row)
-        return rendered(
-            some(views, seen), refined(row), reconstructed(row), params=settings.refine, visibility=visibility
-        )
-
-    def described(row: int) -> Descriptors:
-        return of_instance(
-            row,
-            lambda seen: describe(
-                pick(capture.frames, seen),
-                pictured(row, seen),
-                encoder=networks.encoder,
-                params=params.semantics.describe,
             ),
         )
 
@@ -111,8 +92,44 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
         "merge": merged,
         "scene": scene,
         "masks": render_masks(views, scene, masks_refined, params=settings.masks),
-        "describe": of_each(described),
+        "describe": described(capture, found, networks, params, refined, reconstructed),
     }
+
+
+def described(
+    capture: Capture,
+    found: Split,
+    networks: Networks,
+    params: Params,
+    masks: Callable[[int], InstanceMasks],
+    gaussians: Callable[[int], Gaussians],
+) -> tuple[Descriptors, ...]:
+    """The descriptors of all instances; masks, gaussians: the nodes of an instance's own, by its row."""
+
+    def build(row: int, seen: list[int]) -> Descriptors:
+        pictured = masks(row)
+        if params.semantics.masks == "rendered":
+            pictured = rendered(
+                some(capture.views, seen),
+                pictured,
+                gaussians(row),
+                params=params.splat.refine,
+                visibility=params.split.visibility,
+            )
+        frames = pick(capture.frames, seen)
+        return describe(frames, pictured, encoder=networks.encoder, params=params.semantics.describe)
+
+    return each(
+        found.instances,
+        INDEX,
+        build=lambda _, row: of_instance(found, row, lambda seen: build(row, seen)),
+        on_error="skip",
+    )
+
+
+def of_instance(found: Split, row: int, build: Callable[[list[int]], R]) -> R:
+    """What `build` makes of the views that see an instance: a step for one instance depends on no others."""
+    return expand(found.appearances, lambda seen_in: build(seen_in.views(row)))
 
 
 def some(views: Views, rows: list[int]) -> Views:

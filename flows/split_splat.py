@@ -1,10 +1,14 @@
-"""The DAG of Split&Splat: a capture -> view-consistent instances -> Gaussians -> one labelled scene -> descriptors."""
+"""The DAG of Split&Splat: a capture -> view-consistent instances -> Gaussians -> one labelled scene -> descriptors.
+
+A scene that was trained elsewhere takes the place of the Gaussians (`flows/given.py`).
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 from ss_flow.flows.capture import Capture
+from ss_flow.flows.given import label_given
 from ss_flow.flows.params import Params
 from ss_flow.flows.splat import splat
 from ss_flow.flows.split import Networks, split
@@ -58,13 +62,17 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         results["truth"] = capture.truth
         with labelled("split"):
             results["metrics_split"] = evaluate_masks(masks_split, capture.truth, found.tree, zero_is_void=void)
-    results |= splat(capture, found, networks, params)
+    if capture.given is None:
+        results |= splat(capture, found, networks, params)
+    else:
+        results |= {"given_scene": capture.given} | label_given(capture, found, masks_split, networks, params)
     if capture.truth is not None:
         for stage, masks in (("refined", "masks_refined"), ("splat", "masks")):
-            with labelled(stage):
-                results[f"metrics_{stage}"] = evaluate_masks(
-                    results[masks], capture.truth, found.tree, zero_is_void=void
-                )
+            if masks in results:
+                with labelled(stage):
+                    results[f"metrics_{stage}"] = evaluate_masks(
+                        results[masks], capture.truth, found.tree, zero_is_void=void
+                    )
     if held_out is not None:
         results |= {"ingest_held_out": held_out.frames, "cameras_held_out": held_out.cameras}
         if held_out.truth is not None:

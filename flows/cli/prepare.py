@@ -143,9 +143,8 @@ def prepare(
         held_out = scene.root / "held_out"
         extra: Capture | None = None
         if held_out.is_dir():
-            plain = replace(
-                params.capture, calibrate="none", refine_poses=False
-            )  # of these views only the photos count
+            # Of these views only the photos count.
+            plain = replace(params.capture, depth="auto", calibrate="none", refine_poses=False)
             extra = capture(open_scene(held_out), reference, plain, networks.monodepth)
         results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
         if text is not None:
@@ -172,7 +171,7 @@ def tell_remarks(scenes: Iterable[Prepared], out: Console) -> None:
 
 def _until(step: str, results: Mapping[str, Any]) -> Any:
     """The node to stop at that is not a result itself. Raises InputError when there is no step of this name."""
-    if step in LEADS_TO:
+    if LEADS_TO.get(step) in results:
         return results[LEADS_TO[step]]
     known = nodes_by_step(results.values())
     found = [node for name, nodes in known.items() if name.rpartition(".")[2] == step for node in nodes]

@@ -18,6 +18,7 @@ from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.render import CameraPath, Shot, shoot
 from ss_flow.flows.results import FinishedRun
+from ss_flow.graph import stored
 from ss_flow.resolution import Failure
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
@@ -43,6 +44,8 @@ class Render:
     """An instance by id or name, 0 = the background; may be given several times. Only these are rendered."""
     surroundings: bool = False
     """Render the whole scene all the same; --instance then says only what an orbit goes round."""
+    before: bool = False
+    """Of an edited result: show on the left what each picture showed before the edit."""
     frames: int = 120
     """How many; with --path input, 0 = the input views as they are. Cameras of a file are all taken."""
     width: int = 0
@@ -68,16 +71,23 @@ class Render:
         _check_place(out, is_film=is_film)
         ids = run.ids(self.instance) if self.instance else None
         unit = float(run.results.one("dense").unit) / 1000
+        earlier = _scene_before(run) if self.before else None
         shot = Shot(self._path(run.store), self.frames, self.elevation, self.what, self.width, unit, self.fps)
         written = 0
 
         def build() -> dict[str, Any]:
             scene, cameras = run.results.node("scene"), run.results.node("cameras")
-            return shoot(scene, cameras, ids, shot, whole=self.surroundings or ids is None, is_film=is_film)
+            before = None if earlier is None else stored("before", earlier)
+            whole = self.surroundings or ids is None
+            return shoot(scene, cameras, ids, shot, whole=whole, is_film=is_film, before=before)
 
         def done(report: Report) -> None:
             nonlocal written
-            written = _write(out, run, report, is_film=is_film, depth_unit=unit if self.what == "depth" else None)
+            if is_film:
+                written = _write_film(out, run, report)
+            else:
+                panels, depth_unit = 1 + self.before, unit if self.what == "depth" else None
+                written = _write_pictures(out, run, report, panels=panels, depth_unit=depth_unit)
 
         with display(console(json=self.json)) as screen:
             request = Request(build, run.document["scene"], reporter=screen, done=done)
@@ -114,25 +124,45 @@ class Render:
         return reference
 
 
-def _write(out: Path, run: FinishedRun, report: Report, *, is_film: bool, depth_unit: float | None) -> int:
-    """Write what came out; returns how many frames there are."""
+def _scene_before(run: FinishedRun) -> str:
+    """The digest of the scene that an edited run began with. Raises InputError where it was not edited, or the store no
+    longer holds it."""
+    begun = [node["outputs"][0] for node in run.document["nodes"] if node["step"] == "edit.begin"]
+    if not begun:
+        raise InputError(f"{run.folder} is not an edited run; --before shows what an edit has changed.")
+    if begun[0] not in run.store:
+        raise InputError(f"the store {run.store.location} no longer holds the scene before the edit; edit it again.")
+    return str(begun[0])
+
+
+def _made(report: Report, name: str) -> Any:
+    """What came of an output. Raises the error of one that failed."""
     for value in report.values.values():
         if isinstance(value, Failure):
             raise value.error
-    paths, pictures = report.values["cameras"], report.values["pictures"]
-    assert not isinstance(paths, str | Failure) and not isinstance(pictures, str | Failure)
-    if is_film:
-        film = report.values["film"]
-        assert isinstance(film, str)
-        write_atomically(out, run.store.get(film).content.tobytes())
-        return len(pictures)
+    return report.values[name]
+
+
+def _write_film(out: Path, run: FinishedRun, report: Report) -> int:
+    """Write the film; returns how many frames it has."""
+    write_atomically(out, run.store.get(_made(report, "film")).content.tobytes())
+    return len(_made(report, "pictures"))
+
+
+def _write_pictures(out: Path, run: FinishedRun, report: Report, *, panels: int, depth_unit: float | None) -> int:
+    """Write the pictures and their cameras; returns how many there are.
+
+    panels: so many renderings stand side by side in each.
+    """
+    paths, pictures = _made(report, "cameras"), _made(report, "pictures")
     sizes = []
     with replacing(out) as filling:
         files = [f"{number:05d}.png" for number in range(len(pictures))]
         for file, value in zip(files, pictures, strict=True):
             content = run.store.get(value).content.tobytes()
             (filling / file).write_bytes(content)
-            sizes.append((int.from_bytes(content[16:20]), int.from_bytes(content[20:24])))  # PNG's header
+            width, height = (int.from_bytes(content[place : place + 4]) for place in (16, 20))  # PNG's header
+            sizes.append((width // panels, height))
         cameras = [run.store.get(value).scaled(*size) for value, size in zip(paths, sizes, strict=True)]
         document = transforms_document(cameras, files)
         if depth_unit is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.engine import Report, Request, run_flows
+from ss_flow.errors import InputError
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import OptionalPath, console, file_digests
 from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare, tell_remarks
@@ -22,17 +23,21 @@ from ss_flow.flows.params import Params
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import check_place
+from ss_flow.tasks.gaussians.read_ply import read_columns
 
 
 @dataclass(frozen=True)
 class Run:
     """Turn a capture into instance-labelled Gaussians."""
 
-    scene: Annotated[Path, tyro.conf.Positional]
+    capture: Annotated[Path, tyro.conf.Positional]
     """A folder of photos, a video, a COLMAP workspace, a nerfstudio transforms.json, a ScanNet export or .sens file, or
     a TUM RGB-D folder."""
     out: OptionalPath = None
-    """The folder to write; by default ss-flow-out/NAME of the scene."""
+    """The folder to write; by default ss-flow-out/NAME of the capture."""
+    scene: OptionalPath = None
+    """A splat (.ply) that was trained elsewhere from this capture, to be labelled in the place of a reconstruction; its
+    Gaussians stay as they are."""
     masks: OptionalPath = None
     """Ready-made instance masks in the place of a segmenter: a folder of uint16 PNG files named like the photos, or a
     COCO file (.json)."""
@@ -53,8 +58,16 @@ class Run:
             params = settings.apply(params, [f"capture.calibrate={self.calibrate}"])
         if self.refine_poses:
             params = settings.apply(params, ["capture.refine_poses=true"])
-        out = self.out or Path("ss-flow-out") / self.scene.resolve().stem
-        scene = open_scene(self.scene, self.masks, self.hints)
+        out = self.out or Path("ss-flow-out") / self.capture.resolve().stem
+        scene = open_scene(self.capture, self.masks, self.hints)
+        if self.scene is not None:
+            read_columns(self.scene)  # what is no PLY is refused before anything is computed
+            if scene.poses is None:
+                raise InputError(
+                    f"{self.capture} has no poses, and those that a run would find lie in another frame than "
+                    f"{self.scene}; give the capture with the poses that it was trained with, such as COLMAP's folder."
+                )
+            scene = replace(scene, given_scene=self.scene)
         return run_scene(scene, out, params, self.execution, undistorted=self.undistorted)
 
 

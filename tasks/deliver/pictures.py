@@ -52,6 +52,12 @@ def picture(gaussians: Gaussians, camera: Camera, *, what: What, width: int, dep
     return FileContent(encode_png(pixels))
 
 
+@task(name="deliver.pictures.side_by_side")
+def side_by_side(left: FileContent, right: FileContent) -> FileContent:
+    """Two pictures of `picture` of one size and kind as one."""
+    return FileContent(encode_png(np.concatenate([_decoded(left), _decoded(right)], axis=1)))
+
+
 @task(name="deliver.pictures.film")
 def film(pictures: Sequence[FileContent], *, what: What, fps: int) -> FileContent:
     """The pictures of `picture` as an MP4 file (MPEG-4 part 2), at most 8 bits a channel.

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
+from ss_flow.tasks.gaussians.initialise import SH_ZERO
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
 from ss_flow.tasks.gaussians.rasterize import NAMES
 from ss_flow.tasks.geometry.cameras import Camera
@@ -70,3 +72,24 @@ def render(
     done = NativePass(parameters, labels, camera, settings)  # type: ignore[arg-type]
     assert done.top is not None and done.strongest is not None
     return Rendering(done.rgb, done.alpha, done.depth, done.masks, done.top, done.radii > 0, done.strongest)
+
+
+def weights_by_id(gaussians: Gaussians, camera: Camera, ids: NDArray[np.integer]) -> Iterator[tuple[int, Float32]]:
+    """For each id of an image, ascending: the sum of each Gaussian's weights T * alpha over the id's pixels: [N].
+
+    ids: [H, W] integers from 0 on, of the camera's size; pixels below 0 count for none. A rendering is linear in the
+    colours, so these sums are its gradient towards them, where the gradient of the image is 1 in the id's pixels; the
+    three channels hold three ids at once.
+    """
+    grey = replace(gaussians, sh=np.zeros((len(gaussians), 1, 3), np.float32))  # no colour is cut off at 0
+    parameters = tuple(np.ascontiguousarray(getattr(grey, name), np.float32) for name in NAMES)
+    drawn = NativePass(parameters, None, camera, Settings((0.0, 0.0, 0.0), 0, 0, winners=False))  # type: ignore[arg-type]
+    found = np.unique(ids[ids >= 0]).tolist()
+    for start in range(0, len(found), 3):
+        some = found[start : start + 3]
+        towards = np.zeros((camera.height, camera.width, 3), np.float32)
+        for channel, one in enumerate(some):
+            towards[..., channel] = ids == one
+        weights = drawn.backward(towards, None, None, None)["sh"][:, 0] / np.float32(SH_ZERO)
+        for channel, one in enumerate(some):
+            yield one, weights[:, channel]

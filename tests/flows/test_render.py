@@ -66,9 +66,36 @@ def test_a_film_is_one_file_and_is_made_once(tiny, tmp_path):
     assert (tmp_path / "a.mp4").read_bytes() == first and b"ftyp" in first[:16]
 
 
+def test_an_edit_is_shown_beside_what_it_was_before(tiny, tmp_path):
+    one = next(e["id"] for e in json.loads((tiny.out / "instances.json").read_text())["instances"] if e["file"])
+    (tmp_path / "script.json").write_text(
+        json.dumps({"version": 1, "operations": [{"op": "remove", "instances": one}]})
+    )
+    edited = ss_flow("edit", tiny.out, tmp_path / "script.json", "--out", tmp_path / "edited", "--cache", tiny.store)
+    assert edited.code == 0, edited.err
+    views = ["--frames", "0", "--what", "labels"]
+
+    def pictures(folder, result, *more):
+        assert ss_flow("render", result, "--cache", tiny.store, *views, *more, "--out", tmp_path / folder).code == 0
+        found = sorted((tmp_path / folder).glob("*.png"))
+        return [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in found]
+
+    both = pictures("both", tmp_path / "edited", "--before")
+    left, right = pictures("left", tiny.out), pictures("right", tmp_path / "edited")
+    for pair, before, after in zip(both, left, right, strict=True):
+        np.testing.assert_array_equal(pair, np.concatenate([before, after], axis=1))
+    assert any((image == one).any() for image in left) and not any((image == one).any() for image in right)
+    # Cameras are those of one half.
+    cameras = [json.loads((tmp_path / folder / "transforms.json").read_text()) for folder in ("both", "left")]
+    assert cameras[0] == cameras[1]
+    film = ["--frames", "2", "--before", "--out", tmp_path / "a.mp4"]
+    assert ss_flow("render", tmp_path / "edited", "--cache", tiny.store, *film).code == 0
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [
+        (["--before"], "is not an edited run"),
         (["--path", "nowhere.json"], "is neither input nor orbit"),
         (["--path", "orbit", "--frames", "0"], "--frames 0 is out of range"),
         (["--fps", "0"], "--fps 0 is out of range"),

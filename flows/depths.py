@@ -1,0 +1,162 @@
+"""Depth of every view of a capture: measured, seen by several views together, predicted, or that of a given scene."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ss_flow.errors import InputError
+from ss_flow.flows.params import CaptureParams
+from ss_flow.graph import INDEX, each, expand, pick
+from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians
+from ss_flow.tasks.capture import depth as steps
+from ss_flow.tasks.capture import recordings, sensor_depth, views
+from ss_flow.tasks.capture.given_scene import rendered_depth
+from ss_flow.tasks.capture.mono import mono
+from ss_flow.tasks.capture.neighbors import Neighbors, neighbors
+from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.capture.stereo import stereo
+from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.models.catalogue import Model
+
+Reference = Callable[[Path], FileRef]
+"""Turns a path into a file reference; digests are remembered outside the flow."""
+Depths = tuple[DepthMap, ...]
+
+
+def depth_source(scene: SceneFiles, params: CaptureParams) -> str:
+    """Where the depth of a capture comes from: "sensor", "mvs", "mono" or "rendered"."""
+    if params.depth != "auto":
+        return params.depth
+    if scene.depths is not None or scene.kind == "sens":
+        return "sensor"
+    return "mvs" if scene.given_scene is None else "rendered"
+
+
+def measured(scene: SceneFiles, reference: Reference, frames: tuple[Frame, ...]) -> Depths:
+    """The sensor's depth. Raises InputError when there is none."""
+    if scene.kind == "sens" and scene.recording is not None:
+        return recordings.sens_depth(
+            frames, recording=reference(scene.recording), names=scene.names, entries=scene.entries
+        )
+    if scene.depths is None:
+        raise InputError(f"{scene.root} has no depth files; set capture.depth to mvs or mono.")
+    return sensor_depth.depth(
+        frames,
+        names=scene.names,
+        files=all_of(reference, scene.depths),
+        scale=scene.depth_scale,
+        metric=scene.metric,
+        lenses=scene.lenses,
+        depth_lens=scene.depth_lens,
+    )
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Views beside their neighbours: the depth of a view depends on these alone."""
+
+    frames: tuple[Frame, ...]
+    cameras: tuple[Camera, ...]
+    neighbors: Neighbors
+    names: tuple[str, ...] | None
+    """Of the views, where they are known beforehand."""
+    params: CaptureParams
+
+    @classmethod
+    def of(
+        cls, frames: tuple[Frame, ...], cameras: Cameras, names: tuple[str, ...] | None, params: CaptureParams
+    ) -> Beside:
+        beside = neighbors(cameras, params=params.neighbors)
+        return cls(frames, views.by_view(cameras), beside, names, params)
+
+    def compared(self) -> tuple[Depths, Depths]:
+        """The depth that several views agree on, and what is presumed besides."""
+        found = self._each(self._swept)
+        agreed = self._confirmed(found)
+        for _ in range(self.params.stereo.rounds):
+            found = self._each(functools.partial(self._refined, found, agreed))
+            agreed = self._confirmed(found)
+        if not self.params.presume:
+            return agreed, agreed
+        return agreed, each(agreed, found, names=self.names, build=steps.presume)
+
+    def rendered(self, scene: Gaussians) -> Depths:
+        """The depth that a scene shows, where neighbours confirm it: at outlines it lies between two surfaces."""
+        return self._confirmed(
+            each(
+                self.frames,
+                self.cameras,
+                names=self.names,
+                build=lambda frame, camera: rendered_depth(scene, frame, camera, params=self.params.given),
+            )
+        )
+
+    def predicted(self, agreed: Depths, cameras: Cameras, network: FileRef) -> Depths:
+        """A monocular network's depth, which takes its scale from what several views agree on."""
+        return each(
+            self.frames,
+            names=self.names,
+            build=lambda frame: mono(frame, cameras, agreed, model=network, params=self.params.mono),
+        )
+
+    def _each(self, build: Callable[[int, Neighbors], DepthMap]) -> Depths:
+        return each(
+            self.frames,
+            INDEX,
+            names=self.names,
+            build=lambda _, view: expand(self.neighbors, functools.partial(build, view)),
+        )
+
+    def _swept(self, view: int, near: Neighbors) -> DepthMap:
+        around = near.around(view)
+        return steps.sweep(
+            pick(self.frames, around), pick(self.cameras, around), span=near.span_of(view), params=self.params.sweep
+        )
+
+    def _refined(self, found: Depths, agreed: Depths, view: int, near: Neighbors) -> DepthMap:
+        around = near.around(view)
+        return stereo(
+            pick(self.frames, around),
+            pick(self.cameras, around),
+            found[view],
+            pick(agreed, around),
+            params=self.params.stereo,
+        )
+
+    def _confirmed(self, found: Depths) -> Depths:
+        def confirmed(view: int, near: Neighbors) -> DepthMap:
+            around = near.around(view)
+            return steps.agree(pick(found, around), pick(self.cameras, around), params=self.params.agreement)
+
+        return self._each(confirmed)
+
+
+def without_sensor(
+    source: str, beside: Beside, cameras: Cameras, given: Gaussians | None, monodepth: Model | None
+) -> tuple[Depths, Depths]:
+    """What several views show together ("mvs"), what a network ("mono") or a given scene ("rendered") says; and what is
+    presumed. Raises InputError when there is no such network or scene."""
+    if source == "rendered":
+        if given is None:
+            raise InputError(
+                "capture.depth=rendered takes depth from a trained scene, and there is none; give it --scene."
+            )
+        shown = beside.rendered(given)
+        return shown, shown
+    if source == "mono" and monodepth is None:
+        raise InputError("capture.depth=mono needs a monocular depth network; `ss-flow models list` names some.")
+    agreed, presumed = beside.compared()
+    if source == "mvs" or monodepth is None:
+        return agreed, presumed
+    predicted = beside.predicted(agreed, cameras, monodepth.file("network"))
+    return predicted, predicted
+
+
+def all_of(reference: Reference, paths: Sequence[Path | None]) -> tuple[Any, ...]:
+    """References to files, None where a view has none."""
+    return tuple(reference(path) if path else None for path in paths)
