@@ -92,7 +92,9 @@ def test_depth_of_the_given_scene_gives_the_dense_points(tiny, splat, labelled, 
     points = Store(labelled[1]).get(called.results()["dense"]).points
     true = np.stack([read_columns(tiny.out / "cloud_labeled.ply")[name] for name in "xyz"], axis=1)
     away, _ = cKDTree(true).query(points)
-    assert len(points) > 500 and np.median(away) < 0.05
+    # These discs are wide, so that those in front reach over what lies behind them.
+    width = float(np.median(np.exp(read_gaussians(splat).log_scales.max(axis=1))))
+    assert len(points) > 500 and np.median(away) < 2 * width
 
 
 def test_the_objects_keep_their_pixels(tiny, labelled):
