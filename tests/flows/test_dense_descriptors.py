@@ -10,7 +10,7 @@ from random_networks import dino_like
 from tiny_runs import run_tiny
 
 from ss_flow.tasks.artifacts import NO_VECTOR
-from ss_flow.tasks.deliver.ply import read_gaussians
+from ss_flow.tasks.gaussians.read_ply import read_gaussians
 
 ASKED = ("--set", "semantics.patches=auto", "--set", "semantics.dense.elevations=1", "--set", "semantics.dense.side=56")
 
