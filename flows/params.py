@@ -64,7 +64,7 @@ class CaptureParams:
     sweep: SweepParams = field(default_factory=SweepParams)
     agreement: AgreementParams = field(default_factory=AgreementParams)
     stereo: StereoParams = field(default_factory=StereoParams)
-    presume: bool = True
+    presume: bool = False
     """Whether Split may find and see points by depth that one view alone found (only where views are compared)."""
     registration: RegistrationParams = field(default_factory=RegistrationParams)
     mono: MonoParams = field(default_factory=MonoParams)
