@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ss_flow.errors import InputError
-from ss_flow.flows.depths import Beside, Reference, all_of, depth_source, measured, without_sensor
+from ss_flow.flows.depths import Beside, all_of, depth_source, measured, without_sensor
 from ss_flow.flows.params import CaptureParams
 from ss_flow.flows.poses import poses, refined_poses
+from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import (
     Cameras,
     CaptureChecks,
@@ -37,7 +38,7 @@ from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.models.catalogue import Model
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Capture:
     """Nodes of a capture, by the artifacts that they stand for: what every later step starts from."""
 
@@ -133,9 +134,22 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         evened = colours(frames, cameras, depths, length, params=params.colours)
     fitting = checks(frames, cameras, depths, params=params.checks)
     return Capture(
-        frames, cameras, by_view, depths, presumed, length, masks, truth, names, pointed, objects, placing, evened,
-        fitting, given,
-    )  # fmt: skip
+        frames=frames,
+        cameras=cameras,
+        by_view=by_view,
+        depths=depths,
+        presumed=presumed,
+        unit=length,
+        masks=masks,
+        truth=truth,
+        names=names,
+        clicks=pointed,
+        objects=objects,
+        registration=placing,
+        colours=evened,
+        checks=fitting,
+        given=given,
+    )
 
 
 def _known_names(scene: SceneFiles) -> tuple[str, ...] | None:

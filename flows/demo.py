@@ -19,7 +19,6 @@ from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows.generated import RoomParams, generate, write_scene
-from ss_flow.resolution import Failure
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import UInt8
 from ss_flow.tasks.deliver.output import replacing
@@ -91,9 +90,7 @@ def _placed(folder: Path, room: RoomParams, masks: Masks, annotated: str, store:
     known = _recipe(folder) if folder.exists() else None
 
     def done(report: Report) -> None:
-        digests = report.values["files"]
-        if isinstance(digests, Failure):
-            raise digests.error
+        digests = report.succeeded()["files"]
         recipe = {"room": asdict(room), "files": list(digests)}
         if known == recipe:
             return

@@ -11,7 +11,7 @@ from typing import Any
 from ss_flow.errors import InputError
 from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import INDEX, each, expand, pick
-from ss_flow.task import FileRef
+from ss_flow.task import FileRef, Reference
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians
 from ss_flow.tasks.capture import depth as steps
 from ss_flow.tasks.capture import recordings, sensor_depth, views
@@ -23,8 +23,6 @@ from ss_flow.tasks.capture.stereo import stereo
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.models.catalogue import Model
 
-Reference = Callable[[Path], FileRef]
-"""Turns a path into a file reference; digests are remembered outside the flow."""
 Depths = tuple[DepthMap, ...]
 
 

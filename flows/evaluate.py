@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ss_flow.errors import InputError
 from ss_flow.graph import labelled
-from ss_flow.task import FileRef
+from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.capture.scene_files import SceneFiles, files_in
 from ss_flow.tasks.evaluate import lerf
@@ -21,7 +21,6 @@ from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.colour_words import colours_in
 from ss_flow.tasks.semantics.query import QueryParams, Similarity, chosen, similarity
 
-Reference = Callable[[Path], FileRef]
 Nodes = Mapping[str, Any]
 """The results of a run by name, as nodes of a flow."""
 

@@ -13,11 +13,11 @@ from ss_flow.flows.evaluate import (
     LERF,
     LabelledScene,
     Nodes,
-    Reference,
     after_splat,
     after_split,
     scan_truth,
 )
+from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles

@@ -65,6 +65,12 @@ class FinishedRun:
     def store(self) -> Store:
         return self.results.store
 
+    def require(self, needed: Sequence[str]) -> None:
+        """Raises InputError when the store no longer holds one of these results."""
+        if gone := self.results.missing(needed):
+            what = f"the store {self.store.location} no longer holds {', '.join(gone)} of {self.folder}"
+            raise InputError(f"{what}; run it again.")
+
     @property
     def name(self) -> str:
         """What files that are made of it are called."""
@@ -117,10 +123,10 @@ def finished_run(folder: Path, document: dict[str, Any], store: Store, needed: S
     document: its run.json. needed: the results that the store must still hold.
     Raises InputError when instances.json is damaged, or one of these is gone.
     """
-    results = Results(store, document["results"])
-    if gone := results.missing(needed):
-        raise InputError(f"the store {store.location} no longer holds {', '.join(gone)} of {folder}; run it again.")
-    return FinishedRun(folder, document, _read(folder / "instances.json", {"instances"}), results)
+    instances = _read(folder / "instances.json", {"instances"})
+    run = FinishedRun(folder, document, instances, Results(store, document["results"]))
+    run.require(needed)
+    return run
 
 
 def _read(file: Path, needed: set[str]) -> dict[str, Any]:

@@ -58,6 +58,15 @@ class Report:
     failures: list[Failure]
     run_folder: str
 
+    def succeeded(self) -> dict[str, Value]:
+        """The outputs by name. Raises the error of the first that failed."""
+        found: dict[str, Value] = {}
+        for name, value in self.values.items():
+            if isinstance(value, Failure):
+                raise value.error
+            found[name] = value
+        return found
+
 
 class _Recorder(Reporter):
     def __init__(self) -> None:

@@ -41,6 +41,10 @@ class FileRef:
     """blake3 of the content, hexadecimal."""
 
 
+Reference = Callable[[Path], FileRef]
+"""Turns a path into a reference; digests are remembered outside the flow."""
+
+
 class Bundle:
     """Base of frozen dataclasses of artifacts that go together as one argument of a task, say the views of a scene.
 

@@ -18,6 +18,7 @@ from ss_flow.cache.location import is_url, open_store
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows.results import FinishedRun, finished_run, read_run
+from ss_flow.task import FileRef, Reference
 from ss_flow.tasks.models import catalogue
 
 # What may be left out: the help then shows what to give, not "{None}|PATH" and "(default: None)".
@@ -132,6 +133,11 @@ def choose_patches(name: str, digests: FileDigests) -> catalogue.Model | None:
             "`ss-flow models fetch dinov2-small`."
         )
     return model
+
+
+def references(digests: FileDigests) -> Reference:
+    """References to files by absolute paths, since a worker may stand in another folder."""
+    return lambda path: FileRef(path.absolute(), digests(path))
 
 
 def open_run(folder: Path, options: StoreOptions, needed: Sequence[str]) -> FinishedRun:

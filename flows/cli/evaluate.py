@@ -16,7 +16,15 @@ from rich.table import Table
 
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, choose_model, console, file_digests, open_run
+from ss_flow.flows.cli.context import (
+    OptionalPath,
+    StoreOptions,
+    choose_model,
+    console,
+    file_digests,
+    open_run,
+    references,
+)
 from ss_flow.flows.cli.query import encoder_name, query_params
 from ss_flow.flows.evaluate import (
     LERF,
@@ -29,8 +37,7 @@ from ss_flow.flows.evaluate import (
     scan_truth,
 )
 from ss_flow.flows.results import FinishedRun, read_run
-from ss_flow.resolution import Failure
-from ss_flow.task import FileRef
+from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import read_json
@@ -107,10 +114,11 @@ class Evaluate:
         return self._of_labels(warnings)
 
     def _of_points(self, warnings: list[str]) -> _Tables:
-        annotated = () if self.truth or "truth" not in read_run(self.result)["results"] else ("visibility", "truth")
-        run = open_run(self.result, self.store, ("dense", "cut", "reproject", "scene", *annotated))
+        run = open_run(self.result, self.store, ("dense", "cut", "reproject", "scene"))
+        if not self.truth and "truth" in run.results.digests:
+            run.require(("visibility", "truth"))
 
-        def build(nodes: Nodes, reference: Callable[[Path], FileRef]) -> dict[str, Any]:
+        def build(nodes: Nodes, reference: Reference) -> dict[str, Any]:
             folder = self.truth
             truth = lifted_truth(nodes) if folder is None else scan_truth(folder, reference, compat=self.compat)
             return dict(on_points(nodes, truth, radius=self.radius, compat=self.compat))
@@ -118,9 +126,10 @@ class Evaluate:
         return _Tables(_metrics(_evaluated(run, build, warnings)))
 
     def _of_objects(self, warnings: list[str]) -> _Tables:
-        kept_back = "truth_held_out" in read_run(self.result)["results"]
-        names = ("ingest", "cameras", "truth")
-        run = open_run(self.result, self.store, ("scene", "masks", *(f"{n}_held_out" for n in names if kept_back)))
+        run = open_run(self.result, self.store, ("scene", "masks"))
+        kept_back = "truth_held_out" in run.results.digests
+        if "truth" in run.results.digests or kept_back:
+            run.require([f"{name}_held_out" if kept_back else name for name in ("ingest", "cameras", "truth")])
         found = _evaluated(run, lambda nodes, reference: dict(on_objects(nodes)), warnings)
         views, taken = found["views"], found["removals"]
         means = {
@@ -146,7 +155,7 @@ class Evaluate:
         labelled = LabelledScene.of(
             self.truth or labels_of(files),
             files,
-            lambda path: FileRef(path.absolute(), digests(path)),
+            references(digests),
             encoder=choose_model("text-image", name, digests),
             query=query_params(run.document),
             texts=_texts(self.texts),
@@ -175,23 +184,20 @@ def name_in_words(encoder: str) -> str:
 
 
 def _evaluated(
-    run: FinishedRun, build: Callable[[Nodes, Callable[[Path], FileRef]], dict[str, Any]], warnings: list[str]
+    run: FinishedRun, build: Callable[[Nodes, Reference], dict[str, Any]], warnings: list[str]
 ) -> dict[str, Any]:
     """The artifacts that `build` makes of a run's results. Raises what went wrong."""
     digests = file_digests(run.store)
     found: list[Report] = []
     request = Request(
-        lambda: build(run.results.nodes(), lambda path: FileRef(path.absolute(), digests(path))),
+        lambda: build(run.results.nodes(), references(digests)),
         run.document["scene"],
         done=found.append,
     )
     run_flows([request], run.store, recorded=False)
     digests.save()
     warnings += dict.fromkeys(text for node in found[-1].nodes for text in node.get("warnings") or ())
-    for value in found[-1].values.values():
-        if isinstance(value, Failure):
-            raise value.error
-    return {name: run.store.get(str(value)) for name, value in found[-1].values.items()}
+    return {name: run.store.get(str(value)) for name, value in found[-1].succeeded().items()}
 
 
 def _metrics(found: Mapping[str, Metrics]) -> dict[str, dict[str, float]]:

@@ -14,7 +14,7 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import export as formats
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run
+from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run, references
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.results import FinishedRun
@@ -166,7 +166,7 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
     missing = next((file for file in files if not file.is_file()), None)
     if missing is not None:
         raise InputError(f"{missing} is not there; run the scene again.")
-    masks = tuple(FileRef(file.absolute(), digests(file)) for file in files)
+    masks = tuple(map(references(digests), files))
     digests.save()
     for name, value in zip(names, run.document["results"]["ingest"], strict=True):
         if name not in photos:

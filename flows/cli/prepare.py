@@ -19,14 +19,13 @@ from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows import settings
 from ss_flow.flows.capture import Capture, capture
-from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model, choose_patches
+from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model, choose_patches, references
 from ss_flow.flows.deliver import deliver, run_document, weight_free
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
 from ss_flow.flows.split_splat import LEADS_TO, split_splat
 from ss_flow.graph import Flow, gather, nodes_by_step
 from ss_flow.resolution import Failure
-from ss_flow.task import FileRef
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.semantics.query import query
@@ -136,8 +135,7 @@ def prepare(
         patches=choose_patches(params.semantics.patches, digests),
     )
 
-    def reference(path: Path) -> FileRef:
-        return FileRef(path.absolute(), digests(path))  # a worker may stand in another folder
+    reference = references(digests)
 
     def build() -> dict[str, Any]:
         held_out = scene.root / "held_out"

@@ -14,13 +14,11 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run
+from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run, references
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.render import CameraPath, Shot, shoot
 from ss_flow.flows.results import FinishedRun
 from ss_flow.graph import stored
-from ss_flow.resolution import Failure
-from ss_flow.task import FileRef
 from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
 from ss_flow.tasks.deliver.output import check_writable, replacing
 from ss_flow.tasks.deliver.pictures import What
@@ -119,7 +117,7 @@ class Render:
         if not file.is_file():
             raise InputError(f"--path {self.path} is neither input nor orbit, nor a file of cameras (transforms.json).")
         digests = file_digests(store)
-        reference = FileRef(file.absolute(), digests(file))
+        reference = references(digests)(file)
         digests.save()
         return reference
 
@@ -135,18 +133,11 @@ def _scene_before(run: FinishedRun) -> str:
     return str(begun[0])
 
 
-def _made(report: Report, name: str) -> Any:
-    """What came of an output. Raises the error of one that failed."""
-    for value in report.values.values():
-        if isinstance(value, Failure):
-            raise value.error
-    return report.values[name]
-
-
 def _write_film(out: Path, run: FinishedRun, report: Report) -> int:
     """Write the film; returns how many frames it has."""
-    write_atomically(out, run.store.get(_made(report, "film")).content.tobytes())
-    return len(_made(report, "pictures"))
+    made = report.succeeded()
+    write_atomically(out, run.store.get(str(made["film"])).content.tobytes())
+    return len(made["pictures"])
 
 
 def _write_pictures(out: Path, run: FinishedRun, report: Report, *, panels: int, depth_unit: float | None) -> int:
@@ -154,7 +145,8 @@ def _write_pictures(out: Path, run: FinishedRun, report: Report, *, panels: int,
 
     panels: so many renderings stand side by side in each.
     """
-    paths, pictures = _made(report, "cameras"), _made(report, "pictures")
+    made = report.succeeded()
+    paths, pictures = made["cameras"], made["pictures"]
     sizes = []
     with replacing(out) as filling:
         files = [f"{number:05d}.png" for number in range(len(pictures))]

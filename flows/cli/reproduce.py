@@ -17,7 +17,7 @@ from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import paper, settings
-from ss_flow.flows.cli.context import console, file_digests
+from ss_flow.flows.cli.context import console, file_digests, references
 from ss_flow.flows.cli.prepare import Prefixed, Prepared, RunOptions, display, header, prepare, tell_remarks
 from ss_flow.flows.cli.reproduce_report import Found, Run, failures, section_of, tell_table
 from ss_flow.flows.deliver import FALLBACKS
@@ -28,7 +28,6 @@ from ss_flow.flows.params import Params
 from ss_flow.flows.reproduce import PLANS, Plan, Variant, measured, opened, scenes_of
 from ss_flow.resolution import Failure
 from ss_flow.sweep import recorded_as
-from ss_flow.task import FileRef
 
 GENERATED = "generated"
 _OF_ONE_SCENE = ("ablation", "tau_depth", "instances")
@@ -140,7 +139,7 @@ class Reproduce:
                     labelled = LabelledScene.of(
                         labels_of(prepared.scene),
                         prepared.scene,
-                        partial(_reference, digests),
+                        references(digests),
                         encoder=prepared.networks.encoder,
                         query=params.semantics.query,
                     )
@@ -171,7 +170,7 @@ class Reproduce:
         def build(place: int) -> dict[str, Any]:
             run, (prepared, labelled) = runs[place], ready[place]
             nodes = prepared.build()
-            reference = partial(_reference, digests)
+            reference = references(digests)
             return {"measured": measured(nodes, run.section, run.variant, run.scene, reference, labelled)}
 
         with display(tell) as screen:
@@ -222,7 +221,3 @@ class _Ready(NamedTuple):
     prepared: Prepared
     labelled: LabelledScene | None
     """The scene's label files, in the tables that are measured by them."""
-
-
-def _reference(digests: FileDigests, path: Path) -> FileRef:
-    return FileRef(path.absolute(), digests(path))

@@ -17,7 +17,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, CaptureChecks, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.capture.ingest import first_of
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, pixels_in_view
-from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.geometry.images import decode_rgb, size_within
 from ss_flow.tasks.ranges import Fraction, NonNegative
 
 _SIDE = 160
@@ -147,9 +147,9 @@ def _grey(frame: Frame) -> Float32:
     import cv2
 
     image = cv2.cvtColor(decode_rgb(frame), cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, _SIDE / max(image.shape))
-    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return cv2.resize(image, size_within(_SIDE, frame.width, frame.height), interpolation=cv2.INTER_AREA).astype(
+        np.float32
+    )
 
 
 def _resized(depth: Float32, shape: tuple[int, ...]) -> Float32:

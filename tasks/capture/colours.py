@@ -18,7 +18,7 @@ from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Float32, Float64, Frame, Int32, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, size_within
 from ss_flow.tasks.geometry.visibility import VisibilityParams, surface_points
 from ss_flow.tasks.ranges import Count, Fraction, Positive
 
@@ -201,7 +201,7 @@ def _observations(
     views, rows, colors = [], [], []
     for view, (frame, depth) in enumerate(zip(frames, depths, strict=True)):
         progress(view, len(frames), frame.name)
-        size = _small(frame)
+        size = size_within(_SIDE, frame.width, frame.height)
         photo = cv2.resize(decode_rgb(frame), size, interpolation=cv2.INTER_AREA).astype(np.float64) / 255
         valid = cv2.resize(decode_valid(frame).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         row, x, y, _ = surface_points(points, camera_of(cameras, view).scaled(*size), depth, _SAME_SURFACE, unit.length)
@@ -222,8 +222,3 @@ def _some_points(depth: DepthMap, cameras: Cameras, view: int, most: int, rng: n
     known = np.flatnonzero(depth.depth)
     chosen = rng.choice(known, min(most, len(known)), replace=False)
     return backproject(depth.depth, camera_of(cameras, view).scaled(width, height))[chosen].astype(np.float32)
-
-
-def _small(frame: Frame) -> tuple[int, int]:
-    scale = min(1.0, _SIDE / max(frame.width, frame.height))
-    return max(1, round(frame.width * scale)), max(1, round(frame.height * scale))

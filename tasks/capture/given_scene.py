@@ -14,7 +14,7 @@ from ss_flow.tasks.gaussians.rasterize import NAMES, backend_identity
 from ss_flow.tasks.gaussians.read_ply import read_gaussians
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, size_within
 from ss_flow.tasks.ranges import Count, Fraction
 
 _COMPARED_SIDE = 160
@@ -76,7 +76,7 @@ def rendered_depth(
     At outlines the mean lies between two surfaces, so it needs the other views' word (`agree`). camera: of this view.
     """
     plain = replace(scene, sh=scene.sh[:, :1])  # colours have no say
-    drawn = render(plain, camera.scaled(*_within(params.max_side, frame)))
+    drawn = render(plain, camera.scaled(*size_within(params.max_side, frame.width, frame.height)))
     solid = drawn.alpha >= max(params.min_alpha, 1e-3)
     depth = np.where(solid, drawn.depth / np.maximum(drawn.alpha, 1e-3), 0)
     return DepthMap(frame.name, depth.astype(np.float32), "rendered")
@@ -108,7 +108,7 @@ def _likeness(scene: Gaussians, frame: Frame, camera: Camera) -> float | None:
     covers any. Exposure and contrast do not matter."""
     import cv2
 
-    size = _within(_COMPARED_SIDE, frame)
+    size = size_within(_COMPARED_SIDE, frame.width, frame.height)
     drawn = render(scene, camera.scaled(*size))
     photo = cv2.resize(decode_rgb(frame), size, interpolation=cv2.INTER_AREA)
     valid = cv2.resize(decode_valid(frame).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
@@ -118,9 +118,3 @@ def _likeness(scene: Gaussians, frame: Frame, camera: Camera) -> float | None:
     a, b = (image[covered].mean(axis=1, dtype=np.float64) for image in (drawn.rgb, photo))
     a, b = a - a.mean(), b - b.mean()
     return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-12))
-
-
-def _within(side: int, frame: Frame) -> tuple[int, int]:
-    """Width and height of a frame, scaled down so that neither is above `side`."""
-    shrink = min(1.0, side / max(frame.width, frame.height))
-    return max(1, round(frame.width * shrink)), max(1, round(frame.height * shrink))

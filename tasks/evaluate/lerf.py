@@ -150,7 +150,8 @@ def langsplat_2d(
     texts: (category, what the encoder reads). Returns miou, macc25, macc50 as `strict`, localised (share of the pairs),
     num_targets, num_frames. Raises InputError as `strict`.
     """
-    model, text_of = encoder_of(encoder), dict(texts)
+    model = encoder_of(encoder)
+    words = {category: model.encode_texts([text, *model.negatives(text)]) for category, text in texts}
     own = {d.instance_id: d.embedding for d in descriptors}
     labelled, hits = [], []
     for view, label, carried in _labelled(frames, cameras, labels):
@@ -161,13 +162,11 @@ def langsplat_2d(
         length = np.sqrt(np.maximum(square, 1e-12))
         scores = {}
         for category, target in strict_targets(label).items():
-            if category not in text_of:
+            if category not in words:
                 scores[category] = 0.0
                 hits.append(False)
                 continue
-            text = text_of[category]
-            words = model.encode_texts([text, *model.negatives(text)])
-            cosines = ((words @ features.T) @ weights).T / length[:, None]
+            cosines = ((words[category] @ features.T) @ weights).T / length[:, None]
             raw = relevancy_of(cosines[:, 0], cosines[:, 1:]).reshape(frames[view].height, frames[view].width)
             mask, peak = _found_2d(carried(raw.astype(np.float32)))
             scores[category] = iou(mask, target)

@@ -17,6 +17,7 @@ from ss_flow.tasks.evaluate.objects import change_elsewhere
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.masks.packing import bounds
 
 _BAND = 5
 """Pixels on either side of an instance's border."""
@@ -105,10 +106,8 @@ def removals(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> Re
     for done, instance in enumerate(ids):
         most = np.argsort(-area[:, instance], kind="stable")[:_REMOVED_IN]
         shown = [int(view) for view in most if area[view, instance]]
-        masks = [maps[view].ids == instance for view in shown]
         changes = [
-            change_elsewhere(scene, instance, camera_of(cameras, view), mask)
-            for view, mask in zip(shown, masks, strict=True)
+            change_elsewhere(scene, instance, camera_of(cameras, view), maps[view].ids == instance) for view in shown
         ]
         residual.append(float(np.mean(changes)))
         progress(done + 1, len(ids), f"instance {instance}")
@@ -126,6 +125,6 @@ def border_band(ids: np.ndarray) -> Bool:
 def _box(mask: Bool) -> Bool:
     """The smallest box that holds a mask, as a mask."""
     inside = np.zeros_like(mask)
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    inside[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
+    x0, y0, x1, y1 = bounds(mask)
+    inside[y0:y1, x0:x1] = True
     return inside

@@ -10,17 +10,13 @@ from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float32, Gaussians
+from ss_flow.tasks.geometry.ply_elements import SCALARS
 
 _NEEDED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 _LONGEST_HEADER = 1 << 16
-_TYPES = {
-    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2"},
-    **{"ushort": "<u2", "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4"},
-    **{"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"},
-}
 
 
 def read_columns(path: Path) -> NDArray[np.void]:
@@ -48,13 +44,13 @@ def read_columns(path: Path) -> NDArray[np.void]:
         )
     if len(words) < 2 or words[1][:2] != ["element", "vertex"] or len(words[1]) != 3 or not words[1][2].isdigit():
         raise InputError(f"{path.name} should have `element vertex` and a count as its first element.")
-    odd = [line for line in words[2:] if len(line) != 3 or line[0] != "property" or line[1] not in _TYPES]
+    odd = [line for line in words[2:] if len(line) != 3 or line[0] != "property" or line[1] not in SCALARS]
     if odd:
         raise InputError(f"{path.name} has `{' '.join(odd[0])}` in its header; only scalars of vertices can be read.")
     names = [name for *_, name in words[2:]]
     if len(set(names)) < len(names):
         raise InputError(f"{path.name} has two columns of one name in its header; it is damaged.")
-    count, dtype = int(words[1][2]), np.dtype([(name, _TYPES[kind]) for _, kind, name in words[2:]])
+    count, dtype = int(words[1][2]), np.dtype([(name, "<" + SCALARS[kind]) for _, kind, name in words[2:]])
     start = end + len(b"end_header\n")
     expected, size = start + count * dtype.itemsize, path.stat().st_size
     if size != expected:

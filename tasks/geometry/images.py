@@ -1,4 +1,4 @@
-"""Pixels of frames: decoding, and masks as bits."""
+"""Pixels of frames: decoding, encoding, sizes."""
 
 from __future__ import annotations
 
@@ -57,3 +57,9 @@ def depth_at_frame_size(depth: DepthMap, frame: Frame) -> Float32:
 def at_diagonal(pixels: float, height: int, width: int) -> float:
     """A length that is meant for an image 800 pixels across, in pixels of an image of this size."""
     return pixels * float(np.hypot(height, width)) / 800
+
+
+def size_within(side: int, width: int, height: int) -> tuple[int, int]:
+    """Width and height of an image, scaled down where one of them is above `side`."""
+    scale = min(1.0, side / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))

@@ -14,11 +14,13 @@ from ss_flow.errors import InputError
 Columns = dict[str, NDArray[np.generic]]
 """Of one element, by property: [N], and [N, k] for lists of k items."""
 
-_TYPES = {
+SCALARS = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+"""NumPy's name of each scalar type of the format, without a byte order."""
+
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 
@@ -61,10 +63,10 @@ def _header(stream: BinaryIO, path: Path) -> tuple[str, list[tuple[str, int, lis
                 order = _ORDERS[kind]
             case ["element", name, count] if count.isdigit():
                 elements.append((name, int(count), []))
-            case ["property", "list", count, kind, name] if count in _TYPES and kind in _TYPES and elements:
-                elements[-1][2].append(_Property(name, _TYPES[kind], _TYPES[count]))
-            case ["property", kind, name] if kind in _TYPES and elements:
-                elements[-1][2].append(_Property(name, _TYPES[kind], None))
+            case ["property", "list", count, kind, name] if count in SCALARS and kind in SCALARS and elements:
+                elements[-1][2].append(_Property(name, SCALARS[kind], SCALARS[count]))
+            case ["property", kind, name] if kind in SCALARS and elements:
+                elements[-1][2].append(_Property(name, SCALARS[kind], None))
             case [] | ["comment", *_] | ["obj_info", *_]:
                 pass
             case words:

@@ -1,4 +1,4 @@
-"""Masks as bits, and grown by some pixels."""
+"""Masks as bits, grown by some pixels, and the box that holds one."""
 
 from __future__ import annotations
 
@@ -27,3 +27,9 @@ def grown(mask: Bool, pixels: int) -> Bool:
     import cv2
 
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0
+
+
+def bounds(mask: Bool) -> tuple[int, int, int, int]:
+    """Columns and rows that hold a mask [H, W], not empty: x0, y0, x1, y1, the last two exclusive."""
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

@@ -13,6 +13,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, UInt8
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.masks.erosion import ErosionParams, erode
+from ss_flow.tasks.masks.packing import bounds
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.ranges import Count, Fraction, Natural, Positive
@@ -74,7 +75,7 @@ def describe(
         mask = erode(masks[row], params.erosion)
         image = decode_rgb(frame)
         if model.sees_masks:
-            x0, y0, x1, y1 = _bounds(mask)
+            x0, y0, x1, y1 = bounds(mask)
             vectors.append(model.encode_images([image[y0:y1, x0:x1]], [mask[y0:y1, x0:x1]])[0])
         else:
             vectors.append(model.encode_images([crop(image, mask, params)])[0])
@@ -95,7 +96,7 @@ def crop(image: UInt8, mask: Bool, params: DescribeParams) -> UInt8:
     """
     import cv2
 
-    x0, y0, x1, y1 = _bounds(mask)
+    x0, y0, x1, y1 = bounds(mask)
     side = max(x1 - x0, y1 - y0) + 2 * params.margin_px
     side = round(side * params.box_scale)
     left, top = (x0 + x1 - side) // 2, (y0 + y1 - side) // 2
@@ -112,9 +113,3 @@ def crop(image: UInt8, mask: Bool, params: DescribeParams) -> UInt8:
     size = (params.crop_side, params.crop_side)
     scaled = cv2.resize(composed, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     return np.asarray(scaled, np.uint8)
-
-
-def _bounds(mask: Bool) -> tuple[int, int, int, int]:
-    """Columns and rows that hold the mask: x0, y0, x1, y1, the last two exclusive."""
-    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

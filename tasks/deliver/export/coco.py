@@ -13,6 +13,7 @@ from ss_flow.running import progress
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Bool
 from ss_flow.tasks.deliver.export.content import FileContent
+from ss_flow.tasks.masks.packing import bounds
 
 
 @task(name="deliver.export.coco")
@@ -50,11 +51,10 @@ def _shape(mask: Bool) -> dict[str, Any]:
     borders = np.flatnonzero(flat[1:] != flat[:-1])
     counts = np.diff(np.concatenate([[0], borders, [mask.size]]))
     lengths = counts[:-1] if counts[-1] == 0 else counts
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    x, y = int(columns[0]), int(rows[0])
+    x0, y0, x1, y1 = bounds(mask)
     return {
         "segmentation": {"size": list(mask.shape), "counts": lengths.tolist()},
         "area": int(mask.sum()),
-        "bbox": [x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y],
+        "bbox": [x0, y0, x1 - x0, y1 - y0],
         "iscrowd": 0,
     }
