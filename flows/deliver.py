@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from ss_flow.flows.results import Results
 from ss_flow.flows.split import Networks
 from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
+from ss_flow.tasks.artifacts import Cameras, Frame
+from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_masks, write_scene
 from ss_flow.tasks.deliver.ply import write_cloud
@@ -129,7 +132,6 @@ def write_all(
     folder: Path, store: Store, document: dict[str, Any], scene_files: SceneFiles, *, undistorted: bool
 ) -> None:
     """Write everything but run.json."""
-    from ss_flow.tasks.capture.lens import photo_lens
     from ss_flow.tasks.deliver.descriptors import write_descriptors
     from ss_flow.tasks.deliver.instances_json import instances_document
     from ss_flow.tasks.deliver.undistorted import write_undistorted
@@ -140,14 +142,21 @@ def write_all(
     instances = instances_document(results.all("refine"), scene, results.one("names"), results.one("hierarchy"))
     write_scene(folder, scene, instances)
     write_cloud(folder / "cloud_labeled.ply", results.one("dense"), results.one("cut"), results.one("parts"))
-    stated = dict(zip(scene_files.names, scene_files.lenses, strict=True)) if scene_files.lenses else {}
-    lenses = [photo_lens(frame, stated.get(frame.name), cameras) for frame in frames]
+    lenses = photo_lenses(frames, cameras, scene_files)
     write_masks(maps, frames, lenses)
     if undistorted:
         write_undistorted(folder / "undistorted", frames, cameras, maps[folder / "masks"])
     if "dense_descriptors" in document["results"]:
         write_descriptors(folder, scene, results.one("dense_descriptors"), cameras)
     write_report(folder / "report.html", results, document, instances)
+
+
+def photo_lenses(frames: Sequence[Frame], cameras: Cameras, scene_files: SceneFiles) -> list[Lens | None]:
+    """The lens whose distortion was taken out of each frame, for the size of its input photo; None for a pinhole."""
+    from ss_flow.tasks.capture.lens import photo_lens
+
+    stated = dict(zip(scene_files.names, scene_files.lenses, strict=True)) if scene_files.lenses else {}
+    return [photo_lens(frame, stated.get(frame.name), cameras) for frame in frames]
 
 
 def write_report(file: Path, results: Results, document: dict[str, Any], instances: dict[str, Any]) -> None:

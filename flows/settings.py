@@ -93,6 +93,14 @@ def overlaid(params: T, table: Mapping[str, Any]) -> T:
     return params
 
 
+def recorded(params: T, values: Mapping[str, Any], step: str) -> T:
+    """A step's parameters as a run had them; one that the run did not know yet keeps its value.
+
+    values: all of the run's, by dotted name, as `flat` gives them. step: what these names begin with.
+    """
+    return overlaid(params, {name: values[f"{step}.{name}"] for name in flat(params) if f"{step}.{name}" in values})
+
+
 def _shortens(wanted: list[str], path: Path) -> bool:
     """Whether `wanted` ends like the path and otherwise leaves out parts of it, in order."""
     rest = iter(path[:-1])

@@ -350,6 +350,21 @@ class InstanceMasks(PackedMasks):
     """Seen in too few views to be reconstructed: kept as points only."""
 
 
+@dataclass(frozen=True)
+class PartMasks(PackedMasks):
+    """One part of an instance, where the finished scene shows it."""
+
+    instance_id: int
+    part_id: int
+    """1.. within the instance, as `Gaussians.part_id`."""
+    height: int
+    width: int
+    views: tuple[str, ...]
+    """[V] names of the views that show it, in the order of the frames."""
+    packed: UInt8
+    """[V, ceil(H * W / 8)] one bit a pixel (`np.packbits`), exclusive between parts."""
+
+
 FOUND, PROMPTED, REFINED, DRAWN = 0, 1, 2, 3
 """Where an instance's mask came from: the view's own masks, the segmenter when asked again, refinement in Splat, or the
 instance's points in the view."""
@@ -412,6 +427,14 @@ class Descriptors:
     """[V] visible area of the instance in each of them, in pixels."""
     encoder: str
     """Name of the text-image encoder."""
+
+
+@dataclass(frozen=True)
+class PartDescriptors(Descriptors):
+    """The semantic descriptor of one part of an instance."""
+
+    part_id: int
+    """1.. within the instance."""
 
 
 NO_VECTOR, FROM_PICTURES, FROM_NEIGHBOURS = 0, 1, 2

@@ -18,7 +18,7 @@ import tyro
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
-from ss_flow.cache.errors import StoreFailure  # noqa: E402
+from ss_flow.cache.errors import Gone, StoreFailure  # noqa: E402
 from ss_flow.errors import ExecutorLost, InputError  # noqa: E402
 from ss_flow.flows.cli.commands import chosen  # noqa: E402
 
@@ -52,6 +52,9 @@ def main(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         _complain("interrupted; what was finished is kept, and the next run goes on from it.", style="yellow")
         return INTERRUPTED
+    except Gone as error:
+        _complain(f"{error}; run the scene again, which computes anew what the store no longer holds.")
+        return FAILED
     except (StoreFailure, ExecutorLost) as error:
         _complain(str(error))
         return FAILED

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,8 +12,9 @@ import tyro
 from rich.table import Table
 
 from ss_flow.cache.store import Store
-from ss_flow.engine import Request, run_flows
+from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
+from ss_flow.flows import settings
 from ss_flow.flows.cli.context import (
     OptionalCount,
     OptionalNumber,
@@ -24,11 +25,11 @@ from ss_flow.flows.cli.context import (
     file_digests,
     open_run,
 )
-from ss_flow.flows.results import read_run
-from ss_flow.graph import stored
-from ss_flow.keys import Value
-from ss_flow.resolution import Failure
+from ss_flow.flows.query import NEEDED, described_parts
+from ss_flow.flows.results import FinishedRun, read_run
+from ss_flow.tasks.artifacts import Bool, PartMasks
 from ss_flow.tasks.deliver.output import check_place, replacing
+from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
 
 ANSWER_FILE = "answer.json"
@@ -48,9 +49,12 @@ class Query:
     """Take the best so many that the text fits, in the place of those near the best (--tau-corr)."""
     background: bool = False
     """Rank the background too, as if it were an object."""
+    parts: bool = False
+    """Rank the parts of the instances in the place of whole instances; the first time takes the longest, as every part
+    is looked up in the photos."""
     out: OptionalPath = None
-    """Also write a folder: answer.json, answer.ply (the instances that match) and masks/ (where each photo shows
-    them)."""
+    """Also write a folder: answer.json, answer.ply (the instances or parts that match) and masks/ (where each photo
+    shows them)."""
     json: bool = False
     """Print one JSON document."""
     store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
@@ -63,8 +67,40 @@ class Query:
                 f"{self.result} is an edited run, whose objects no photo shows as they are; search its source, "
                 f"{document['edit']['source']}."
             )
-        run = open_run(self.result, self.store, ("describe",))
-        store, descriptors = run.store, tuple(document["results"]["describe"])
+        if self.parts and self.background:
+            raise InputError("--background is no part of anything; leave it or --parts out.")
+        run = open_run(self.result, self.store, ("describe", *(NEEDED if self.parts else ())))
+        params = self._params(document)
+        if self.out is not None:
+            check_place(self.out, ANSWER_FILE)
+        digests = file_digests(run.store)
+        encoder = choose_model("text-image", encoder_name(run.store, document["results"]["describe"]), digests)
+        digests.save()
+
+        def build() -> dict[str, Any]:
+            nodes, known = run.results.nodes(), {}
+            descriptors = nodes["describe"]
+            if self.parts:
+                describing = settings.recorded(DescribeParams(), document["params"], "semantics.describe")
+                known["parts"], descriptors = described_parts(nodes, encoder, describing)
+            found = query(descriptors, text=self.text, params=params, encoder=encoder, background=self.background)
+            return {"query": found, **known}
+
+        reports: list[Report] = []
+        run_flows([Request(build, document["scene"], done=reports.append)], run.store, recorded=False)
+        made = reports[-1].succeeded()
+        found = run.store.get(str(made["query"]))
+        if self.parts and not len(found.instance_id):
+            raise InputError(f"no photo shows a part of any instance of {self.result}; leave --parts out.")
+        answer = _document(found, run.instances, parts=self.parts)
+        if self.out is not None:
+            shown = [run.store.get(digest) for digest in made["parts"]] if self.parts else None
+            write_answer(self.out, run, answer, shown)
+        self._tell(found, answer)
+        return 0
+
+    def _params(self, document: dict[str, Any]) -> QueryParams:
+        """How to search: as the run does, but for what the options say. Raises InputError."""
         params = query_params(document)
         if self.tau_corr is not None:
             params = replace(params, tau_corr=self.tau_corr)
@@ -74,31 +110,7 @@ class Query:
             if self.top_k < 1 or self.tau_corr is not None:
                 raise InputError("--top-k takes a whole number from 1 on, and takes the place of --tau-corr.")
             params = replace(params, select="topk", top_k=self.top_k)
-        if self.out is not None:
-            check_place(self.out, ANSWER_FILE)
-        digests = file_digests(store)
-        encoder = choose_model("text-image", encoder_name(store, descriptors), digests)
-        digests.save()
-        answers: list[QueryResult] = []
-        request = Request(
-            lambda: {
-                "query": query(
-                    stored("describe", descriptors),
-                    text=self.text,
-                    params=params,
-                    encoder=encoder,
-                    background=self.background,
-                )
-            },
-            document["scene"],
-            done=lambda report: answers.append(_answer(store, report.values["query"])),
-        )
-        run_flows([request], store, recorded=False)
-        answer = _document(answers[-1], run.instances)
-        if self.out is not None:
-            write_answer(self.out, self.result, answer)
-        self._tell(answers[-1], answer)
-        return 0
+        return params
 
     def _tell(self, found: QueryResult, document: dict[str, Any]) -> None:
         if self.json:
@@ -107,25 +119,27 @@ class Query:
         out = console(json=False)
         if not found.accepted:
             out.print(f"nothing in the scene matches {found.text!r} ({found.encoder}); the nearest are:")
-        table = Table("", "id", "name", "score", "delta", box=None)
+        part = ["part"] if self.parts else []
+        table = Table("", "id", *part, "name", "score", "delta", box=None)
         for row in document["instances"][:10]:
             mark = "[green]match[/]" if row["matched"] else ""
-            table.add_row(mark, str(row["id"]), row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}")
+            place = [str(row[column]) for column in ("id", *part)]
+            table.add_row(mark, *place, row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}")
         out.print(table)
 
 
 def query_params(document: dict[str, Any]) -> QueryParams:
     """How a run searches, from its run.json."""
-    own = {f.name: document["params"].get(f"semantics.query.{f.name}", f.default) for f in fields(QueryParams)}
-    return QueryParams(**own)
+    return settings.recorded(QueryParams(), document["params"], "semantics.query")
 
 
-def _document(found: QueryResult, instances: dict[str, Any]) -> dict[str, Any]:
-    """What --json prints."""
+def _document(found: QueryResult, instances: dict[str, Any], *, parts: bool) -> dict[str, Any]:
+    """What --json prints; with `parts`, each row says which part of its instance it is."""
     names = {entry["id"]: entry["name"] for entry in instances["instances"]}
     rows = [
         {
             "id": int(found.instance_id[i]),
+            **({"part": int(found.part_id[i])} if parts else {}),
             "name": names.get(int(found.instance_id[i]), ""),
             "score": round(float(found.score[i]), 4),
             "delta": round(float(found.delta[i]), 4),
@@ -136,10 +150,12 @@ def _document(found: QueryResult, instances: dict[str, Any]) -> dict[str, Any]:
     return {"text": found.text, "encoder": found.encoder, "instances": rows}
 
 
-def write_answer(folder: Path, result: Path, document: dict[str, Any]) -> None:
+def write_answer(
+    folder: Path, run: FinishedRun, document: dict[str, Any], parts: Sequence[PartMasks] | None = None
+) -> None:
     """Write the folder of an answer: answer.json, answer.ply, and a mask of 0 and 255 for every photo.
 
-    result: the output folder of the run. document: what --json prints.
+    document: what --json prints. parts: where the frames show the parts, when parts were searched.
     """
     import cv2
     import numpy as np
@@ -149,23 +165,43 @@ def write_answer(folder: Path, result: Path, document: dict[str, Any]) -> None:
     from ss_flow.tasks.gaussians.read_ply import read_gaussians
     from ss_flow.tasks.geometry.images import encode_png
 
-    ids = [row["id"] for row in document["instances"] if row["matched"]]
-    scene = read_gaussians(result / "scene_labeled.ply")
+    matched = [row for row in document["instances"] if row["matched"]]
+    wanted = {(row["id"], row.get("part", 0)) for row in matched}
+    scene = read_gaussians(run.folder / "scene_labeled.ply")
+    part_of = scene.part_id if parts is not None else np.zeros_like(scene.part_id)
+    rows = [pair in wanted for pair in zip(scene.instance_id.tolist(), part_of.tolist(), strict=True)]
+    photos = sorted((run.folder / "masks").glob("*.png"))
+    masks: Iterator[Bool]
+    if parts is None:
+        ids = [row["id"] for row in matched]
+        masks = (np.isin(cv2.imread(str(photo), cv2.IMREAD_UNCHANGED), ids) for photo in photos)
+    else:
+        shown = [part for part in parts if (part.instance_id, part.part_id) in wanted]
+        masks = _on_photos(run, shown, [photo.stem for photo in photos])
     with replacing(folder) as filling:
-        write_gaussians(filling / "answer.ply", select(scene, np.isin(scene.instance_id, ids)), labelled=True)
+        write_gaussians(filling / "answer.ply", select(scene, np.array(rows, bool)), labelled=True)
         (filling / "masks").mkdir()
-        for file in sorted((result / "masks").glob("*.png")):
-            matched = np.isin(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), ids)
-            (filling / "masks" / file.name).write_bytes(encode_png(np.uint8(255) * matched).tobytes())
+        for photo, mask in zip(photos, masks, strict=True):
+            (filling / "masks" / photo.name).write_bytes(encode_png(np.uint8(255) * mask).tobytes())
         (filling / ANSWER_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
 
 
-def _answer(store: Store, value: Value | Failure) -> QueryResult:
-    if isinstance(value, Failure):
-        raise value.error
-    assert isinstance(value, str)
-    found: QueryResult = store.get(value)
-    return found
+def _on_photos(run: FinishedRun, parts: Sequence[PartMasks], names: Sequence[str]) -> Iterator[Bool]:
+    """[H, W] which pixels of each named photo show one of these parts."""
+    import numpy as np
+
+    from ss_flow.flows.deliver import photo_lenses
+    from ss_flow.tasks.capture.photo_pixels import on_photo, photo_pixels
+    from ss_flow.tasks.capture.scene import open_scene
+
+    frames = {frame.name: frame for frame in run.results.all("ingest")}
+    lenses = photo_lenses(list(frames.values()), run.results.one("cameras"), open_scene(Path(run.document["scene"])))
+    lens_of = dict(zip(frames, lenses, strict=True))
+    for name in names:
+        frame, lens = frames[name], lens_of[name]
+        own = [part.mask(part.views.index(name)) for part in parts if name in part.views]
+        mask = np.any([np.zeros((frame.height, frame.width), bool), *own], axis=0)
+        yield on_photo(mask.astype(np.uint8), frame, None if lens is None else photo_pixels(frame, lens)) > 0
 
 
 def encoder_name(store: Store, descriptors: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, UInt8
+from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, PartDescriptors, PartMasks, UInt8
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.masks.erosion import ErosionParams, erode
 from ss_flow.tasks.masks.packing import bounds
@@ -47,12 +47,12 @@ class DescribeParams:
 @task(resources=Resources(cores=1, memory_mb=1200), environment=network_identity)
 def describe(
     frames: tuple[Frame, ...],
-    instance: InstanceMasks,
+    instance: InstanceMasks | PartMasks,
     *,
     encoder: Model | None = None,
     params: DescribeParams = DescribeParams(),
 ) -> Descriptors:
-    """The mean of an instance's pictures, as unit vectors, brought back to unit length.
+    """The mean of an instance's pictures, or of a part's, as unit vectors, brought back to unit length.
 
     frames: at least those with a mask of the instance. encoder: None for colour words.
     Returns zeros and no views when no mask covers `min_area` of its image.
@@ -87,6 +87,19 @@ def describe(
     return Descriptors(
         instance.instance_id, embedding, tuple(instance.views[row] for row in chosen), weights, model.name
     )
+
+
+@task(resources=Resources(cores=1, memory_mb=1200), environment=network_identity)
+def describe_part(
+    frames: tuple[Frame, ...],
+    part: PartMasks,
+    *,
+    encoder: Model | None = None,
+    params: DescribeParams = DescribeParams(),
+) -> PartDescriptors:
+    """What `describe` says of a part of an instance."""
+    found = describe(frames, part, encoder=encoder, params=params)
+    return PartDescriptors(**vars(found), part_id=part.part_id)
 
 
 def crop(image: UInt8, mask: Bool, params: DescribeParams) -> UInt8:

@@ -1,4 +1,4 @@
-"""Which instances a text means (Split&Splat, Sec. 4.2 and 4.4.4; spec row 41, A29)."""
+"""Which instances, or parts of them, a text means (Split&Splat, Sec. 4.2 and 4.4.4; spec row 41, A29)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Descriptors, Float32, Int32, UInt8
+from ss_flow.tasks.artifacts import Descriptors, Float32, Int32, PartDescriptors, UInt8
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.ranges import Count, Fraction, Positive
@@ -54,6 +54,8 @@ class Similarity:
     text that only says what is not meant, 1 less the largest cosine."""
     relevancy: Float32
     """[L] 0..1, above 0.5 where every term fits better than every negative; 0 for an instance without a descriptor."""
+    part_id: Int32
+    """[L] the part of the instance that is meant, 0 = the whole."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,8 @@ class QueryResult:
     """[L] 1 for the instances that the text means."""
     accepted: bool
     """Whether the best instance fits at all; otherwise nothing in the scene matches."""
+    part_id: Int32
+    """[L] the part of the instance that is meant, 0 = the whole."""
 
     def matches(self) -> list[int]:
         """The ids that the text means, the best first."""
@@ -172,6 +176,7 @@ def similarity(
         instance_id=np.array([d.instance_id for d in ranked], np.int32),
         score=np.where(seen, score, -1).astype(np.float32),
         relevancy=(relevancy * seen).astype(np.float32),
+        part_id=np.array([d.part_id if isinstance(d, PartDescriptors) else 0 for d in ranked], np.int32),
     )
 
 
@@ -186,7 +191,7 @@ def chosen(found: Similarity, *, params: QueryParams = QueryParams()) -> QueryRe
     """
     if not params.tau_corr > 0:
         raise InputError(f"tau_corr is {params.tau_corr}; it must be above 0 (0.02 is usual).")
-    order = np.lexsort((found.instance_id, -found.score))
+    order = np.lexsort((found.part_id, found.instance_id, -found.score))
     score, relevancy = found.score[order], found.relevancy[order]
     delta = score[:1] - score
     fits = relevancy > (_HALF if found.absolute else params.min_relevancy)
@@ -202,6 +207,7 @@ def chosen(found: Similarity, *, params: QueryParams = QueryParams()) -> QueryRe
         relevancy=relevancy,
         matched=(fits & near).astype(np.uint8),
         accepted=bool(fits[:1].any()),
+        part_id=found.part_id[order],
     )
 
 

@@ -96,6 +96,19 @@ def test_masks_inside_others_become_parts_of_instances_in_all_that_is_delivered(
         assert (mine["x"][mine["part_id"] == 1] > middle).mean() > 0.9
         assert (mine["x"][mine["part_id"] == 0] < middle).mean() > 0.7
 
+    out, again = tmp_path / "answer", ("--parts", "--json", "--cache", warm.store)
+    answer = ss_flow("query", tmp_path / "out", "brown", "--out", out, *again)
+    assert answer.code == 0, answer.err
+    (row,) = answer.document()["instances"]
+    assert (row["id"], row["part"], row["matched"]) == (cut, 1, True)
+    found = read_columns(out / "answer.ply")
+    assert len(found) and set(found["instance_id"].tolist()) == {cut} and set(found["part_id"].tolist()) == {1}
+    shown = np.stack([cv2.imread(str(out / f"masks/{k:04d}.png"), cv2.IMREAD_UNCHANGED) > 0 for k in range(5)])
+    assert shown.any(axis=(1, 2)).sum() >= 3 and (np.stack(places)[shown][:, 0] > middle).mean() > 0.9
+    assert not any(row["matched"] for row in ss_flow("query", tmp_path / "out", "pink", *again).document()["instances"])
+    refused = ss_flow("query", tmp_path / "out", "brown", "--background", *again)
+    assert refused.code == 2 and "--background is no part of anything" in refused.err
+
 
 def middles(scene: Path, view: str) -> dict[str, list[list[float]]]:
     """A click on each thing that a view shows well, by the name that it is given here."""

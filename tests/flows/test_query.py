@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 from tiny_runs import ss_flow
@@ -91,6 +92,19 @@ def test_the_folder_of_an_answer_shows_what_matches_in_every_photo_and_in_space(
         assert np.array_equal(mask, 255 * np.isin(cv2.imread(str(photo), -1), matched))
     again = ss_flow("query", tiny.out, "purple", "--out", out, "--json", "--cache", tiny.store)
     assert again.code == 0 and json.loads((out / "answer.json").read_text())["text"] == "purple"
+
+
+def test_a_run_without_parts_says_so(tiny):
+    answer = ss_flow("query", tiny.out, "white", "--parts", "--cache", tiny.store)
+    assert answer.code == 2 and "no photo shows a part of any instance" in answer.err
+
+
+def test_a_result_that_is_gone_is_told_in_one_sentence_with_what_to_do(warm):
+    described = json.loads((warm.out / "run.json").read_text())["results"]["describe"]
+    shutil.rmtree(next((warm.store / "objects").rglob(described[0])) / "embedding")
+    answer = ss_flow("query", warm.out, "white", "--cache", warm.store)
+    assert answer.code == 1
+    assert "was damaged" in answer.err and "run the scene again, which computes anew" in answer.err
 
 
 def test_an_answer_never_takes_the_place_of_anything_else(tiny, tmp_path):

@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Frame, InstanceMasks
+from ss_flow.tasks.artifacts import Frame, InstanceMasks, PartMasks
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.models.colour_words import TERMS
-from ss_flow.tasks.semantics.describe import DescribeParams, crop, describe
+from ss_flow.tasks.semantics.describe import DescribeParams, crop, describe, describe_part
 
 H, W = 120, 160
 GREY, RED, BLUE = (128, 128, 128), (210, 20, 30), (20, 40, 200)
@@ -47,6 +47,14 @@ def test_a_red_object_on_grey_is_red():
     assert found.instance_id == 7 and found.encoder == "colour words"
     assert TERMS[found.embedding.argmax()] == "red" and found.embedding.max() > 0.9
     assert found.embedding[TERMS.index("grey")] < 0.05
+
+
+def test_a_part_is_described_as_an_instance_with_its_masks_is():
+    frames, instance = scene((square(40, 30, 40), RED))
+    part = PartMasks(7, 2, instance.height, instance.width, instance.views, instance.packed)
+    found, whole = describe_part(frames, part), describe(frames, instance)
+    assert (found.instance_id, found.part_id, found.views) == (7, 2, whole.views)
+    assert np.array_equal(found.embedding, whole.embedding)
 
 
 def test_views_weigh_as_much_as_the_object_covers_in_them():

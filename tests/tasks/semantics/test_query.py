@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Descriptors
+from ss_flow.tasks.artifacts import Descriptors, PartDescriptors
 from ss_flow.tasks.models.colour_words import TERMS
 from ss_flow.tasks.semantics import query as module
 from ss_flow.tasks.semantics.query import QueryParams, chosen, query, similarity, terms
@@ -61,6 +61,13 @@ def at_degrees(instance_id: int, angle: float, height: float = 0.0) -> Descripto
 def test_red_finds_the_red_objects_and_no_others():
     found = query(ROOM, text="the crimson thing")
     assert found.matches() == [4, 2] and found.accepted
+
+
+def test_parts_are_ranked_each_by_itself():
+    parts = [PartDescriptors(**vars(d), part_id=p) for p, d in ((2, coloured(4, blue=1.0)), (1, coloured(4, red=1.0)))]
+    found = query((*parts, coloured(2, red=1.0)), text="red")
+    assert list(zip(found.instance_id.tolist(), found.part_id.tolist(), strict=True)) == [(2, 0), (4, 1), (4, 2)]
+    assert found.matched.tolist() == [1, 1, 0]
 
 
 def test_a_colour_that_nothing_has_matches_nothing():

@@ -1,0 +1,26 @@
+"""What a text means in a finished run: what `ss-flow query` adds to a flow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ss_flow.graph import each
+from ss_flow.tasks.artifacts import PartDescriptors, PartMasks
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.semantics.describe import DescribeParams, describe_part
+from ss_flow.tasks.semantics.part_masks import part_masks
+
+NEEDED = ("ingest", "cameras", "scene", "masks")
+"""The results of a run that its parts are found in."""
+
+
+def described_parts(
+    nodes: Mapping[str, Any], encoder: Model | None, params: DescribeParams
+) -> tuple[tuple[PartMasks, ...], tuple[PartDescriptors, ...]]:
+    """Where the parts of all instances are seen, and what the encoder says of each.
+
+    nodes: the results of a run by name.
+    """
+    parts = part_masks(nodes["cameras"], nodes["scene"], nodes["masks"])
+    return parts, each(parts, build=lambda part: describe_part(nodes["ingest"], part, encoder=encoder, params=params))

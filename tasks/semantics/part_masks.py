@@ -1,0 +1,47 @@
+"""Where the parts of instances are seen, so that a text can be held against each. Beyond Split&Splat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ss_flow.running import progress
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, PartMasks
+from ss_flow.tasks.gaussians.rasterize import backend_identity
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.masks.packing import pack_masks
+
+_SOLID = 0.5
+"""Alpha from which a pixel shows anything."""
+
+
+@task(name="semantics.part_masks", resources=Resources(cores=1, memory_mb=1000), environment=backend_identity)
+def part_masks(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> tuple[PartMasks, ...]:
+    """The parts of all instances by instance and part, each in the views that show it.
+
+    A pixel of an instance's mask shows the part of the Gaussian of that instance with the largest weight there.
+
+    maps: the ids that the finished scene shows in each view.
+    """
+    if not len(scene):
+        return ()
+    row_of = {name: row for row, name in enumerate(cameras.names)}
+    found: dict[tuple[int, int], PartMasks] = {}
+    for done, shown in enumerate(maps):
+        height, width = shown.ids.shape
+        seen = render(scene, camera_of(cameras, row_of[shown.name]).scaled(width, height))
+        top = seen.top_contributor
+        same = (top >= 0) & (seen.alpha >= _SOLID) & (scene.instance_id[top] == shown.ids) & (shown.ids > 0)
+        part = np.where(same, scene.part_id[top], 0)
+        both = np.stack([shown.ids[part > 0], part[part > 0]], axis=1)
+        for instance, number in np.unique(both, axis=0).tolist():
+            mask = pack_masks(((shown.ids == instance) & (part == number))[None])
+            before = found.get((instance, number), PartMasks(instance, number, height, width, (), mask[:0]))
+            views, packed = (*before.views, shown.name), np.concatenate([before.packed, mask])
+            found[instance, number] = replace(before, views=views, packed=packed)
+        progress(done + 1, len(maps), shown.name)
+    return tuple(found[key] for key in sorted(found))
