@@ -13,16 +13,21 @@ from ss_flow.flows import settings
 from ss_flow.flows.params import Params
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+
+
+def script(name: str):
+    """A script of docs/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
 def maker():
-    spec = importlib.util.spec_from_file_location("make_parameters", ROOT / "docs" / "make_parameters.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("make_parameters")
 
 
 def anchors(page: Path) -> set[str]:
@@ -45,6 +50,17 @@ def test_every_parameter_is_in_the_table_with_an_explanation(maker):
 def test_a_page_without_the_marks_is_refused(maker):
     with pytest.raises(ValueError, match=r"parameters\.md lacks"):
         maker.with_table("# Parameters\n")
+
+
+def test_the_plots_are_drawn_from_the_tables_of_the_pages(tmp_path):
+    plots = script("make_plots")
+    page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    drawn = plots.draw(tmp_path)
+    assert [path.name for path in drawn] == [f"{plot.__name__}.svg" for plot in plots.PLOTS]
+    assert set(re.findall(r"\(images/(\w+\.svg)\)", page)) == {path.name for path in drawn}
+    assert plots.table("measurements/splat.md", "Time and memory")[1][:3] == ["room 50", "54", "106 s"]
+    with pytest.raises(ValueError, match="no table under 'Nothing'"):
+        plots.table("engine.md", "Nothing")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
@@ -76,7 +92,7 @@ def test_functions_in_the_tables_of_a_page_stand_in_the_files_beside_them(page):
 
 
 def test_every_repaired_ambiguity_has_the_values_of_the_presets_or_names_the_test_that_holds_it(maker):
-    page = (ROOT / "docs" / "pipeline.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "algorithm.md").read_text(encoding="utf-8")
     section = page.partition("## Repaired ambiguities")[2].partition("\n## ")[0]
     _, _, *rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
     presets = [settings.flat(settings.preset(Params(), name)) for name in ("default", "paper", "reference")]
