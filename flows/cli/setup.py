@@ -59,9 +59,22 @@ class ModelsFetch:
     """Name in the catalogue."""
 
     def run(self) -> int:
+        from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
+
+        from ss_flow.running import Surroundings, running
         from ss_flow.tasks.models.fetch import fetch
 
-        console(json=False).print(f"{self.name} is in {fetch(self.name)}")
+        shown = console(json=False)
+        columns = ("{task.description}", BarColumn(), DownloadColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=shown, transient=True, disable=not shown.is_terminal) as display:
+            row = display.add_task(self.name, total=None)
+
+            def listener(done: int, total: int, note: str) -> None:
+                display.update(row, completed=done, total=total)
+
+            with running(Surroundings(listener)):
+                folder = fetch(self.name)
+        shown.print(f"{self.name} is in {folder}; runs use it from now on", soft_wrap=True)
         return 0
 
 

