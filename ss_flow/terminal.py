@@ -5,21 +5,25 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from datetime import timedelta
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.progress import TaskID as RowId
+from rich.progress_bar import ProgressBar
+from rich.table import Table
 
 from ss_flow.events import Reporter
 
 WORTH_SECONDS = 1.0
-"""Shorter nodes leave no line behind on a terminal."""
+"""Steps that took less in all leave no line behind on a terminal."""
 ALIVE_SECONDS = 30.0
 """Elsewhere, how often a line says how far the running nodes are."""
+_MOST_ROWS = 8
+"""Steps that the live display shows at once."""
 _ENDED = ("hit", "finished", "failed", "skipped")
 
 
@@ -48,49 +52,19 @@ class Messages(Reporter):
         self._console.print(f"[{style}]{word:<6}[/] {escape(text)}", highlight=False, soft_wrap=True)
 
 
-class Terminal(Messages):
-    """A live display: how many nodes are done, and how far each running one is."""
+@dataclass
+class _Node:
+    """A node that runs."""
 
-    def __init__(self, console: Console) -> None:
-        super().__init__(console)
-        self._display = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("[dim]{task.fields[note]}"),
-            console=console,
-            transient=True,
-        )
-        self._all = self._display.add_task("[bold]all steps", total=None, note="")
-        self._rows: dict[str, RowId] = {}
-        self._known: dict[str, int] = {}
-        self._done = 0
-        self._display.start()
+    begun: float
+    done: int = 0
+    total: int = 0
+    """What it said last of how far it is; 0 of 0 = nothing."""
+    note: str = ""
 
-    def event(self, kind: str, **details: Any) -> None:
-        label = escape(details.get("label", ""))
-        if kind == "started":
-            self._rows[label] = self._display.add_task(label, total=None, note="")
-        elif kind in ("finished", "failed", "retried") and label in self._rows:
-            self._display.remove_task(self._rows.pop(label))
-        elif kind == "restarted":
-            self._done = 0
-        if kind in _ENDED:
-            self._done += 1
-            self._known[details.get("flow", "")] = details["known"]
-            self._display.update(self._all, completed=self._done, total=max(self._done, sum(self._known.values())))
-        if kind == "finished" and details["seconds"] >= WORTH_SECONDS:
-            self.say("green", "done", f"{details['label']:<34} {details['seconds']:8.1f} s")
-        super().event(kind, **details)
-
-    def progressed(self, label: str, done: int, total: int, note: str) -> None:
-        if (label := escape(label)) in self._rows:
-            self._display.update(self._rows[label], completed=done, total=total, note=escape(note))
-
-    def close(self) -> None:
-        self._display.stop()
+    def seconds(self, now: float) -> float | None:
+        """How long it is going to take in all, by what it said; None where it said nothing."""
+        return (now - self.begun) * self.total / self.done if self.done > 0 else None
 
 
 @dataclass
@@ -105,74 +79,184 @@ class _Step:
     told: int = 0
     """How many were computed when the step was last told of."""
     seconds: float = 0.0
+    running: dict[str, _Node] = field(default_factory=dict)
+    """By label."""
+
+    def work_left(self, now: float) -> float | None:
+        """Seconds that its nodes still take, one after another; None where nothing tells."""
+        waiting = self.known - self.ended - len(self.running)
+        said = [node.seconds(now) for node in self.running.values()]
+        known = [seconds for seconds in said if seconds is not None]
+        if self.computed:
+            usual = self.seconds / self.computed
+        elif known:
+            usual = sum(known) / len(known)
+        else:
+            return None if waiting or self.running else 0.0
+        begun = [node.begun for node in self.running.values()]
+        ends = zip((usual if seconds is None else seconds for seconds in said), begun, strict=True)
+        return max(waiting, 0) * usual + sum(max(seconds - (now - since), 0.0) for seconds, since in ends)
 
 
-class Log(Messages):
-    """Plain lines, for a file or a pipe: one a step, when the last of its known nodes has ended, and now and then one
-    for each node that runs for long.
+class _Steps(Messages):
+    """Counts the nodes of each step, and leaves a line when the last known one of a step has ended.
 
-    What was found in the store makes no line. every: seconds between two lines of a running node.
+    worth: seconds that a step must have taken to leave one. What was found in the store makes no line.
     """
 
-    def __init__(self, console: Console, *, every: float = ALIVE_SECONDS) -> None:
+    def __init__(self, console: Console, *, worth: float) -> None:
         super().__init__(console)
+        self._worth = worth
         self._steps: dict[str, _Step] = {}
-        self._begun: dict[str, float] = {}
-        self._progress: dict[str, str] = {}
-        self._lock = threading.Lock()
-        self._closed = threading.Event()
-        self._beat = threading.Thread(target=self._say_alive, args=(every,), name="alive", daemon=True)
-        self._beat.start()
+        self._step_of: dict[str, _Step] = {}
+        self._lock = threading.RLock()
 
     def event(self, kind: str, **details: Any) -> None:
-        label = details.get("label", "")
         with self._lock:
+            self._count(kind, details)
+        super().event(kind, **details)
+
+    def _count(self, kind: str, details: dict[str, Any]) -> None:
+        label = details.get("label", "")
+        if "step" in details:
+            step = self._steps.setdefault(f"{details.get('flow', '')} {details['step']}".strip(), _Step())
+            step.known = details["of"]
             if kind == "started":
-                self._begun[label] = time.monotonic()
+                step.running[label] = _Node(time.monotonic())
+                self._step_of[label] = step
             elif kind in ("finished", "failed", "retried"):
-                self._begun.pop(label, None)
-                self._progress.pop(label, None)
-            elif kind == "restarted":
-                for step in self._steps.values():
-                    step.ended = step.there = 0
+                step.running.pop(label, None)
             if kind in _ENDED:
-                step = self._steps.setdefault(f"{details.get('flow', '')} {details['step']}".strip(), _Step())
-                step.known = details["of"]
                 step.ended += 1
                 step.there += kind in ("hit", "finished")
                 step.computed += kind == "finished"
                 step.seconds += details["seconds"] if kind == "finished" else 0.0
-        super().event(kind, **details)
+        elif kind == "restarted":
+            for step in self._steps.values():
+                step.ended = step.there = 0
 
     def progressed(self, label: str, done: int, total: int, note: str) -> None:
         with self._lock:
-            if label in self._begun:
-                self._progress[label] = f", {done} of {total}{f' ({note})' if note else ''}"
+            if label in self._step_of and (node := self._step_of[label].running.get(label)):
+                node.done, node.total, node.note = done, total, note
 
     def pause(self) -> None:
         self._say_done(lambda step: step.ended >= step.known)
 
     def close(self) -> None:
         """Also tells of steps that were interrupted."""
-        self._closed.set()
-        self._beat.join()
         self._say_done(lambda step: True)
 
     def _say_done(self, which: Callable[[_Step], bool]) -> None:
         for name, step in self._steps.items():
-            if step.computed > step.told and which(step):
+            if step.computed > step.told and step.seconds >= self._worth and which(step):
                 step.told = step.computed
                 self.say("green", "done", f"{name:<34} {step.there:5} of {step.known:<5} {step.seconds:8.1f} s")
+
+
+class Terminal(_Steps):
+    """A live display of few lines, however many nodes there are: all steps, and a line for each step that runs.
+
+    Remaining times hold for the nodes that are known, at the pace of those that ended: results decide what else is to
+    be done, so the whole takes at least what is shown.
+    """
+
+    def __init__(self, console: Console, *, every: float = 0.25) -> None:
+        super().__init__(console, worth=WORTH_SECONDS)
+        self._begun = time.monotonic()
+        self._known: dict[str, int] = {}
+        self._live = Live(get_renderable=self.picture, console=console, transient=True, refresh_per_second=1 / every)
+        self._live.start()
+
+    def _count(self, kind: str, details: dict[str, Any]) -> None:
+        super()._count(kind, details)
+        if "known" in details:
+            self._known[details.get("flow", "")] = details["known"]
+
+    def close(self) -> None:
+        self._live.stop()
+        super().close()
+
+    def picture(self) -> Group:
+        """What the display shows now."""
+        with self._lock:
+            now = time.monotonic()
+            active = [(name, step) for name, step in self._steps.items() if step.running]
+            # Side by side, as many as run now; those that are still to come may find more room or less.
+            width = max(1, sum(len(step.running) for _, step in active))
+            left = sum(step.work_left(now) or 0.0 for step in self._steps.values()) / width
+            ended, known = (sum(step.ended for step in self._steps.values()), sum(self._known.values()))
+            rows = Table.grid(padding=(0, 1), expand=True)
+            rows.add_column(no_wrap=True, overflow="ellipsis", max_width=24)
+            rows.add_column(width=10)
+            for _ in range(2):
+                rows.add_column(no_wrap=True, justify="right")
+            rows.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
+            rows.add_row(
+                "[bold]all steps",
+                ProgressBar(max(known, ended, 1), ended),
+                f"{ended} of {max(known, ended)}",
+                _clock(now - self._begun),
+                f"at least {_clock(left)} left" if left else "",
+            )
+            for name, step in active[:_MOST_ROWS]:
+                rows.add_row(escape(name), *_row(step, now))
+            more = len(active) - _MOST_ROWS
+            return Group(rows, f"[dim]and {more} more steps[/]") if more > 0 else Group(rows)
+
+
+def _row(step: _Step, now: float) -> Iterable[Any]:
+    """Bar, count, remaining time and note of a step that runs."""
+    nodes = list(step.running.items())
+    part = sum(node.done / node.total for _, node in nodes if node.total > 0)
+    work = step.work_left(now)
+    left = "" if work is None else f"{_clock(work / len(nodes))} left"
+    if step.known == 1:
+        node = nodes[0][1]
+        note, count = node.note, f"{node.done} of {node.total}" if node.total else ""
+    else:
+        items = [label.partition("[")[2].rstrip("]") or label for label, _ in nodes]
+        note, count = ", ".join(items), f"{step.ended} of {step.known}"
+    return ProgressBar(max(step.known, 1), step.ended + part), count, left, f"[dim]{escape(note)}[/]"
+
+
+def _clock(seconds: float) -> str:
+    """Hours, minutes and seconds: "0:05:10"."""
+    return str(timedelta(seconds=round(seconds)))
+
+
+class Log(_Steps):
+    """Plain lines, for a file or a pipe: one a step, and now and then one for each node that runs for long.
+
+    every: seconds between two lines of a running node.
+    """
+
+    def __init__(self, console: Console, *, every: float = ALIVE_SECONDS) -> None:
+        super().__init__(console, worth=0.0)
+        self._closed = threading.Event()
+        self._beat = threading.Thread(target=self._say_alive, args=(every,), name="alive", daemon=True)
+        self._beat.start()
+
+    def close(self) -> None:
+        self._closed.set()
+        self._beat.join()
+        super().close()
 
     def _say_alive(self, every: float) -> None:
         while not self._closed.wait(every):
             with self._lock:
                 now = time.monotonic()
                 lines = [
-                    f"{label}{self._progress.get(label, '')}, {now - begun:.0f} s so far"
-                    for label, begun in self._begun.items()
-                    if now - begun >= every
+                    f"{label}{_so_far(node)}, {now - node.begun:.0f} s so far"
+                    for step in self._steps.values()
+                    for label, node in step.running.items()
+                    if now - node.begun >= every
                 ]
             with contextlib.suppress(BrokenPipeError):  # nobody reads any more: the main thread will find out
                 for line in lines:
                     self.say("cyan", "runs", line)
+
+
+def _so_far(node: _Node) -> str:
+    """ ", 3 of 200 (level 2)", or nothing where the node said nothing."""
+    return f", {node.done} of {node.total}{f' ({node.note})' if node.note else ''}" if node.total else ""
