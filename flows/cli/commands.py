@@ -114,6 +114,13 @@ A cell that was not measured stays empty.""",
     "doctor": Entry(
         "setup:Doctor", "Tell whether this machine has all that runs need, and what to do where it has not."
     ),
+    "completion": Entry(
+        "setup:Completion",
+        """Print a script with which the shell completes commands and options at the Tab key.
+
+bash: ss-flow completion bash > ~/.local/share/bash-completion/completions/ss-flow
+zsh:  ss-flow completion zsh > FOLDER/_ss-flow, where FOLDER is in your $fpath""",
+    ),
 }
 
 

