@@ -43,6 +43,7 @@ class Scene(ctypes.Structure):
         *((name, _POINTER) for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "labels", "ids")),
         *((name, _INT32) for name in ("sh_coefficients", "sh_degree", "num_labels", "width", "height")),
         *((name, _DOUBLE) for name in ("fx", "fy", "cx", "cy")),
+        ("borders", _DOUBLE * 4),
         ("world_to_camera", _DOUBLE * 12),
         ("near_plane", _DOUBLE),
         ("background", _FLOAT * 3),

@@ -65,6 +65,7 @@ class NativePass:
             camera.fy,
             camera.cx,
             camera.cy,
+            (ctypes.c_double * 4)(*camera.borders),
             (ctypes.c_double * 12)(*np.asarray(camera.world_to_camera, np.float64)[:3].ravel()),
             NEAR_PLANE,
             (ctypes.c_float * 3)(*settings.background),

@@ -22,6 +22,21 @@ class Camera:
     cy: float
     world_to_camera: Float64
     """[4, 4] rigid."""
+    photo_borders: tuple[float, float, float, float] | None = None
+    """`borders` of the photo that this image is a part of; None where it is the whole photo."""
+
+    @property
+    def borders(self) -> tuple[float, float, float, float]:
+        """Slopes of the rays through the borders of the whole photo, also where only a part of it is left: x / z of the
+        left border, y / z of the upper, x / z of the right, y / z of the lower one."""
+        if self.photo_borders is not None:
+            return self.photo_borders
+        return (
+            -self.cx / self.fx,
+            -self.cy / self.fy,
+            (self.width - self.cx) / self.fx,
+            (self.height - self.cy) / self.fy,
+        )
 
     @property
     def center(self) -> Float64:
@@ -38,7 +53,9 @@ class Camera:
 
     def cropped(self, x0: int, y0: int, x1: int, y1: int) -> Camera:
         """The same camera with only the pixels x0 <= u < x1, y0 <= v < y1; the principal point may fall outside."""
-        return replace(self, width=x1 - x0, height=y1 - y0, cx=self.cx - x0, cy=self.cy - y0)
+        return replace(
+            self, width=x1 - x0, height=y1 - y0, cx=self.cx - x0, cy=self.cy - y0, photo_borders=self.borders
+        )
 
 
 def camera_of(cameras: Cameras, view: int) -> Camera:

@@ -15,13 +15,14 @@ using lanes::where_less;
 
 constexpr float kLog2E = 1.4426950408889634f;
 constexpr float kDilation = 0.3f;         // pixels^2 added to the screen covariance
+constexpr double kBeyond = 0.15;          // share of the photo's width or height that limits of slopes lie beyond it
 constexpr float kMinAlpha = 1.0f / 255;   // contributions below are skipped
 constexpr float kLog2MinAlpha = -7.994353436858858f;
 
 struct View {
     float R[3][3], t[3], center[3];
     float fx, fy, cx, cy, near_plane;
-    float tan_x, tan_y;  // the Jacobian is evaluated no further than this off the axis
+    float low_x, high_x, low_y, high_y;  // the slopes x / z, y / z between which the Jacobian is evaluated
 };
 
 inline View view_of(const Scene& s) {
@@ -34,10 +35,11 @@ inline View view_of(const Scene& s) {
     }
     v.fx = (float)s.fx, v.fy = (float)s.fy, v.cx = (float)s.cx, v.cy = (float)s.cy;
     v.near_plane = (float)s.near_plane;
-    const double far_x = std::fmax(std::fabs(s.cx), std::fabs(s.width - s.cx)) / s.fx;
-    const double far_y = std::fmax(std::fabs(s.cy), std::fabs(s.height - s.cy)) / s.fy;
-    v.tan_x = (float)std::fmax(2.0, 1.3 * far_x);
-    v.tan_y = (float)std::fmax(2.0, 1.3 * far_y);
+    // As gsplat does, and for a principal point in the middle 3DGS. Of the photo and not of a crop of it: a crop shows
+    // what the photo shows there.
+    const double beyond_x = kBeyond * (s.borders[2] - s.borders[0]), beyond_y = kBeyond * (s.borders[3] - s.borders[1]);
+    v.low_x = (float)(s.borders[0] - beyond_x), v.high_x = (float)(s.borders[2] + beyond_x);
+    v.low_y = (float)(s.borders[1] - beyond_y), v.high_y = (float)(s.borders[3] + beyond_y);
     return v;
 }
 
@@ -78,9 +80,9 @@ inline Footprint project(const Scene& s, const View& view, const Rows& rows) {
     f.inv_z = 1.0f / f.z;
     f.tx = f.x * f.inv_z, f.ty = f.y * f.inv_z;
     f.u = view.fx * f.tx + view.cx, f.v = view.fy * f.ty + view.cy;
-    f.free_x = 1.0f - less(splat(view.tan_x), lanes::absolute(f.tx));
-    f.free_y = 1.0f - less(splat(view.tan_y), lanes::absolute(f.ty));
-    f.tx = lanes::clamp(f.tx, -view.tan_x, view.tan_x), f.ty = lanes::clamp(f.ty, -view.tan_y, view.tan_y);
+    f.free_x = 1.0f - less(f.tx, splat(view.low_x)) - less(splat(view.high_x), f.tx);
+    f.free_y = 1.0f - less(f.ty, splat(view.low_y)) - less(splat(view.high_y), f.ty);
+    f.tx = lanes::clamp(f.tx, view.low_x, view.high_x), f.ty = lanes::clamp(f.ty, view.low_y, view.high_y);
     f.j00 = view.fx * f.inv_z, f.j02 = -f.j00 * f.tx;
     f.j11 = view.fy * f.inv_z, f.j12 = -f.j11 * f.ty;
 

@@ -19,6 +19,8 @@ struct Scene {
     int32_t num_labels;
     int32_t width, height;
     double fx, fy, cx, cy;
+    double borders[4];            // of the whole photo: x / z of the left, y / z of the upper, x / z of the right, y / z
+                                  // of the lower one
     double world_to_camera[12];   // rows of [R | t]
     double near_plane;
     float background[3];

@@ -45,7 +45,16 @@ def sh_basis(degree: int, d: Tensor) -> Tensor:
     return torch.stack(out, dim=1)
 
 
-def render(parameters, camera, background, labels=None, num_labels=0, sh_degree=0, near=0.01) -> dict[str, Tensor]:
+def slope_limits(camera) -> list[tuple[float, float]]:
+    """gsplat's rule: three tenths of the tangent of half the field of view beyond the photo's borders, x / z, y / z."""
+    left, top, right, bottom = camera.borders
+    half_x, half_y = (right - left) / 2, (bottom - top) / 2
+    return [(left - 0.3 * half_x, right + 0.3 * half_x), (top - 0.3 * half_y, bottom + 0.3 * half_y)]
+
+
+def render(
+    parameters, camera, background, labels=None, num_labels=0, sh_degree=0, near=0.01, limits=None
+) -> dict[str, Tensor]:
     means, quaternions, log_scales, opacity_logits, sh = parameters
     to_camera = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)
     rotation, translation = to_camera[:3, :3], to_camera[:3, 3]
@@ -53,9 +62,7 @@ def render(parameters, camera, background, labels=None, num_labels=0, sh_degree=
     x, y, z = local.unbind(1)
     keep = z > near
     safe = torch.where(keep, z, torch.ones_like(z))
-    limit_x = max(2.0, 1.3 * max(abs(camera.cx), abs(camera.width - camera.cx)) / camera.fx)
-    limit_y = max(2.0, 1.3 * max(abs(camera.cy), abs(camera.height - camera.cy)) / camera.fy)
-    tx, ty = (x / safe).clamp(-limit_x, limit_x), (y / safe).clamp(-limit_y, limit_y)
+    tx, ty = ((a / safe).clamp(*limit) for a, limit in zip((x, y), limits or slope_limits(camera), strict=True))
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [

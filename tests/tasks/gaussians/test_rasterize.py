@@ -293,13 +293,53 @@ def test_equal_depths_are_blended_in_order_of_rows():
     assert int(out.top_contributor[6, 8]) == 0
 
 
-def test_a_crop_renders_as_the_crop_of_the_whole():
+def around(rng: np.random.Generator, n: int) -> GaussianTensors:
+    """Long Gaussians, most of them outside the picture, which reach into it."""
+    z = rng.uniform(0.6, 1.5, n)
+    arrays = (
+        np.column_stack([rng.uniform(-2.5, 2.5, n) * z, rng.uniform(-2.5, 2.5, n) * z, z]),
+        rng.normal(size=(n, 4)),
+        np.log(0.4) + rng.normal(size=(n, 3)) * 0.6,
+        rng.normal(size=n) - 2,
+        rng.normal(size=(n, 1, 3)) * 0.4,
+    )
+    return GaussianTensors(*(torch.tensor(a, dtype=torch.float32, requires_grad=True) for a in arrays))
+
+
+@pytest.mark.parametrize("cx", [20.3, 12.0, -5.0])
+def test_a_crop_renders_as_the_crop_of_the_whole(cx):
+    """To rounding: a crop's pixels are counted from another one."""
     rng = np.random.default_rng(3)
-    gaussians, camera = scene(rng, 200), camera_at(rng, 40, 30)
+    gaussians, camera = around(rng, 120), camera_at(rng, 40, 30, cx)
     whole = rasterize(gaussians, camera, background=(0, 0, 0))
-    part = rasterize(gaussians, camera.cropped(7, 5, 30, 22), background=(0, 0, 0))
+    crop = camera.cropped(7, 5, 30, 22)
+    part = rasterize(gaussians, crop, background=(0, 0, 0))
     off = (part.rgb - whole.rgb[5:22, 7:30]).abs()
     assert float(off.median()) < 1e-6 and float((off > 1e-3).float().mean()) < 0.002
+    as_a_photo = rasterize(gaussians, replace(crop, photo_borders=None), background=(0, 0, 0))
+    assert float((as_a_photo.rgb - whole.rgb[5:22, 7:30]).abs().mean()) > 5e-3  # else nothing would have been tested
+
+
+def test_slopes_end_where_those_of_3dgs_do():
+    """1.3 times the tangent of half the field of view (Kerbl et al. 2023, their code), of the photo and its crop."""
+    rng = np.random.default_rng(6)
+    gaussians = around(rng, 80)
+    camera = replace(camera_at(rng, 40, 30), cx=20.0, cy=15.0)
+    fields = 2 * np.arctan(camera.width / (2 * camera.fx)), 2 * np.arctan(camera.height / (2 * camera.fy))
+    limits = [(-1.3 * np.tan(field / 2), 1.3 * np.tan(field / 2)) for field in fields]
+    background = torch.zeros(3, dtype=torch.float64)
+    for seen in (camera, camera.cropped(0, 8, 16, 30).scaled(8, 11)):
+        theirs = reference.render(doubles(gaussians), seen, background, limits=limits)
+        assert relative(rasterize(gaussians, seen, background=(0, 0, 0)).rgb, theirs["rgb"]) < 1e-4
+        wider = reference.render(doubles(gaussians), seen, background, limits=[(-2, 2), (-2, 2)])
+        assert relative(wider["rgb"], theirs["rgb"]) > 1e-2
+
+
+def test_images_and_gradients_of_what_lies_outside_agree_with_the_reference():
+    rng = np.random.default_rng(7)
+    for cx in (20.3, 4.0, 44.0):
+        compare(around(rng, 60), camera_at(rng, 40, 30, cx), tolerance=1e-3)
+        compare(around(rng, 60), camera_at(rng, 40, 30, cx).cropped(20, 3, 40, 21), tolerance=1e-3)
 
 
 def test_the_same_call_gives_the_same_bytes():
