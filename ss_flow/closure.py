@@ -250,13 +250,23 @@ def _top_level(body: list[ast.stmt]) -> Iterator[ast.stmt]:
 
 def _bound_names(statement: ast.stmt) -> list[str]:
     match statement:
-        case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+        case ast.FunctionDef(decorator_list=decorators):
+            return [statement.name, *dict.fromkeys(_dispatching(decorators))]
+        case ast.AsyncFunctionDef() | ast.ClassDef():
             return [statement.name]
         case ast.Assign():
             return [n.id for target in statement.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
         case ast.AnnAssign(target=ast.Name(id=name)) | ast.AugAssign(target=ast.Name(id=name)):
             return [name]
     return []
+
+
+def _dispatching(decorators: list[ast.expr]) -> Iterator[str]:
+    """The functions of `functools.singledispatch` that `@f.register` and `@f.register(type)` add a branch to."""
+    for decorator in decorators:
+        match decorator.func if isinstance(decorator, ast.Call) else decorator:
+            case ast.Attribute(value=ast.Name(id=function), attr="register"):
+                yield function
 
 
 def _imports(module: _Module, nodes: Any) -> Imports:

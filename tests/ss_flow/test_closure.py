@@ -182,3 +182,30 @@ def test_of_two_things_imported_under_one_name_both_are_followed(package):
             return chosen(x)
     """
     assert {"probe.maths.twice", "probe.maths.unrelated"} <= set(package(step=step, maths=MATHS))
+
+
+def test_the_branches_of_single_dispatch_belong_to_the_function(package):
+    step = """
+    import functools
+    from probe.maths import twice
+
+    def run(x):
+        return told(x)
+
+    @functools.singledispatch
+    def told(x):
+        return x
+
+    @told.register
+    def _(x: int):
+        return twice(x)
+
+    @told.register(list)
+    @told.register(tuple)
+    def _(x):
+        return 3
+    """
+    found = package(step=step, maths=MATHS)
+    assert "probe.maths.twice" in found
+    edited = package(step=step.replace("return 3", "return 4"), maths=MATHS)
+    assert {name for name in found if found[name] != edited[name]} == {"probe.step.told"}
