@@ -161,30 +161,19 @@ def photo_lenses(frames: Sequence[Frame], cameras: Cameras, scene_files: SceneFi
 
 def write_report(file: Path, results: Results, document: dict[str, Any], instances: dict[str, Any]) -> None:
     """Write report.html, whole or not at all. instances: the document of instances.json."""
-    from ss_flow.tasks.deliver.report import Insight, Votes, report_html, report_pictures
+    from ss_flow.tasks.deliver.report import Insight, Votes, report_html
     from ss_flow.tasks.deliver.suspects import suspects
-    from ss_flow.tasks.deliver.thumbnails import shares_of_views, thumbnails
 
-    frames, cameras, depths, maps = (
-        results.all("ingest"),
-        results.one("cameras"),
-        results.all("depth"),
-        results.all("masks"),
-    )
-    pictures = report_pictures(frames, cameras, depths, results.all("masks_split"), maps, results.one("scene"))
     doubtful = suspects(
         results.all("refine"),
         instances,
         results.one("hierarchy"),
         spacing=results.one("dense").spacing,
-        num_views=len(frames),
+        num_views=len(results.digests["ingest"]),
     )
-    insight = Insight(
-        thumbnails(frames, maps, [entry["id"] for entry in instances["instances"]]),
-        shares_of_views(maps),
-        doubtful,
-        Votes.of(results.one("propagate"), document["params"]["split.propagate.tau_label"]),
-    )
+    votes = Votes.of(results.one("propagate"), document["params"]["split.propagate.tau_label"])
+    insight = Insight(results.all("thumbnails"), doubtful, votes)
+    pictures = results.all("report_pictures")
     write_atomically(file, report_html(document, pictures=pictures, instances=instances, insight=insight))
 
 

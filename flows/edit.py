@@ -17,7 +17,7 @@ from ss_flow.events import Reporter
 from ss_flow.flows.deliver import failure_records, node_records
 from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check
-from ss_flow.flows.results import FinishedRun, finished_run, read_run
+from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run
 from ss_flow.graph import labelled
 from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
@@ -26,6 +26,7 @@ from ss_flow.tasks.deliver.output import RUN_FILE, check_place, replacing, write
 from ss_flow.tasks.edit.fill import fill
 from ss_flow.tasks.edit.holes import Holes, Measured, holes
 from ss_flow.tasks.edit.operations import begin
+from ss_flow.tasks.edit.pictures import before_and_after
 
 _NEEDED = ("scene", "cameras", "depth", "dense", "cut")
 _CAPTURE = ("ingest", "cameras", "depth", "dense")
@@ -44,8 +45,8 @@ class Edit:
     """Those of the edited scene."""
 
     def build(self) -> dict[str, Any]:
-        """Add the script's nodes to a flow: "scene", and for each operation N after which something has left its place
-        "holes_N", and "unfilled_N" where its holes are filled."""
+        """Add the script's nodes to a flow: "scene", "report_pictures", and for each operation N after which something
+        has left its place "holes_N", and "unfilled_N" where its holes are filled."""
         results = self.source.results
         measured = Measured(*(results.node(name) for name in _NEEDED[1:]))
         scene = begin(results.node("scene"))
@@ -59,7 +60,8 @@ class Edit:
                     after = fill(scene, after, measured, **left)
                     outputs[f"unfilled_{step.number}"] = holes(scene, after, measured, **left)
             scene = after
-        return outputs | {"scene": scene}
+        pictures = before_and_after(results.node("scene"), scene, results.node("cameras"))
+        return outputs | {"scene": scene, "report_pictures": pictures}
 
 
 def open_edit(source: Path, script: Mapping[str, Any], store: Store, folder: Path = Path()) -> Edit:
@@ -105,12 +107,11 @@ def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None =
 
 def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, Any]:
     from ss_flow.tasks.deliver.report import report_html
-    from ss_flow.tasks.edit.pictures import before_and_after
 
     results = edit.source.results.digests
-    scene: EditedScene = store.get(report.values["scene"])  # type: ignore[arg-type]
+    made = Results(store, report.values)
+    scene: EditedScene = made.one("scene")
     instances = edit.objects.document(edit.source.instances, scene)
-    found: dict[str, Holes] = {n: store.get(value) for n, value in report.values.items() if n != "scene"}  # type: ignore[arg-type]
     document = {
         "status": "ok",
         "warnings": [{"label": n["label"], "text": text} for n in report.nodes for text in n.get("warnings", ())],
@@ -125,25 +126,24 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
         "edit": {
             "source": str(edit.source.folder.resolve()),
             "script": edit.script,
-            "holes": [_told(step, found) for step in edit.steps if step.leaving],
+            "holes": [_told(step, made) for step in edit.steps if step.leaving],
             "num_filled": int(scene.filled.sum()),
         },
     }
     code = kept_closure(_deliver, store.closures).definitions
     document["content"] = digest({"results": report.values, "instances": instances, "code": code})
-    pictures = before_and_after(store.get(results["scene"]), scene, store.get(results["cameras"]))
     with replacing(out) as filling:
         write_scene(filling, scene, instances)
-        html = report_html(document, pictures=pictures, instances=instances)
+        html = report_html(document, pictures=made.all("report_pictures"), instances=instances)
         (filling / "report.html").write_text(html, encoding="utf-8")
         document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
     return document
 
 
-def _told(step: Step, found: Mapping[str, Holes]) -> dict[str, Any]:
+def _told(step: Step, made: Results) -> dict[str, Any]:
     """What run.json says of the holes that an operation left."""
-    hole = found[f"holes_{step.number}"]
+    hole: Holes = made.one(f"holes_{step.number}")
     told = {
         "operation": step.number,
         "instances": list(step.leaving),
@@ -154,5 +154,5 @@ def _told(step: Step, found: Mapping[str, Holes]) -> dict[str, Any]:
         "largest_area": round(float(hole.area.max(initial=0)), 6),
     }
     if step.fill:
-        told["open_after_filling"] = int(found[f"unfilled_{step.number}"].unmeasured.sum())
+        told["open_after_filling"] = int(made.one(f"unfilled_{step.number}").unmeasured.sum())
     return told

@@ -14,6 +14,8 @@ from ss_flow.flows.splat import splat
 from ss_flow.flows.split import Networks, split
 from ss_flow.graph import each, labelled
 from ss_flow.tasks.artifacts import Cameras, DenseDescriptors, Gaussians
+from ss_flow.tasks.deliver.report_pictures import report_pictures
+from ss_flow.tasks.deliver.thumbnails import thumbnails
 from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.evaluate.novel_view import novel_view
 from ss_flow.tasks.models.catalogue import Model
@@ -78,6 +80,10 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         if held_out.truth is not None:
             results["truth_held_out"] = held_out.truth
         results["novel_view"] = novel_view(held_out.frames, held_out.cameras, results["scene"])
+    results["report_pictures"] = report_pictures(
+        capture.frames, capture.cameras, capture.depths, masks_split, results["masks"], results["scene"]
+    )
+    results["thumbnails"] = thumbnails(capture.frames, results["masks"])
     if networks.patches is not None:
         results["dense_descriptors"] = dense_descriptors(results["scene"], capture.cameras, networks.patches, params)
     results["names"] = name(results["describe"], encoder=networks.encoder)

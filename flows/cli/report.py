@@ -12,10 +12,7 @@ from rich.markup import escape
 from ss_flow.flows.cli.context import StoreOptions, console, open_run
 from ss_flow.flows.deliver import write_report
 
-_SHOWN = (
-    *("ingest", "cameras", "depth", "dense", "propagate", "hierarchy"),
-    *("refine", "masks_split", "masks", "scene"),
-)
+_SHOWN = ("ingest", "dense", "propagate", "hierarchy", "refine", "report_pictures", "thumbnails")
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from ss_flow.tasks.artifacts import (
     UInt8,
     Visibility,
 )
+from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, decompressed
 from ss_flow.tasks.deliver.contact_sheet import FAINT, INK, as_picture, blank, caption, contact_sheet, table_picture
 from ss_flow.tasks.deliver.palette import depth_colors, instance_colors, paint_ids, turbo
 from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
@@ -124,6 +125,11 @@ def _caption(item: object, index: int) -> str:
 @_draw.register
 def _(value: Frame, context: Context) -> UInt8:
     return decode_rgb(value)
+
+
+@_draw.register
+def _(value: Picture | Thumbnail, context: Context) -> UInt8:
+    return decompressed(value.content)
 
 
 @_draw.register

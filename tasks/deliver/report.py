@@ -11,12 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, PointLabels, UInt8
-from ss_flow.tasks.deliver.draw import draw
-from ss_flow.tasks.deliver.palette import instance_colors
-from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
+from ss_flow.tasks.artifacts import PointLabels, UInt8
+from ss_flow.tasks.deliver.compressed import Picture, Thumbnail
 from ss_flow.tasks.deliver.timeline import timeline
-from ss_flow.tasks.geometry.images import encode_png
 
 _KINDS = {
     "photo": "Photo",
@@ -47,7 +44,6 @@ _METRIC_NAMES = {
     "num_predicted": "Predicted instances",
 }
 _STAGES = {"split": "After Split", "refined": "Refined masks", "splat": "After Splat", "novel_view": "Novel views"}
-_WIDEST = 960
 _BINS = 10
 
 
@@ -83,10 +79,8 @@ class Votes:
 class Insight:
     """What a report tells of a run besides its documents."""
 
-    thumbnails: Mapping[int, UInt8]
-    """A small picture of each instance."""
-    shares: Mapping[int, float]
-    """How much of all pixels of all views each instance fills."""
+    thumbnails: Sequence[Thumbnail]
+    """Of the instances that a view shows."""
     suspects: Sequence[Mapping[str, Any]]
     """What `suspects.suspects` found."""
     votes: Votes
@@ -95,17 +89,16 @@ class Insight:
 def report_html(
     run: Mapping[str, Any],
     *,
-    pictures: Mapping[str, UInt8 | bytes],
+    pictures: Sequence[Picture],
     instances: Mapping[str, Any] | None = None,
     insight: Insight | None = None,
 ) -> str:
     """The report of a run.
 
     run: the document of run.json ("status", "scene", "params", "models", "metrics", "nodes", "warnings", "failures";
-    any may be missing). pictures: each [H, W, 3] RGB or the bytes of a PNG or JPEG, under "view/kind" with the kinds
-    photo, masks_split, masks, render, depth, which are shown in one row a view; any other name is the picture's
-    caption. instances: the document of instances.json. Those that fill most of the views come first, walls and floors
-    after things, and crumbs are folded away.
+    any may be missing). pictures: named "VIEW/KIND" with the kinds photo, masks_split, masks, render, depth, which are
+    shown in one row a view, or by their caption. instances: the document of instances.json. Those that fill most of the
+    views come first, walls and floors after things, and crumbs are folded away.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -113,7 +106,8 @@ def report_html(
     template = resources.files(__package__ or "").joinpath("report.html.jinja").read_text(encoding="utf-8")
     views, others = _views(pictures)
     nodes = list(run.get("nodes") or ())
-    shares = insight.shares if insight else {}
+    thumbnails = {one.instance_id: one for one in insight.thumbnails} if insight else {}
+    shares = {i: one.share for i, one in thumbnails.items()}
     listed = sorted(
         (instances or {}).get("instances", []),
         key=lambda e: (e["kind"] == "stuff", -shares.get(e["id"], 0.0), -e["num_points"]),
@@ -137,55 +131,22 @@ def report_html(
         instances=[entry for entry in listed if not entry["crumb"]],
         crumbs=[entry for entry in listed if entry["crumb"]],
         shares=shares,
-        thumbnails={i: data_uri(picture) for i, picture in insight.thumbnails.items()} if insight else {},
+        thumbnails={i: _data_uri(one.content) for i, one in thumbnails.items()},
         suspects=insight.suspects if insight else (),
         votes=insight.votes if insight else None,
         timeline=timeline(nodes),
     )
 
 
-def report_pictures(
-    frames: Sequence[Frame],
-    cameras: Cameras,
-    depths: Sequence[DepthMap],
-    split_maps: Sequence[LabelMap],
-    maps: Sequence[LabelMap],
-    scene: Gaussians,
-    *,
-    count: int = 3,
-) -> dict[str, UInt8]:
-    """The pictures of a report: `count` views, evenly chosen, and the scene's Gaussians and cameras.
-
-    All lists are in the order of the frames. An empty scene has no renderings.
-    """
-    chosen = sorted({int(k) for k in (np.arange(count) + 0.5) * len(frames) / count})
-    pictures: dict[str, UInt8] = {}
-    for k in chosen:
-        name = frames[k].name
-        pictures[f"{name}/photo"] = draw(frames[k])
-        pictures[f"{name}/masks_split"] = draw(split_maps[k], frame=frames[k])
-        pictures[f"{name}/masks"] = draw(maps[k], frame=frames[k])
-        if len(scene):
-            pictures[f"{name}/render"] = draw(scene, cameras=cameras, view=k)
-        pictures[f"{name}/depth"] = draw(depths[k])
-    if len(scene):
-        colors = instance_colors(int(scene.instance_id.max()) + 1)[scene.instance_id]
-        camera = orbit_camera(scene.means, cameras)
-        spacing = 2 * float(np.exp(np.median(scene.log_scales)))
-        pictures["Instances"] = draw_points(scene.means, colors, camera, spacing)
-    pictures["Cameras"] = draw(cameras)
-    return pictures
-
-
-def _views(pictures: Mapping[str, UInt8 | bytes]) -> tuple[list[dict[str, Any]], list[dict[str, str]]]:
+def _views(pictures: Sequence[Picture]) -> tuple[list[dict[str, Any]], list[dict[str, str]]]:
     rows: dict[str, dict[str, str]] = {}
     others = []
-    for name, picture in pictures.items():
-        view, _, kind = name.rpartition("/")
+    for picture in pictures:
+        view, _, kind = picture.name.rpartition("/")
         if view and kind in _KINDS:
-            rows.setdefault(view, {})[kind] = data_uri(picture)
+            rows.setdefault(view, {})[kind] = _data_uri(picture.content)
         else:
-            others.append({"caption": name, "uri": data_uri(picture)})
+            others.append({"caption": picture.name, "uri": _data_uri(picture.content)})
     views = [
         {"name": view, "pictures": [{"caption": _KINDS[kind], "uri": found[kind]} for kind in _KINDS if kind in found]}
         for view, found in rows.items()
@@ -193,21 +154,9 @@ def _views(pictures: Mapping[str, UInt8 | bytes]) -> tuple[list[dict[str, Any]],
     return views, others
 
 
-def data_uri(picture: UInt8 | bytes) -> str:
-    """A picture as a data URI; arrays are scaled down to 960 px and become PNG or JPEG, whichever is smaller."""
-    import cv2
-
-    if isinstance(picture, bytes):
-        data = picture
-    else:
-        scale = _WIDEST / picture.shape[1]
-        if scale < 1:
-            size = (_WIDEST, max(1, round(picture.shape[0] * scale)))
-            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-        jpeg = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 88])[
-            1
-        ].tobytes()
-        data = min(encode_png(picture).tobytes(), jpeg, key=len)
+def _data_uri(content: UInt8) -> str:
+    """The bytes of a PNG or JPEG file as a data URI."""
+    data = content.tobytes()
     kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
+from ss_flow.task import task
 from ss_flow.tasks.artifacts import Frame, LabelMap, UInt8
+from ss_flow.tasks.deliver.compressed import Thumbnail, compressed
 from ss_flow.tasks.geometry.images import decode_rgb
 
 _SIDE = 128
@@ -16,35 +18,32 @@ _DIMMED = 0.3
 """Brightness that the surroundings keep, towards white."""
 
 
-def thumbnails(frames: Sequence[Frame], maps: Sequence[LabelMap], ids: Iterable[int]) -> dict[int, UInt8]:
-    """A square picture [128, 128, 3] of each instance that a view shows, its surroundings faded.
+@task()
+def thumbnails(frames: Sequence[Frame], maps: Sequence[LabelMap]) -> tuple[Thumbnail, ...]:
+    """A square picture [128, 128, 3] of each instance that a view shows, its surroundings faded; by rising id.
 
     frames, maps: of all views, in one order. Each photo is decoded once.
     """
-    asked = set(ids)
+    filled: dict[int, int] = {}
     best: dict[int, tuple[int, int]] = {}
     """Pixels and view of each instance; the first of equals."""
+    pixels_of_all = 0
     for view, one in enumerate(maps):
-        present, area = np.unique(one.ids, return_counts=True)
-        for instance, pixels in zip(present.tolist(), area.tolist(), strict=True):
-            if instance in asked and pixels > best.get(instance, (0, 0))[0]:
-                best[instance] = pixels, view
-    pictures: dict[int, UInt8] = {}
-    for view in sorted({view for _, view in best.values()}):
-        photo = decode_rgb(frames[view])
-        for instance in (i for i, (_, of) in best.items() if of == view):
-            pictures[instance] = _cut_out(photo, maps[view].ids == instance)
-    return pictures
-
-
-def shares_of_views(maps: Sequence[LabelMap]) -> dict[int, float]:
-    """How much of all pixels of all views each instance fills: what it matters to who looks."""
-    area: dict[int, int] = {}
-    for one in maps:
+        pixels_of_all += one.ids.size
         for instance, pixels in zip(*(x.tolist() for x in np.unique(one.ids, return_counts=True)), strict=True):
-            area[instance] = area.get(instance, 0) + pixels
-    whole = sum(one.ids.size for one in maps)
-    return {instance: pixels / whole for instance, pixels in area.items()}
+            filled[instance] = filled.get(instance, 0) + pixels
+            if instance and pixels > best.get(instance, (0, 0))[0]:
+                best[instance] = pixels, view
+    shown: dict[int, list[int]] = {}
+    for instance in sorted(best):
+        shown.setdefault(best[instance][1], []).append(instance)
+    found = []
+    for view, instances in shown.items():
+        photo, ids = decode_rgb(frames[view]), maps[view].ids
+        for instance in instances:
+            picture = compressed(_cut_out(photo, ids == instance))
+            found.append(Thumbnail(instance, filled[instance] / pixels_of_all, picture))
+    return tuple(sorted(found, key=lambda one: one.instance_id))
 
 
 def _cut_out(photo: UInt8, mask: np.ndarray) -> UInt8:

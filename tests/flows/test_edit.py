@@ -13,6 +13,7 @@ from tiny_runs import bytes_of, ss_flow
 from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
 
 SCENE_FILES = ("scene.ply", "scene_labeled.ply", "instances.json")
+PICTURES = "edit.pictures.before_and_after"
 
 
 def edit(warm, *operations: dict, out: str = "edited"):
@@ -41,7 +42,7 @@ def test_dropping_the_last_operation_gives_the_bytes_before_and_computes_nothing
     first, last = {"op": "recolour", "instances": own, "color": "#2040ff"}, {"op": "remove", "instances": own}
     _, alone = edit(warm, first, out="alone")
     called, _ = edit(warm, first, last)
-    assert called.computed() == {"edit.remove": 1, "edit.holes": 1}
+    assert called.computed() == {"edit.remove": 1, "edit.holes": 1, PICTURES: 1}
     again, place = edit(warm, first)
     assert again.computed() == {}
     assert {n: (place / n).read_bytes() for n in SCENE_FILES} == {n: (alone / n).read_bytes() for n in SCENE_FILES}
@@ -52,7 +53,7 @@ def test_changing_the_last_operation_computes_only_that(warm):
     turn = {"op": "transform", "instances": own, "rotate": {"axis": [0, 0, 1], "degrees": 30}}
     edit(warm, turn, {"op": "recolour", "instances": own, "color": [255, 0, 0]})
     called, _ = edit(warm, turn, {"op": "recolour", "instances": own, "color": [0, 255, 0]})
-    assert called.computed() == {"edit.recolour": 1}
+    assert called.computed() == {"edit.recolour": 1, PICTURES: 1}
 
 
 def test_the_folder_tells_its_source_its_script_and_the_holes(warm):

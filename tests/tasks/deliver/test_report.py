@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, PointLabels
-from ss_flow.tasks.deliver.report import Insight, Votes, data_uri, report_html, report_pictures
+from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, compressed, decompressed
+from ss_flow.tasks.deliver.report import Insight, Votes, report_html
+from ss_flow.tasks.deliver.report_pictures import report_pictures
 from ss_flow.tasks.deliver.timeline import timeline
 from ss_flow.tasks.geometry.images import encode_png
 
 PHOTO = np.random.default_rng(0).integers(0, 256, (60, 80, 3), np.uint8)
+FILE = compressed(PHOTO)
 RUN = {
     "status": "degraded",
     "scene": "my <room> & more",
@@ -62,7 +65,8 @@ class Page(HTMLParser):
 
 
 def test_the_page_is_well_formed_and_loads_nothing():
-    html = report_html(RUN, pictures={"a/photo": PHOTO, "Cameras": PHOTO}, instances={"instances": [INSTANCE]})
+    pictures = [Picture("a/photo", FILE), Picture("Cameras", FILE)]
+    html = report_html(RUN, pictures=pictures, instances={"instances": [INSTANCE]})
     page = Page(html)
     assert page.open == []
     assert len(page.addresses) == 2 and all(a.startswith("data:image/") for a in page.addresses)
@@ -70,7 +74,7 @@ def test_the_page_is_well_formed_and_loads_nothing():
 
 
 def test_what_the_run_says_is_on_the_page():
-    page = Page(report_html(RUN, pictures={}, instances={"instances": [INSTANCE]}))
+    page = Page(report_html(RUN, pictures=(), instances={"instances": [INSTANCE]}))
     for text in (
         "my <room> & more", "degraded", "mIoU 0.812", "PSNR 27.31 dB", "SSIM 0.900", "After Split", "Novel views",
         "rgb-d graph", "split.tau_depth 0.02", "split.grids (1, 4)", "seed –", "splat.reconstruct 3: loss is <NaN>",
@@ -84,32 +88,32 @@ def test_crumbs_are_folded_away_and_stuff_comes_after_things():
         return INSTANCE | {"name": name, "weak": False} | changes
 
     listed = [entry("wall", kind="stuff", num_points=9), entry("speck", crumb=True), entry("mug", num_points=5)]
-    text = Page(report_html(RUN, pictures={}, instances={"instances": listed})).text
+    text = Page(report_html(RUN, pictures=(), instances={"instances": listed})).text
     assert text.index("mug") < text.index("wall") < text.index("1 crumbs") < text.index("speck")
 
 
 def test_metrics_read_as_words_and_counts_as_whole_numbers():
     metrics = {"split": {"hungarian_miou": 0.5, "over_segmentation": 0.25, "num_truth": 13.0, "some_new_figure": 1.0}}
-    text = Page(report_html({"metrics": metrics}, pictures={})).text
+    text = Page(report_html({"metrics": metrics}, pictures=())).text
     for words in ("mIoU, one-to-one 0.500", "Instances split up 0.250", "True instances 13 ", "Some new figure 1.000"):
         assert words in text, words
     assert "_" not in text
 
 
 def test_of_a_scenes_place_only_its_name_is_shown():
-    html = report_html({**RUN, "scene": "/home/someone/captures/kitchen"}, pictures={})
+    html = report_html({**RUN, "scene": "/home/someone/captures/kitchen"}, pictures=())
     assert "<h1>kitchen</h1>" in html and "someone" not in html
 
 
 def test_warnings_are_told_once():
     warnings = [{"label": "capture.registration", "text": "Depth <does> not fit."}]
-    html = report_html({"warnings": warnings}, pictures={})
+    html = report_html({"warnings": warnings}, pictures=())
     assert html.count("Depth &lt;does&gt; not fit.") == 1 and "(capture.registration)" in html
-    assert "Warnings" not in report_html({"warnings": []}, pictures={})
+    assert "Warnings" not in report_html({"warnings": []}, pictures=())
 
 
 def test_failures_by_label_are_told():
-    page = Page(report_html({"failures": [{"label": "reconstruct[3]", "error": "out of memory"}]}, pictures={}))
+    page = Page(report_html({"failures": [{"label": "reconstruct[3]", "error": "out of memory"}]}, pictures=()))
     assert "reconstruct[3]: out of memory" in page.text
 
 
@@ -124,24 +128,25 @@ def test_three_views_spread_over_the_capture_are_drawn():
     nothing = Gaussians(f.reshape(0, 3), f.reshape(0, 4), f.reshape(0, 3), f, f.reshape(0, 1, 3), i, f, i)
     pictures = report_pictures(frames, cameras, depths, maps, maps, nothing)
     kinds = ("photo", "masks_split", "masks", "depth")
-    assert list(pictures) == [*(f"{v}/{kind}" for v in ("v1", "v4", "v7") for kind in kinds), "Cameras"]
+    assert [one.name for one in pictures] == [*(f"{v}/{kind}" for v in ("v1", "v4", "v7") for kind in kinds), "Cameras"]
     few = report_pictures(frames[:2], cameras, depths[:2], maps[:2], maps[:2], nothing)
-    assert [name for name in few if name.endswith("photo")] == ["v0/photo", "v1/photo"]
+    assert [one.name for one in few if one.name.endswith("photo")] == ["v0/photo", "v1/photo"]
+    assert decompressed(pictures[0].content).shape == (h, w, 3)
 
 
 def test_the_time_of_a_hit_is_not_counted():
-    page = Page(report_html(RUN, pictures={}))
+    page = Page(report_html(RUN, pictures=()))
     assert "Computing time 1 min 20 s" in page.text
     assert "split.segment 2 1 4.00 s" in page.text and "splat.merge 1 0 1 min 16 s" in page.text
 
 
 def test_the_longest_step_has_the_full_bar():
-    html = report_html(RUN, pictures={})
+    html = report_html(RUN, pictures=())
     assert re.findall(r'<i style="width: ([\d.]+)%"', html) == ["5.3", "100.0"]
 
 
 def test_pictures_of_a_view_stand_together_in_a_fixed_order():
-    pictures = {"a/depth": PHOTO, "b/photo": PHOTO, "a/photo": PHOTO, "Cameras": PHOTO}
+    pictures = [Picture(name, FILE) for name in ("a/depth", "b/photo", "a/photo", "Cameras")]
     html = report_html(RUN, pictures=pictures)
     assert re.findall(r"<figcaption>(.*?)</figcaption>", html) == ["Photo", "Depth", "Photo", "Cameras"]
     assert re.findall(r"<h3>View (.*?)</h3>", html) == ["a", "b"]
@@ -153,13 +158,14 @@ def test_objects_are_pictured_by_how_much_they_matter_and_the_doubtful_ones_name
 
     votes = Votes.of(labels([0, 0.5, 0.9, 1.0], [0, 0, 3, 3]), 0.7)
     doubt = {"id": 3, "name": "small mug", "reasons": ["few views: it is seen in 2 of 20", "low <confidence>"]}
-    insight = Insight({3: PHOTO, 4: PHOTO}, {3: 0.001, 4: 0.25}, [doubt], votes)
+    insight = Insight([Thumbnail(3, 0.001, FILE), Thumbnail(4, 0.25, FILE)], [doubt], votes)
     listed = [entry(3, "small mug"), entry(4, "large box"), entry(5, "never shown")]
-    html = report_html(RUN, pictures={}, instances={"instances": listed}, insight=insight)
+    html = report_html(RUN, pictures=(), instances={"instances": listed}, insight=insight)
     text = Page(html).text
     assert "small mug (3) : few views: it is seen in 2 of 20; low <confidence>" in text
     pictured = re.findall(r'alt="(.*?)" loading', html)
-    assert pictured == ["large box", "small mug"] and "25.0 % of the pixels" in text
+    assert pictured == ["large box", "small mug"]
+    assert "25.0 % of the pixels" in text
     assert "50.0 % of the dense points carry a label" in text and "Of 25.0 % the best label" in text
     assert "voted for 25.0 %" in text
 
@@ -177,7 +183,7 @@ def test_agreement_is_told_by_tenths_of_the_points_that_have_votes():
 
 def test_stages_stand_side_by_side():
     metrics = {"split": {"miou": 0.5, "pq": 0.25}, "refined": {"miou": 0.625}, "splat": {"miou": 0.75, "pq": 0.125}}
-    text = Page(report_html({"metrics": metrics}, pictures={})).text
+    text = Page(report_html({"metrics": metrics}, pictures=())).text
     assert "After Split Refined masks After Splat mIoU 0.500 0.625 0.750 PQ 0.250 0.125" in text
 
 
@@ -199,32 +205,29 @@ def test_the_timeline_places_what_was_computed_and_leaves_out_the_cache():
 
 
 def test_memory_is_told_by_step():
-    assert "split.segment 2 1 4.00 s 812 MB" in Page(report_html(RUN, pictures={})).text
+    assert "split.segment 2 1 4.00 s 812 MB" in Page(report_html(RUN, pictures=())).text
 
 
 def test_an_empty_run_has_a_report_too():
-    page = Page(report_html({}, pictures={}))
+    page = Page(report_html({}, pictures=()))
     assert "unknown" in page.text and "How it was made" in page.text and "Instances" in page.text
 
 
-def decoded(uri: str) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), 1)[..., ::-1]
-
-
-def test_pictures_are_inside_in_the_smaller_form():
+def test_pictures_are_kept_in_the_smaller_form():
     flat = np.zeros((60, 80, 3), np.uint8)
-    assert data_uri(flat).startswith("data:image/png;") and data_uri(PHOTO).startswith("data:image/jpeg;")
-    np.testing.assert_array_equal(decoded(data_uri(flat)), flat)
+    assert compressed(flat)[:4].tobytes() == b"\x89PNG" and FILE[:2].tobytes() == b"\xff\xd8"
+    np.testing.assert_array_equal(decompressed(compressed(flat)), flat)
     smooth = cv2.resize(PHOTO, (320, 240), interpolation=cv2.INTER_CUBIC)
-    assert np.abs(decoded(data_uri(smooth)).astype(int) - smooth).mean() < 12
+    assert np.abs(decompressed(compressed(smooth)).astype(int) - smooth).mean() < 12
 
 
-def test_bytes_stay_as_they_are():
-    png = encode_png(PHOTO).tobytes()
-    uri = data_uri(png)
-    assert uri.startswith("data:image/png;") and base64.b64decode(uri.split(",")[1]) == png
+@pytest.mark.parametrize("kind", ["png", "jpeg"])
+def test_the_page_holds_the_files_as_they_are(kind):
+    content = encode_png(PHOTO) if kind == "png" else FILE
+    (uri,) = Page(report_html({}, pictures=[Picture("Cameras", content)])).addresses
+    assert uri.startswith(f"data:image/{kind};") and base64.b64decode(uri.split(",")[1]) == content.tobytes()
 
 
 @pytest.mark.parametrize("width, expected", [(2000, 960), (500, 500)])
 def test_large_pictures_are_scaled_down(width, expected):
-    assert decoded(data_uri(np.zeros((90, width, 3), np.uint8))).shape[1] == expected
+    assert decompressed(compressed(np.zeros((90, width, 3), np.uint8))).shape[1] == expected
