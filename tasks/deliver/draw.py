@@ -41,6 +41,8 @@ from ss_flow.tasks.models.colour_words import TERMS, ColourWords
 from ss_flow.tasks.semantics.query import QueryResult
 
 _MOST_ON_A_SHEET = 24
+_NARROW = 320
+"""Pixels below which the legend of a depth map takes two lines."""
 _ORIGINS = {FOUND: "", PROMPTED: " (re-prompted)", REFINED: " (refined)", DRAWN: " (from points)"}
 _TERM_COLORS = dict(grey="#8a8a8a", white="#e8e8e4", green="#2e8b45", yellow="#eac520", brown="#7b4a21", pink="#f08cb4")
 
@@ -155,8 +157,10 @@ def _(value: DepthMap, context: Context) -> UInt8:
 
 def _depth_legend(width: int, low: float, high: float, note: str) -> UInt8:
     ramp = np.repeat(turbo()[None, np.linspace(255, 0, width).astype(np.intp)], 10, axis=0)
-    line = caption(f"{low:.3g}   to   {high:.3g}   ({note})", width)
-    return np.concatenate([np.full((4, width, 3), 34, np.uint8), ramp, line])
+    lines = [f"{low:.3g}   to   {high:.3g}   ({note})"]
+    if width < _NARROW:
+        lines = [f"{low:.3g}   to   {high:.3g}", note]
+    return np.concatenate([np.full((4, width, 3), 34, np.uint8), ramp, *(caption(line, width) for line in lines)])
 
 
 @_draw.register

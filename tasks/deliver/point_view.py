@@ -12,6 +12,9 @@ _SKY = (244, 245, 247)
 _WIDEST = 4
 """Largest half-width of a point's square, pixels: more would hide what lies behind a near point."""
 
+_ONE_SIDE = 0.5
+"""Length of the mean of the photos' level viewing directions from which they are taken from one side; 1 = parallel."""
+
 
 def orbit_camera(
     points: Float32,
@@ -25,13 +28,13 @@ def orbit_camera(
     """A camera outside the points, a little above, that sees nearly all of them.
 
     points: [N, 3] world, N > 0. cameras: tell which way is up (photos are taken upright); without them it is the
-    direction in which the points spread least, away from their denser end.
+    direction in which the points spread least, away from their denser end. Where all photos are taken from about one
+    side, that side is azimuth 0: what they do not show is not worth looking at.
     """
     low, high = np.percentile(points, (2, 98), axis=0)
     center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
     up = _up(points - center, cameras)
-    east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    east /= np.linalg.norm(east)
+    east = _side(up, cameras)
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     around = np.cos(azimuth) * east + np.sin(azimuth) * np.cross(up, east)
     outward = np.cos(elevation) * around + np.sin(elevation) * up
@@ -39,6 +42,17 @@ def orbit_camera(
     eye = center + outward * radius / np.sin(half_fov) * 0.9
     focal = height / 2 / np.tan(half_fov)
     return Camera(width, height, focal, focal, width / 2, height / 2, looking(eye, -outward, up))
+
+
+def _side(up: Float64, cameras: Cameras | None) -> Float64:
+    """[3] the level direction of azimuth 0, unit."""
+    if cameras is not None and len(cameras):
+        towards = -cameras.world_to_camera[:, 2, :3].mean(axis=0)
+        towards -= up * (up @ towards)
+        if (agreed := float(np.linalg.norm(towards))) > _ONE_SIDE:
+            return towards / agreed
+    east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    return east / np.linalg.norm(east)
 
 
 def _up(centred: Float64, cameras: Cameras | None) -> Float64:

@@ -45,6 +45,7 @@ _METRIC_NAMES = {
 }
 _STAGES = {"split": "After Split", "refined": "Refined masks", "splat": "After Splat", "novel_view": "Novel views"}
 _BINS = 10
+_FOLDERS_OF_PHOTOS = ("color", "frames", "images", "input", "photos", "rgb")
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def report_html(
         key=lambda e: (e["kind"] == "stuff", -shares.get(e["id"], 0.0), -e["num_points"]),
     )
     return environment.from_string(template).render(
-        scene=PurePath(str(run.get("scene") or "")).name or "scene",
+        scene=_title(PurePath(str(run.get("scene") or ""))),
         status=run.get("status") or "unknown",
         models=_flat(run.get("models") or {}),
         metrics=_metrics(run.get("metrics") or {}),
@@ -136,6 +137,11 @@ def report_html(
         votes=insight.votes if insight else None,
         timeline=timeline(nodes),
     )
+
+
+def _title(scene: PurePath) -> str:
+    """What a capture is called: its folder; where that says only what lies in it, the folder around."""
+    return (scene.parent.name if scene.name.lower() in _FOLDERS_OF_PHOTOS else "") or scene.name or "scene"
 
 
 def _views(pictures: Sequence[Picture]) -> tuple[list[dict[str, Any]], list[dict[str, str]]]:

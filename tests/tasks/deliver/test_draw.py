@@ -84,6 +84,8 @@ def test_depth_has_a_legend_below():
     picture = draw(DepthMap("left", np.linspace(1, 2, H * W, dtype=np.float32).reshape(H, W), "sensor"))
     assert picture.shape[1] == W and picture.shape[0] > H
     assert (picture[H + 4, :, 0] != picture[H + 4, ::-1, 0]).any()
+    wide = draw(DepthMap("left", np.ones((H, 400), np.float32), "sensor"))
+    assert 0 < len(wide) - H < len(picture) - H, "a narrow one has two lines of text"
 
 
 def test_points_are_seen_from_a_view_or_from_outside():

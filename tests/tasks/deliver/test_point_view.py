@@ -33,6 +33,18 @@ def test_up_is_where_the_photos_have_it():
     assert camera.center[2] > 0
 
 
+def test_what_was_photographed_from_one_side_is_shown_from_there():
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)).astype(np.float32)
+    turns = np.radians([-20, 0, 35])
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    for pose, turn in zip(poses, turns, strict=True):
+        level = [np.cos(turn), np.sin(turn), 0]  # looks along +x, z is up
+        pose[:3, :3] = [np.cross(level, [0, 0, 1]), [0, 0, -1], level]
+    cameras = Cameras(("a", "b", "c"), np.full((3, 2), 9, np.int32), np.ones((3, 4)), poses, True)
+    front, behind = (orbit_camera(points, cameras, azimuth_deg=turn).center for turn in (0, 180))
+    assert front[0] < -1 < 1 < behind[0] and abs(front[1]) < 0.2 * abs(front[0]) and front[2] > 0
+
+
 def test_without_cameras_a_room_stands_on_its_floor():
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-3, 3, (2000, 2)), np.zeros(2000)])

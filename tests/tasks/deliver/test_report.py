@@ -158,14 +158,16 @@ def test_objects_are_pictured_by_how_much_they_matter_and_the_doubtful_ones_name
 
     votes = Votes.of(labels([0, 0.5, 0.9, 1.0], [0, 0, 3, 3]), 0.7)
     doubt = {"id": 3, "name": "small mug", "reasons": ["few views: it is seen in 2 of 20", "low <confidence>"]}
-    insight = Insight([Thumbnail(3, 0.001, FILE), Thumbnail(4, 0.25, FILE)], [doubt], votes)
+    insight = Insight([Thumbnail(3, 0.0004, FILE), Thumbnail(4, 0.25, FILE)], [doubt], votes)
     listed = [entry(3, "small mug"), entry(4, "large box"), entry(5, "never shown")]
     html = report_html(RUN, pictures=(), instances={"instances": listed}, insight=insight)
     text = Page(html).text
     assert "small mug (3) : few views: it is seen in 2 of 20; low <confidence>" in text
+    doubts = re.search(r'<ul class="doubts">(.*?)</ul>', html, re.DOTALL)[1]
+    assert base64.b64encode(FILE.tobytes()).decode() in doubts
     pictured = re.findall(r'alt="(.*?)" loading', html)
     assert pictured == ["large box", "small mug"]
-    assert "25.0 % of the pixels" in text
+    assert "25.0 % of the pixels" in text and "less than 0.1 % of the pixels" in text
     assert "50.0 % of the dense points carry a label" in text and "Of 25.0 % the best label" in text
     assert "voted for 25.0 %" in text
 
@@ -206,6 +208,11 @@ def test_the_timeline_places_what_was_computed_and_leaves_out_the_cache():
 
 def test_memory_is_told_by_step():
     assert "split.segment 2 1 4.00 s 812 MB" in Page(report_html(RUN, pictures=())).text
+
+
+@pytest.mark.parametrize("place, title", [("/a/fox/images", "fox"), ("/a/kitchen", "kitchen"), ("images", "images")])
+def test_the_title_is_the_folder_of_the_capture_not_that_of_its_photos(place, title):
+    assert f"<h1>{title}</h1>" in report_html({"scene": place}, pictures=())
 
 
 def test_an_empty_run_has_a_report_too():
