@@ -13,7 +13,12 @@ from ss_flow.tasks.gaussians.rasterize import NAMES, GaussianTensors, Rendered
 from ss_flow.tasks.geometry.cameras import Camera
 
 
-def rasterize_cpu(
+def camera_on(device: torch.device, camera: Camera) -> Camera:
+    """As `draw` takes it: as it is."""
+    return camera
+
+
+def draw(
     gaussians: GaussianTensors,
     camera: Camera,
     background: Tensor,
@@ -21,7 +26,7 @@ def rasterize_cpu(
     settings: Settings,
     center_gradient: Tensor,
 ) -> Rendered:
-    """`rasterize` of one view on the CPU, its arguments checked. center_gradient: [N, 2] zeros, to be filled."""
+    """See `Renderer`."""
     channels = None if labels is None else np.ascontiguousarray(labels.numpy())
     rgb, alpha, depth, masks, top, radii, strongest = _Rasterize.apply(
         *gaussians.tensors(), background, channels, camera, settings, center_gradient

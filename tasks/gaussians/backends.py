@@ -1,61 +1,155 @@
-"""Loss and gradients of one view: by the native library on the CPU, or by torch and gsplat on CUDA."""
+"""Where Gaussians are trained: what a backend gives, and the backend of the CPU.
+
+A training is one code on every device. It holds a backend's arrays and works on them with the functions that NumPy and
+torch share by name (`Backend.xp`); what they do not share, it asks of the backend.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, NamedTuple, Protocol
 
-from ss_flow.tasks.artifacts import Float32, Int32
-from ss_flow.tasks.gaussians.library import Workspace
+import numpy as np
+from numpy.typing import NDArray
+
+from ss_flow.tasks.artifacts import Float32
+from ss_flow.tasks.gaussians.library import Workspace, address, library
 from ss_flow.tasks.gaussians.losses import gradients_of
-from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
+from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Target, Weights
 
-Arrays = tuple[Float32, Float32, Float32, Float32, Float32]
+Array = Any
+"""An array of a backend's device."""
+Values = dict[str, Array]
+"""By the names of `PARAMETERS`, float32, one row for each Gaussian."""
+
+EPSILON = 1e-15
+"""Of Adam, as in 3DGS."""
 
 
 class Descent(NamedTuple):
     """What one view says about the parameters."""
 
-    loss: float
-    gradients: dict[str, Float32]
+    loss: Array
+    """One number."""
+    gradients: Values
     """By parameter, and "centers" [N, 2] towards the projected means, per pixel. Valid until the next call."""
-    radii: Float32
+    radii: Array
     """[N] reach on the screen in pixels, 0 = not in view."""
 
 
+@dataclass(frozen=True)
+class AdamStep:
+    """What a step of Adam depends on besides the gradients."""
+
+    number: int
+    """1 for the first."""
+    rates: Mapping[str, Any]
+    """Learning rates by parameter, and "sh_rest" for the colours above degree 0; of the means [N], world units."""
+    sh_degree: int
+    """The colours above it have had no gradient yet."""
+
+
 class Backend(Protocol):
-    """Renders, compares and goes back."""
+    """The arrays of a device, and what a training asks for there. No step waits for the host, or carries to it."""
+
+    xp: ModuleType
+    """NumPy or torch."""
+
+    def stream(self) -> AbstractContextManager[Any]:
+        """What a training runs in: so several that share a device do not wait for each other."""
+
+    def put(self, array: NDArray[Any]) -> Array:
+        """A copy on the device."""
+
+    def host(self, array: Array) -> NDArray[Any]:
+        """The same as a NumPy array."""
+
+    def target(self, target: Target, num_labels: int) -> Any:
+        """A view as `descent` and `shown` take it."""
 
     def descent(
-        self, parameters: Arrays, labels: Int32 | None, target: Target, settings: Settings, weights: Weights
+        self, values: Values, labels: Array | None, target: Any, settings: Settings, weights: Weights
     ) -> Descent:
-        """labels: [N] the label of each Gaussian, < 0 = none; None without mask loss."""
+        """The loss of one view, and its gradients.
+
+        labels: [N] the label of each Gaussian, < 0 = none; None without mask loss.
+        """
+
+    def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
+        """One step down the gradients, in place; first, second: Adam's moments (Kingma and Ba 2015, Alg. 1)."""
+
+    def shown(self, values: Values, target: Any, sh_degree: int) -> tuple[Float32, Array]:
+        """A view over black, [h, w, 3] on the host, and [N] the largest weight of each Gaussian in it."""
 
 
 class NativeBackend:
-    """On the CPU; the number of threads changes no byte."""
+    """The native library on NumPy arrays; the number of threads changes no byte."""
+
+    xp = np
 
     def __init__(self, threads: int) -> None:
         self._threads = threads
         self._workspace = Workspace()
         self._gradients: dict[str, Float32] | None = None
 
+    def stream(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def put(self, array: NDArray[Any]) -> NDArray[Any]:
+        return np.array(array, order="C")
+
+    def host(self, array: NDArray[Any]) -> NDArray[Any]:
+        return array
+
+    def target(self, target: Target, num_labels: int) -> Target:
+        return target
+
     def descent(
-        self, parameters: Arrays, labels: Int32 | None, target: Target, settings: Settings, weights: Weights
+        self, values: Values, labels: Array | None, target: Target, settings: Settings, weights: Weights
     ) -> Descent:
         rendered = NativePass(
-            parameters, labels, target.camera, settings,
+            _arrays(values), None if target.ids is None else labels, target.camera, settings,
             ids=target.ids, workspace=self._workspace, threads=self._threads,
         )  # fmt: skip
         loss, towards = gradients_of(rendered, target, weights, self._workspace, self._threads)
-        if self._gradients is not None and len(self._gradients["means"]) != len(parameters[0]):
+        if self._gradients is not None and len(self._gradients["means"]) != len(values["means"]):
             self._gradients = None
         self._gradients = rendered.backward(*towards, out=self._gradients)
         return Descent(loss, self._gradients, rendered.radii)
 
+    def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
+        before = values["means"].copy()
+        for name, value in values.items():
+            width, head = value[:1].size, 0
+            active, rate = width, 1.0 if name == "means" else step.rates[name]
+            if name == "sh":
+                active, head = 3 * (step.sh_degree + 1) ** 2, 3
+            library().ss_adam(
+                len(value), width, active, head, address(value), address(gradients[name]), address(first[name]),
+                address(second[name]), rate, step.rates["sh_rest"] if name == "sh" else rate, step.number, EPSILON,
+            )  # fmt: skip
+        # A step of Adam is as long as its rate: those of the means, taken with rate 1, are cut to size here.
+        means = values["means"]
+        means[:] = before + step.rates["means"][:, None] * (means - before)
+
+    def shown(self, values: Values, target: Target, sh_degree: int) -> tuple[Float32, Float32]:
+        settings = Settings((0.0, 0.0, 0.0), 0, sh_degree, winners=True)
+        rendered = NativePass(_arrays(values), None, target.camera, settings, threads=self._threads)
+        assert rendered.strongest is not None
+        return rendered.rgb, rendered.strongest
+
+
+def _arrays(values: Values) -> tuple[Float32, Float32, Float32, Float32, Float32]:
+    means, quaternions, log_scales, opacity_logits, sh = (values[name] for name in PARAMETERS)
+    return means, quaternions, log_scales, opacity_logits, sh
+
 
 def backend_for(device: str, threads: int) -> Backend:
-    """The backend of a device, "cpu" or "cuda"."""
+    """The backend of a device: "cpu" or "cuda"."""
     if device == "cpu":
         return NativeBackend(threads)
     from ss_flow.tasks.gaussians.torch_backend import TorchBackend

@@ -1,8 +1,12 @@
-"""The same rendering by gsplat on CUDA (imports torch and gsplat: import it inside functions)."""
+"""The same rendering by gsplat, on CUDA (imports torch and gsplat: import it inside functions).
+
+gsplat ends a pixel and cuts small contributions by rules of its own, and sums gradients in any order: results agree
+with the CPU's to about a grey level, and with those of another run to rounding.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,77 +15,166 @@ from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE, Settings
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered
 from ss_flow.tasks.geometry.cameras import Camera
 
+_TILE = 16
+"""Pixels on a side of gsplat's tiles."""
+_CHANNELS = 32
+"""So many channels gsplat blends at once at full speed."""
+_STRIP = 4
+"""Rows of tiles whose contributions are listed at once: they may be a hundred for every pixel."""
+_MOST_ALPHA = 0.999
+"""gsplat's largest alpha."""
 
-def rasterize_cuda(
+
+class DeviceCamera(NamedTuple):
+    """A camera with its matrices on the device."""
+
+    camera: Camera
+    pose: Tensor
+    """[1, 4, 4] world to camera."""
+    intrinsics: Tensor
+    """[1, 3, 3]."""
+    center: Tensor
+    """[3] world."""
+
+
+def camera_on(device: torch.device, camera: Camera) -> DeviceCamera:
+    """See `Renderer`."""
+    pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32, device=device)
+    intrinsics = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    center = torch.as_tensor(camera.center, dtype=torch.float32, device=device)
+    return DeviceCamera(camera, pose[None], torch.tensor([intrinsics], dtype=torch.float32, device=device), center)
+
+
+class _Splats(NamedTuple):
+    """Gaussians on the screen, and gsplat's list of those in each tile, front to back."""
+
+    means: Tensor
+    """[1, N, 2] pixels."""
+    conics: Tensor
+    """[1, N, 3]."""
+    opacities: Tensor
+    """[1, N]."""
+    depths: Tensor
+    """[1, N]."""
+    radii: Tensor
+    """[1, N, 2] int32, 0 = not in view."""
+    offsets: Tensor
+    """[1, tile rows, tile columns] where each tile's list begins."""
+    listed: Tensor
+    """[I] rows of Gaussians."""
+
+
+def draw(
     gaussians: GaussianTensors,
-    camera: Camera,
+    camera: DeviceCamera,
     background: Tensor,
     labels: Tensor | None,
     settings: Settings,
     center_gradient: Tensor,
 ) -> Rendered:
-    """`rasterize` of one view on CUDA, its arguments checked. center_gradient: [N, 2] zeros, to be filled.
+    """See `Renderer`; top contributors and largest weights, if asked for, take longer than all the rest."""
+    from gsplat import rasterize_to_pixels, spherical_harmonics
 
-    gsplat ends a pixel and cuts small contributions by its own thresholds, so results agree with the CPU's to about a
-    grey level. It gives no winners: with `winners` this raises NotImplementedError.
-    """
-    if settings.winners:
-        raise NotImplementedError("top contributors are found on the CPU only: render with CPU tensors")
-    from gsplat import rasterization, spherical_harmonics
+    width, height = camera.camera.width, camera.camera.height
+    splats = _projected(gaussians, camera)
+    if splats.means.requires_grad:
 
-    device = gaussians.means.device
-    pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32, device=device)
-    intrinsics = torch.tensor(
-        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=device
-    )
-    center = -pose[:3, :3].T @ pose[:3, 3]
+        def note(towards: Tensor) -> None:  # what a hook returns would take the gradient's place
+            center_gradient.add_(towards[0])
+
+        splats.means.register_hook(note)
+    in_view = (splats.radii[0] > 0).all(dim=-1)
     used = (settings.sh_degree + 1) ** 2
-    colors = spherical_harmonics(settings.sh_degree, gaussians.means - center, gaussians.sh[:, :used].contiguous())
-    channels = [torch.clamp(colors + 0.5, min=0)]
+    colors = spherical_harmonics(
+        settings.sh_degree, gaussians.means - camera.center, gaussians.sh[:, :used], masks=in_view
+    )
+    channels = [torch.clamp(colors + 0.5, min=0), splats.depths[0][:, None]]
     if labels is not None:
-        one_hot = torch.zeros(len(gaussians), settings.num_labels, device=device)
-        rows = torch.nonzero(labels >= 0)[:, 0]
-        one_hot[rows, labels[rows].long()] = 1
-        channels.append(one_hot)
-    images, alphas, info = _render(rasterization, gaussians, channels, pose, intrinsics, camera)
-    means2d = info["means2d"]
-    if means2d.requires_grad:
-        means2d.register_hook(lambda towards: center_gradient.add_(towards.reshape(center_gradient.shape)))
-    image, alpha = images[0], alphas[0, :, :, 0]
-    radii = info["radii"][0].float()
-    size = (camera.height, camera.width)
+        channels.append((labels[:, None] == torch.arange(settings.num_labels, device=labels.device)).float())
+    drawn = [
+        rasterize_to_pixels(
+            splats.means, splats.conics, some[None], splats.opacities, width, height, _TILE, splats.offsets,
+            splats.listed,
+        )
+        for some in torch.cat(channels, dim=1).split(_CHANNELS, dim=1)
+    ]  # fmt: skip
+    image, alpha = torch.cat([images[0] for images, _ in drawn], dim=-1), drawn[0][1][0, :, :, 0]
+    top = torch.full((height, width), -1, dtype=torch.int32, device=alpha.device)
+    strongest = alpha.new_zeros(len(gaussians))
+    if settings.winners:
+        with torch.no_grad():
+            _find_winners(splats, width, height, top, strongest)
     return Rendered(
         rgb=image[..., :3] + (1 - alpha)[..., None] * background,
         alpha=alpha,
-        depth=image[..., -1],
-        label_masks=image[..., 3:-1].permute(2, 0, 1),
-        top_contributor=torch.full(size, -1, dtype=torch.int32, device=device),
-        radii=radii.amax(dim=-1) if radii.dim() == 2 else radii,
-        max_contribution=torch.zeros(len(gaussians), device=device),
+        depth=image[..., 3],
+        label_masks=image[..., 4:].permute(2, 0, 1),
+        top_contributor=top,
+        radii=torch.where(in_view, splats.radii[0].amax(dim=-1), 0).float(),
+        max_contribution=strongest,
         center_gradient=center_gradient,
     )
 
 
-def _render(
-    rasterization: Any,
-    gaussians: GaussianTensors,
-    channels: list[Tensor],
-    pose: Tensor,
-    intrinsics: Tensor,
-    camera: Camera,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    images, alphas, info = rasterization(
-        means=gaussians.means,
-        quats=torch.nn.functional.normalize(gaussians.quaternions, dim=1),
-        scales=torch.exp(gaussians.log_scales),
-        opacities=torch.sigmoid(gaussians.opacity_logits),
-        colors=torch.cat(channels, dim=1),
-        viewmats=pose[None],
-        Ks=intrinsics[None],
-        width=camera.width,
-        height=camera.height,
-        near_plane=NEAR_PLANE,
-        render_mode="RGB+D",
-        packed=False,
-    )
-    return images, alphas, info
+def _projected(gaussians: GaussianTensors, camera: DeviceCamera) -> _Splats:
+    from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles
+
+    width, height = camera.camera.width, camera.camera.height
+    opacities = torch.sigmoid(gaussians.opacity_logits)
+    radii, means, depths, conics, _ = fully_fused_projection(
+        gaussians.means, None, gaussians.quaternions, torch.exp(gaussians.log_scales), camera.pose, camera.intrinsics,
+        width, height, near_plane=NEAR_PLANE, opacities=opacities,
+    )  # fmt: skip
+    columns, rows = -(-width // _TILE), -(-height // _TILE)
+    _, keys, listed = isect_tiles(means, radii, depths, _TILE, columns, rows)
+    offsets = isect_offset_encode(keys, 1, columns, rows).reshape(1, rows, columns)
+    return _Splats(means, conics, opacities[None], depths, radii, offsets, listed)
+
+
+def _find_winners(splats: _Splats, width: int, height: int, top: Tensor, strongest: Tensor) -> None:
+    """Fill in each pixel's Gaussian of the largest weight ([H, W], -1 where none is) and each Gaussian's largest weight
+    ([N], 0 where it has none), from gsplat's lists of who contributes to a pixel."""
+    from gsplat import rasterize_to_indices_in_range
+
+    begins = torch.cat([splats.offsets.flatten(), splats.offsets.new_tensor([len(splats.listed)])]).long()
+    columns = splats.offsets.shape[-1]
+    for row in range(0, splats.offsets.shape[1], _STRIP):
+        tiles = splats.offsets[:, row : row + _STRIP]
+        rows = slice(row * _TILE, min((row + tiles.shape[1]) * _TILE, height))
+        size = (rows.stop - rows.start, width)
+        means = splats.means - splats.means.new_tensor([0, rows.start])
+        ends = begins[row * columns : (row + tiles.shape[1]) * columns + 1]
+        listed = splats.listed[: int(ends[-1])]
+        transmittance, heaviest = means.new_ones(size).flatten(), means.new_zeros(size).flatten()
+        best = top[rows].view(-1)
+        for turn in range(-(-int(ends.diff().max()) // _TILE**2)):  # gsplat takes as many of a tile's list at once
+            gaussian, pixel, _ = rasterize_to_indices_in_range(
+                turn, turn + 1, transmittance.reshape(1, *size), means, splats.conics, splats.opacities, width, size[0],
+                _TILE, tiles, listed,
+            )  # fmt: skip
+            if not len(gaussian):
+                continue
+            gaussian, pixel = gaussian.long(), pixel.long()
+            alpha = _alpha(means[0, gaussian], splats.conics[0, gaussian], splats.opacities[0, gaussian], pixel, width)
+            # Those of one pixel follow one another, front to back: their sums are differences of the sum over all.
+            thinned = torch.log1p(-alpha.double())
+            before = thinned.cumsum(0) - thinned
+            first = torch.cat([pixel[:1] >= 0, pixel.diff() != 0]).nonzero()[:, 0]
+            start = before.new_zeros(len(heaviest)).index_put((pixel[first],), before[first])
+            weight = transmittance[pixel] * torch.exp(before - start[pixel]).float() * alpha
+            strongest.scatter_reduce_(0, gaussian, weight, "amax")
+            peak = torch.zeros_like(heaviest).scatter_reduce_(0, pixel, weight, "amax")
+            place = torch.arange(len(pixel), device=pixel.device)
+            place = torch.where(weight == peak[pixel], place, len(pixel))  # of equal weights the front one leads
+            leader = pixel.new_full((len(heaviest),), len(pixel)).scatter_reduce_(0, pixel, place, "amin")
+            better = peak > heaviest
+            best[better] = gaussian[leader[better]].int()
+            heaviest = torch.maximum(heaviest, peak)
+            transmittance *= torch.exp(torch.zeros_like(start).index_add_(0, pixel, thinned)).float()
+
+
+def _alpha(means: Tensor, conics: Tensor, opacities: Tensor, pixel: Tensor, width: int) -> Tensor:
+    """[M] of splats at the centres of pixels, which are counted row by row."""
+    x, y = means[:, 0] - pixel % width - 0.5, means[:, 1] - pixel // width - 0.5
+    power = 0.5 * (conics[:, 0] * x * x + conics[:, 2] * y * y) + conics[:, 1] * x * y
+    return torch.clamp(opacities * torch.exp(-power), max=_MOST_ALPHA)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Float32, Float64
+from ss_flow.tasks.gaussians.backends import Array, Backend, Values
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.ranges import Count, Natural
 
@@ -27,9 +28,9 @@ REFERENCE_ROWS = 512
 class Seen:
     """What one step tells of the Gaussians."""
 
-    centers: Float32
+    centers: Array
     """[N, 2] gradient towards the projected means."""
-    radii: Float32
+    radii: Array
     """[N] pixels, 0 = not in view."""
     pixels: int
     """In the mean that the loss is."""
@@ -67,30 +68,39 @@ class Schedule:
 class GradientRecord:
     """The mean gradient of each Gaussian's screen position over the views that showed it."""
 
-    def __init__(self, count: int) -> None:
-        self.sum, self.seen = np.zeros(count, np.float64), np.zeros(count, np.int64)
+    def __init__(self, count: int, backend: Backend) -> None:
+        self.backend = backend
+        self.sum, self.seen = (backend.put(np.zeros(count, kind)) for kind in (np.float64, np.int64))
 
-    def add(self, centers: Float32, radii: Float32, pixels: int) -> None:
+    def add(self, centers: Array, radii: Array, pixels: int) -> None:
         """centers: [N, 2] gradient of a loss that is a mean over `pixels`. radii: [N], 0 where not in view."""
-        norm = np.hypot(centers[:, 0], centers[:, 1]) * (pixels / (2 * REFERENCE_ROWS))
+        xp = self.backend.xp
+        norm = xp.hypot(centers[:, 0], centers[:, 1]) * (pixels / (2 * REFERENCE_ROWS))
         seen = radii > 0
-        self.sum[seen] += norm[seen]
-        self.seen[seen] += 1
+        self.sum += xp.where(seen, norm, 0)
+        self.seen += seen
 
-    def mean(self) -> Float64:
-        return self.sum / np.maximum(self.seen, 1)
+    def mean(self) -> Array:
+        return self.sum / self.backend.xp.clip(self.seen, 1, None)
 
 
 class AdaptiveControl:
     """Clones and splits where the picture is still wrong, drops what is faint or far too large."""
 
     def __init__(
-        self, count: int, schedule: Schedule, *, threshold: float, extent: float, most: int, prune_opacity: float
+        self,
+        record: GradientRecord,
+        schedule: Schedule,
+        *,
+        threshold: float,
+        extent: float,
+        most: int,
+        prune_opacity: float,
     ) -> None:
         self.last_step = schedule.stop
         self._schedule = schedule
         self._threshold, self._extent, self._most, self._prune_opacity = threshold, extent, most, prune_opacity
-        self._record = GradientRecord(count)
+        self._record = record
 
     def after(self, step: int, parameters: Parameters, seen: Seen, generator: np.random.Generator) -> None:
         """Act after a step (the first is 1); may rearrange the rows of the parameters."""
@@ -105,66 +115,73 @@ class AdaptiveControl:
                 extent=self._extent,
                 most=self._most,
                 generator=generator,
+                backend=parameters.backend,
             )
             parameters.rearrange(*rows)
             keep = parameters.opacities() >= self._prune_opacity
             if step > self._schedule.reset_every:
-                keep &= np.exp(parameters.values["log_scales"]).max(axis=1) <= LARGE_SHARE * self._extent
+                keep &= parameters.longest() <= LARGE_SHARE * self._extent
             parameters.keep(keep)
-            self._record = GradientRecord(len(parameters))
+            self._record = GradientRecord(len(parameters), parameters.backend)
         if self._schedule.resets(step):
             parameters.limit_opacity(0.01)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """What it remembers, to go on from later."""
-        return {"record.sum": self._record.sum, "record.seen": self._record.seen}
+        host = self._record.backend.host
+        return {"record.sum": host(self._record.sum), "record.seen": host(self._record.seen)}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Go on from what `state` gave."""
-        self._record.sum, self._record.seen = state["record.sum"], state["record.seen"]
+        put = self._record.backend.put
+        self._record.sum, self._record.seen = put(state["record.sum"]), put(state["record.seen"])
 
 
 def densify(
-    parameters: dict[str, Float32],
-    gradient: Float64,
+    values: Values,
+    gradient: Array,
     *,
     threshold: float,
     extent: float,
     most: int,
     generator: np.random.Generator,
-) -> tuple[dict[str, Float32], NDArray[np.integer], Bool]:
-    """Clone small and split large Gaussians whose screen gradient is above the threshold.
+    backend: Backend,
+) -> tuple[Values, Array, Array]:
+    """Clone small and split large Gaussians whose screen gradient ([N] float64) is above the threshold.
 
     Returns the new parameters, the row each came from, and which rows are new (their optimiser state starts at 0).
-    When the result would exceed `most`, those with the largest gradients go first.
+    When the result would exceed `most`, those with the largest gradients go first. The halves of a split one lie where
+    `generator` says, on the host, so that every device splits alike.
     """
-    n = len(gradient)
-    chosen = np.flatnonzero(gradient >= threshold)
-    room = max(most - n, 0)
-    if len(chosen) > room:
-        chosen = np.sort(chosen[np.argsort(-gradient[chosen], kind="stable")[:room]])
-    large = np.exp(parameters["log_scales"][chosen]).max(axis=1) > CLONE_SHARE * extent
-    clones, parents = chosen[~large], chosen[large]
-    kept = np.setdiff1d(np.arange(n), parents)
-    source = np.concatenate([kept, clones, parents, parents])
-    fresh = np.arange(len(source)) >= len(kept)
-    out = {name: array[source].copy() for name, array in parameters.items()}
+    xp = backend.xp
+    chosen = gradient >= threshold
+    rows, room = xp.where(chosen)[0], max(most - len(gradient), 0)
+    if len(rows) > room:
+        chosen[rows[xp.argsort(-gradient[rows], stable=True)[room:]]] = False
+    large = xp.amax(xp.exp(values["log_scales"]), 1) > CLONE_SHARE * extent
+    kept, clones, parents = (xp.where(some)[0] for some in (~(chosen & large), chosen & ~large, chosen & large))
+    source = xp.concatenate([kept, clones, parents, parents])
+    fresh = xp.ones_like(source, dtype=xp.bool)
+    fresh[: len(kept)] = False
+    out = {name: array[source] for name, array in values.items()}
     if len(parents):
         halves = slice(len(kept) + len(clones), None)
         both = source[halves]
-        offset = generator.normal(size=(len(both), 3)) * np.exp(parameters["log_scales"][both].astype(np.float64))
-        turned = np.einsum("nij,nj->ni", rotations(parameters["quaternions"][both]), offset)
-        out["means"][halves] += turned.astype(np.float32)
-        out["log_scales"][halves] -= np.float32(np.log(SPLIT_SHRINK))
+        scales = xp.exp(xp.asarray(values["log_scales"][both], dtype=xp.float64))
+        offset = backend.put(generator.normal(size=(len(both), 3))) * scales
+        turned = xp.einsum("nij,nj->ni", rotations(values["quaternions"][both], xp), offset)
+        out["means"][halves] += xp.asarray(turned, dtype=xp.float32)
+        out["log_scales"][halves] -= float(np.log(SPLIT_SHRINK))
     return out, source, fresh
 
 
-def rotations(quaternions: Float32) -> Float64:
-    """[N, 4] w x y z of any length -> [N, 3, 3]."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).astype(np.float64).T
+def rotations(quaternions: Array, xp: ModuleType = np) -> Array:
+    """[N, 4] w x y z of any length -> [N, 3, 3] float64. xp: the module of the array, NumPy or torch."""
+    unit = quaternions / xp.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
+    w, x, y, z = xp.asarray(unit, dtype=xp.float64).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.moveaxis(np.array(rows), 2, 0)
+    return xp.moveaxis(xp.stack([xp.stack(row) for row in rows]), 2, 0)

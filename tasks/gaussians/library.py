@@ -179,6 +179,7 @@ class Workspace:
     """
 
     def __init__(self) -> None:
+        self._free = library().ss_workspace_free  # at the interpreter's end there is no `library` any more
         self.handle = library().ss_workspace()
         if self.handle is None:
             raise MemoryError("not enough memory for a rendering")
@@ -187,7 +188,7 @@ class Workspace:
 
     def __del__(self) -> None:
         if getattr(self, "handle", None) is not None:
-            library().ss_workspace_free(self.handle)
+            self._free(self.handle)
 
 
 def address(array: NDArray[np.float32] | NDArray[np.int32] | None) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Literal
 
@@ -87,7 +88,7 @@ class Target:
     labelled: Float32 | None
     """[h, w] 1 / (number of labels * number of pixels that are not ignored) there, 0 elsewhere."""
 
-    @property
+    @functools.cached_property
     def pixels(self) -> int:
         """Number of pixels in the mean of the colour loss."""
         return int(self.counted.sum())

@@ -10,10 +10,10 @@ from __future__ import annotations
 import ctypes
 import functools
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.processor import on_this_processor
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
@@ -103,6 +104,16 @@ class Rendered:
     """[N, 2] after `backward`: gradient towards the projected means, per pixel; zeros before."""
 
 
+class Renderer(NamedTuple):
+    """Draws one view on a device of torch; nothing is checked, and no parameter goes to the host."""
+
+    camera_on: Callable[[torch.device, Camera], Any]
+    """A camera as `draw` takes it."""
+    draw: Callable[[GaussianTensors, Any, Tensor, Tensor | None, Settings, Tensor], Rendered]
+    """`rasterize` of one view. Takes Gaussians, camera, background (that of the settings, for its gradient), labels,
+    settings, and [N, 2] zeros that become `center_gradient`."""
+
+
 @functools.cache
 def training_device() -> str:
     """Where Gaussians are trained: "cuda" where gsplat, a torch with CUDA and a driver are there, else "cpu".
@@ -154,20 +165,31 @@ def rasterize(
         background = torch.tensor(background, dtype=torch.float32, device=gaussians.means.device)
     if background.shape != (3,):
         raise ValueError(f"background must be [3], not {list(background.shape)}")
-    if gaussians.means.is_cuda:
-        from ss_flow.tasks.gaussians.cuda import rasterize_cuda as on_device
-    else:
-        from ss_flow.tasks.gaussians.autograd import rasterize_cpu as on_device
-    center_gradient = torch.zeros(len(cameras), len(gaussians), 2, device=gaussians.means.device)
+    device = gaussians.means.device
+    renderer = renderer_on(device)
+    center_gradient = torch.zeros(len(cameras), len(gaussians), 2, device=device)
     red, green, blue = background.detach().tolist()
     settings = Settings((red, green, blue), num_labels, degree, winners)
     views = [
-        on_device(gaussians, c, background, labels, settings, g) for c, g in zip(cameras, center_gradient, strict=True)
+        renderer.draw(gaussians, renderer.camera_on(device, c), background, labels, settings, g)
+        for c, g in zip(cameras, center_gradient, strict=True)
     ]
     if isinstance(camera, Camera):
         return views[0]
     images = {f.name: torch.stack([getattr(v, f.name) for v in views]) for f in fields(Rendered)}
     return Rendered(**{**images, "center_gradient": center_gradient})
+
+
+def renderer_on(device: torch.device) -> Renderer:
+    """What draws on a device of torch."""
+    if device.type == "cpu":
+        from ss_flow.tasks.gaussians.autograd import camera_on, draw
+
+        return Renderer(camera_on, draw)
+    from ss_flow.tasks.gaussians.cuda import camera_on as camera_on_cuda
+    from ss_flow.tasks.gaussians.cuda import draw as draw_on_cuda
+
+    return Renderer(camera_on_cuda, draw_on_cuda)
 
 
 def _check(gaussians: GaussianTensors, labels: Tensor | None, num_labels: int, cameras: Sequence[Camera]) -> int:

@@ -1,22 +1,25 @@
-"""Loss and gradients of one view by torch, for CUDA (imports torch: import it inside functions).
+"""Training on a device of torch: on CUDA, where nothing leaves the device from step to step; on the CPU, to test that.
 
-The parameters and Adam stay on the host, so that training is the same code on every device; what crosses is the
-parameters and their gradients, once a step. The losses are those of `losses.py`, written with torch's own operations.
+Imports torch: import it inside functions. The losses are those of `losses.py`, written with torch's own operations.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.optim.adam import adam
 
-from ss_flow.tasks.artifacts import Int32
-from ss_flow.tasks.gaussians.backends import Arrays, Descent
-from ss_flow.tasks.gaussians.native_pass import PARAMETERS, Settings
+from ss_flow.tasks.artifacts import Float32
+from ss_flow.tasks.gaussians.backends import EPSILON, AdamStep, Descent, Values
+from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.gaussians.objective import Target, Weights
-from ss_flow.tasks.gaussians.rasterize import GaussianTensors, rasterize
+from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered, renderer_on
 
 _RADIUS, _SIGMA = 5, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
@@ -27,8 +30,10 @@ class _Target:
     """A target on the device, its mask loss by channels: one for each label that the view shows, one for all others,
     which should stay empty."""
 
-    image: Tensor
-    counted: Tensor
+    camera: Any
+    """As the device's renderer takes it."""
+    photo: _Photo | None
+    """None where no colour counts."""
     inside: Tensor
     judged: Tensor
     depth: Tensor
@@ -36,77 +41,125 @@ class _Target:
     labelled: Tensor | None
     one_hot: Tensor
     """[P + 1, h, w]."""
-    channel_of_label: Int32
-    """[labels]."""
+    channel_of_label: Tensor
+    """[labels] int32."""
+
+
+@dataclass(frozen=True)
+class _Photo:
+    """The pixels whose colour counts, and what SSIM takes of them, found once."""
+
+    counts: Tensor
+    """[1, 1, h, w] bool."""
+    share: Tensor
+    """[1, 1, h, w] of each pixel in the mean over pixels and channels."""
+    image: Tensor
+    """[3, 1, h, w] 0 where the colour does not count."""
+    mean: Tensor
+    """[3, 1, h, w] within SSIM's window."""
+    variance: Tensor
+    """[3, 1, h, w] likewise."""
+
+    @classmethod
+    def of(cls, image: Tensor, counted: Tensor) -> _Photo:
+        """image: [h, w, 3]; counted: [h, w] 1 where the colour counts."""
+        counts = (counted > 0)[None, None]
+        share = (counted / (3 * counted.sum()))[None, None]
+        image = torch.where(counts, _planes(image), 0)
+        mean, squares = _blur(torch.stack([image, image * image]))
+        return cls(counts, share, image, mean, squares - mean * mean)
 
 
 class TorchBackend:
-    """On any device that torch and `rasterize` know."""
+    """On any device that torch and a renderer know."""
+
+    xp = torch
 
     def __init__(self, device: str) -> None:
-        self._device = device
-        self._targets: dict[int, tuple[Target, _Target]] = {}
+        self._device = torch.device(device)
+        self._renderer = renderer_on(self._device)
+
+    def stream(self) -> AbstractContextManager[Any]:
+        if self._device.type != "cuda":
+            return nullcontext()
+        return torch.cuda.stream(torch.cuda.Stream(self._device))
+
+    def put(self, array: NDArray[Any]) -> Tensor:
+        return torch.tensor(array, device=self._device)
+
+    def host(self, array: Tensor) -> NDArray[Any]:
+        return array.cpu().numpy()
+
+    def target(self, target: Target, num_labels: int) -> _Target:
+        height, width = target.inside.shape
+        channel_of_label = np.zeros(num_labels, np.int32)
+        one_hot = np.zeros((0, height, width), np.float32)
+        if target.ids is not None:
+            present = np.unique(target.ids[target.ids >= 0])
+            channel_of_label[:] = len(present)
+            channel_of_label[present] = np.arange(len(present))
+            one_hot = np.zeros((len(present) + 1, height, width), np.float32)
+            one_hot[: len(present)] = target.ids == present[:, None, None]
+        return _Target(
+            self._renderer.camera_on(self._device, target.camera),
+            _Photo.of(self.put(target.image), self.put(target.counted)) if target.counted.any() else None,
+            self.put(target.inside),
+            self.put(target.judged),
+            self.put(target.depth),
+            self.put(target.known),
+            None if target.labelled is None else self.put(target.labelled),
+            self.put(one_hot),
+            self.put(channel_of_label),
+        )
 
     def descent(
-        self, parameters: Arrays, labels: Int32 | None, target: Target, settings: Settings, weights: Weights
+        self, values: Values, labels: Tensor | None, target: _Target, settings: Settings, weights: Weights
     ) -> Descent:
-        here = self._here(target, settings.num_labels)
-        tensors = GaussianTensors(*(torch.tensor(a, device=self._device, requires_grad=True) for a in parameters))
+        leaves = {name: value.detach().requires_grad_() for name, value in values.items()}
         channels = None
-        if labels is not None and here.labelled is not None:
-            chosen = np.where(labels >= 0, here.channel_of_label[np.maximum(labels, 0)], -1).astype(np.int32)
-            channels = torch.tensor(chosen, device=self._device)
-        out = rasterize(
-            tensors,
-            target.camera,
-            background=settings.background,
-            labels=channels,
-            num_labels=0 if channels is None else len(here.one_hot),
-            sh_degree=settings.sh_degree,
+        if labels is not None and target.labelled is not None:
+            channels = torch.where(labels >= 0, target.channel_of_label[labels.clamp(min=0)], -1)
+        settings = replace(settings, num_labels=0 if channels is None else len(target.one_hot))
+        out = self._draw(leaves, target, channels, settings)
+        loss = _color_loss(out.rgb, target.photo, weights.ssim)
+        loss = loss + weights.alpha * (target.judged * (out.alpha - target.inside).abs()).sum()
+        loss = loss + weights.depth * (target.known * _depth_error(out.alpha, out.depth, target, weights)).sum()
+        if channels is not None:
+            loss = loss + weights.mask * (target.labelled * (out.label_masks - target.one_hot).abs()).sum()
+        towards = torch.autograd.grad(loss, tuple(leaves.values()), materialize_grads=True)
+        gradients = dict(zip(leaves, towards, strict=True)) | {"centers": out.center_gradient}
+        return Descent(loss.detach(), gradients, out.radii)
+
+    def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
+        rates = dict(step.rates)
+        rates["means"] = rates["means"][:, None]
+        # Colours above `step.sh_degree` have neither gradient nor momentum, and so stay.
+        rates["sh"] = torch.full_like(values["sh"][:1, :, :1], rates["sh_rest"])
+        rates["sh"][:, 0] = step.rates["sh"]
+        for name, value in values.items():
+            rate, before = rates[name], value.clone()
+            single = not isinstance(rate, Tensor)
+            adam(
+                [value], [gradients[name]], [first[name]], [second[name]], [],
+                [value.new_full((), step.number - 1)],
+                fused=True, amsgrad=False, maximize=False, beta1=0.9, beta2=0.999, weight_decay=0.0, eps=EPSILON,
+                lr=rate if single else 1.0,
+            )  # fmt: skip
+            # A step of Adam is as long as its rate: where rows have rates of their own, it is cut to size here.
+            if not single:
+                torch.lerp(before, value, rate, out=value)
+
+    def shown(self, values: Values, target: _Target, sh_degree: int) -> tuple[Float32, Tensor]:
+        with torch.no_grad():
+            out = self._draw(values, target, None, Settings((0.0, 0.0, 0.0), 0, sh_degree, winners=True))
+        return out.rgb.cpu().numpy(), out.max_contribution
+
+    def _draw(self, values: Values, target: _Target, channels: Tensor | None, settings: Settings) -> Rendered:
+        gaussians, means = GaussianTensors(**values), values["means"]
+        background = torch.stack([means.new_full((), value) for value in settings.background])
+        return self._renderer.draw(
+            gaussians, target.camera, background, channels, settings, means.new_zeros(len(means), 2)
         )
-        loss = _color_loss(out.rgb, here, weights.ssim)
-        loss = loss + weights.alpha * (here.judged * (out.alpha - here.inside).abs()).sum()
-        loss = loss + weights.depth * (here.known * _depth_error(out.alpha, out.depth, here, weights)).sum()
-        if here.labelled is not None:
-            loss = loss + weights.mask * (here.labelled * (out.label_masks - here.one_hot).abs()).sum()
-        loss.backward()
-        gradients = {
-            name: (torch.zeros_like(t) if t.grad is None else t.grad).cpu().numpy()
-            for name, t in zip(PARAMETERS, tensors.tensors(), strict=True)
-        }
-        gradients["centers"] = out.center_gradient.cpu().numpy()
-        return Descent(float(loss.detach()), gradients, out.radii.cpu().numpy())
-
-    def _here(self, target: Target, num_labels: int) -> _Target:
-        if id(target) not in self._targets:
-            self._targets[id(target)] = (target, _moved(target, num_labels, self._device))
-        return self._targets[id(target)][1]
-
-
-def _moved(target: Target, num_labels: int, device: str) -> _Target:
-    def put(array: np.ndarray) -> Tensor:
-        return torch.tensor(array, device=device)
-
-    height, width = target.inside.shape
-    channel_of_label = np.zeros(num_labels, np.int32)
-    one_hot = np.zeros((0, height, width), np.float32)
-    if target.ids is not None:
-        present = np.unique(target.ids[target.ids >= 0])
-        channel_of_label[:] = len(present)
-        channel_of_label[present] = np.arange(len(present))
-        one_hot = np.zeros((len(present) + 1, height, width), np.float32)
-        one_hot[: len(present)] = target.ids == present[:, None, None]
-    return _Target(
-        put(target.image),
-        put(target.counted),
-        put(target.inside),
-        put(target.judged),
-        put(target.depth),
-        put(target.known),
-        None if target.labelled is None else put(target.labelled),
-        put(one_hot),
-        channel_of_label,
-    )
 
 
 def _depth_error(alpha: Tensor, depth: Tensor, target: _Target, weights: Weights) -> Tensor:
@@ -116,26 +169,30 @@ def _depth_error(alpha: Tensor, depth: Tensor, target: _Target, weights: Weights
     return (torch.where(shown, alpha * alpha / torch.where(shown, depth, 1), 0) - 1 / target.depth).abs()
 
 
-def _color_loss(image: Tensor, target: _Target, ssim_weight: float) -> Tensor:
-    counts = (target.counted > 0)[..., None]
-    share = target.counted[..., None] / (3 * target.counted.sum()).clamp(min=1e-12)
-    if not bool(counts.any()):
+def _color_loss(image: Tensor, photo: _Photo | None, ssim_weight: float) -> Tensor:
+    if photo is None:
         return image.sum() * 0
-    x, y = (torch.where(counts, i, torch.zeros_like(i)).permute(2, 0, 1)[:, None] for i in (image, target.image))
-    share = share.permute(2, 0, 1)[:, None]
-    loss = (1 - ssim_weight) * (share * (x - y).abs()).sum()
+    x, y = torch.where(photo.counts, _planes(image), 0), photo.image
+    loss = (1 - ssim_weight) * (photo.share * (x - y).abs()).sum()
     if ssim_weight == 0:
         return loss
-    mx, my, mxx, myy, mxy = (_blur(i) for i in (x, y, x * x, y * y, x * y))
-    top = (2 * mx * my + _C1) * (2 * (mxy - mx * my) + _C2)
-    bottom = (mx * mx + my * my + _C1) * ((mxx - mx * mx) + (myy - my * my) + _C2)
-    return loss + ssim_weight * (1 - (share * top / bottom).sum())
+    mean, squares, products = _blur(torch.stack([x, x * x, x * y]))
+    both, covariance = mean * photo.mean, products - mean * photo.mean
+    top = (2 * both + _C1) * (2 * covariance + _C2)
+    bottom = (mean * mean + photo.mean * photo.mean + _C1) * (squares - mean * mean + photo.variance + _C2)
+    return loss + ssim_weight * (1 - (photo.share * top / bottom).sum())
 
 
-def _blur(image: Tensor) -> Tensor:
-    """[C, 1, H, W] through the Gaussian window of SSIM, zeros beyond the border."""
-    x = torch.arange(-_RADIUS, _RADIUS + 1, dtype=image.dtype, device=image.device)
+def _planes(image: Tensor) -> Tensor:
+    """[h, w, 3] -> [3, 1, h, w]."""
+    return image.permute(2, 0, 1)[:, None]
+
+
+def _blur(images: Tensor) -> Tensor:
+    """[I, 3, 1, h, w] through the Gaussian window of SSIM, zeros beyond the border."""
+    x = torch.arange(-_RADIUS, _RADIUS + 1, dtype=images.dtype, device=images.device)
     tap = torch.exp(-(x**2) / (2 * _SIGMA**2))
     tap = tap / tap.sum()
-    across = torch.nn.functional.conv2d(image, tap.view(1, 1, 1, -1), padding=(0, _RADIUS))
-    return torch.nn.functional.conv2d(across, tap.view(1, 1, -1, 1), padding=(_RADIUS, 0))
+    planes = images.flatten(0, 1)
+    across = torch.nn.functional.conv2d(planes, tap.view(1, 1, 1, -1), padding=(0, _RADIUS))
+    return torch.nn.functional.conv2d(across, tap.view(1, 1, -1, 1), padding=(_RADIUS, 0)).reshape(images.shape)

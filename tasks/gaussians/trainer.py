@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
 from ss_flow.tasks.artifacts import Float32, Gaussians
-from ss_flow.tasks.gaussians.backends import backend_for
-from ss_flow.tasks.gaussians.densification import AdaptiveControl, Schedule, Seen
-from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
+from ss_flow.tasks.gaussians.backends import AdamStep, Array, Backend, backend_for
+from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecord, Schedule, Seen
+from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target, decayed
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import training_device
@@ -106,12 +106,14 @@ def train(
     extent: float | Float32,
     seed: int,
     label_ids: Sequence[int] = (),
+    backend: Backend | None = None,
 ) -> TrainResult:
     """Fit Gaussians to views with Adam (Kerbl et al. 2023, Sec. 5; spec P1, P4).
 
     extent: size of what is trained, world units, or [N] of what each Gaussian is part of: scales the learning rate of
-    the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. On the CPU the number of
-    threads changes no byte, and neither does a kill: a later try goes on from the last checkpoint.
+    the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. backend: where, by default
+    on this machine's `training_device`. On the CPU the number of threads changes no byte, and neither does a kill: a
+    later try goes on from the last checkpoint.
     Raises ValueError when there are no views or Gaussians or an array does not fit its camera, TrainingDiverged when
     numbers blow up. The result has no Gaussians when all were pruned.
     """
@@ -127,24 +129,9 @@ def train(
     ):
         if value not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {value!r}")
-    training = _Training(initial, views, params, extents, seed, label_ids)
-    training.resume()
-    saved = time.monotonic()
-    while training.step < params.iterations and len(training.parameters):
-        training.advance()
-        if training.step % 50 and training.step < params.iterations:
-            continue
-        training.check()
-        try:
-            note = f"{len(training.parameters)} Gaussians, loss {training.losses[training.step - 1]:.4f}"
-            progress(training.step, params.iterations, note)
-        except BaseException:  # the run is being cancelled
-            training.save()
-            raise
-        if time.monotonic() - saved > CHECKPOINT_SECONDS:
-            training.save()
-            saved = time.monotonic()
-    return training.finish()
+    backend = backend or backend_for(training_device(), cores())
+    with backend.stream():
+        return _Training(initial, views, params, extents, seed, label_ids, backend).run()
 
 
 class _Training:
@@ -158,63 +145,89 @@ class _Training:
         extents: Float32,
         seed: int,
         label_ids: Sequence[int],
+        backend: Backend,
     ) -> None:
         num_labels = len(label_ids) if params.mask_weight else 0
-        self._initial, self._params, self._extents, self._num_labels = initial, params, extents, num_labels
+        self._initial, self._params, self._num_labels, self._backend = initial, params, num_labels, backend
         self._targets = [Target.of(view, params.objective, num_labels) for view in views]
+        self._there = [backend.target(target, num_labels) for target in self._targets]
         self._generator = np.random.default_rng(seed)
         self._given_degree = round(initial.sh.shape[1] ** 0.5) - 1
         last = min(params.sh_degree, params.iterations // 1000) if params.iterations >= 2000 else 0
         self._last_degree = max(self._given_degree, last)
-        self.parameters = Parameters(initial, self._last_degree)
+        self.parameters = Parameters(initial, self._last_degree, backend)
         if not self.parameters.finite():
             raise ValueError("the initial Gaussians hold values that are not finite")
-        self._channels = channels_of(initial.instance_id, label_ids)
-        self._extent = float(extents.max())
+        self._extents = backend.put(extents)
+        self._channels = backend.put(channels_of(initial.instance_id, label_ids)) if num_labels else None
         # A few sparse points of a small thing must be let fill the space between them.
-        self._longest = np.maximum(np.float32(params.max_scale) * extents, np.exp(initial.log_scales.max(axis=1)))
-        self._control = _control(params, len(initial), self._extent)
+        longest = np.maximum(np.float32(params.max_scale) * extents, np.exp(initial.log_scales.max(axis=1)))
+        self._longest = backend.put(longest)
+        self._control = _control(params, GradientRecord(len(initial), backend), float(extents.max()))
         self.step = 0
-        self.losses = np.zeros(params.iterations, np.float32)
+        self._losses = backend.put(np.zeros(params.iterations, np.float32))
         self._order: list[int] = []
-        self._backend = backend_for(training_device(), cores())
+
+    def run(self) -> TrainResult:
+        """All steps that are still to be done."""
+        self.resume()
+        saved = time.monotonic()
+        while self.step < self._params.iterations and len(self.parameters):
+            self.advance()
+            if self.step % 50 and self.step < self._params.iterations:
+                continue
+            note = f"{len(self.parameters)} Gaussians, loss {self.losses()[-1]:.4f}"
+            try:
+                progress(self.step, self._params.iterations, note)
+            except BaseException:  # the run is being cancelled
+                self.save()
+                raise
+            if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                self.save()
+                saved = time.monotonic()
+        return self.finish()
 
     def advance(self) -> None:
         """One step: render a view, compare, go down the gradient, mind the number of Gaussians."""
         params, parameters = self._params, self.parameters
         if not self._order:
             self._order = self._generator.permutation(len(self._targets)).tolist()
-        target = self._targets[self._order.pop()]
+        view = self._order.pop()
         done_share = self.step / max(params.iterations - 1, 1)
         self.step += 1
         degree = max(self._given_degree, min(self._last_degree, self.step // 1000))
         behind = params.objective.behind(self._generator)
         settings = Settings(behind, self._num_labels, degree, winners=False)
         weights = params.objective.at(done_share, params.mask_weight)
-        labels = self._channels[parameters.origin] if target.ids is not None else None
-        found = self._backend.descent(parameters.arrays(), labels, target, settings, weights)
-        self.losses[self.step - 1] = found.loss
-        if not np.isfinite(found.loss):
-            raise TrainingDiverged(f"training of {len(parameters)} Gaussians diverged at step {self.step}")
-        extents = self._extents[parameters.origin]
-        means_rate = decayed(params.rates.position, params.rates.position_final, done_share)
-        parameters.step(found.gradients, _by_name(params.rates), self.step, degree, np.float32(means_rate) * extents)
+        labels = None if self._channels is None else self._channels[parameters.origin]
+        found = self._backend.descent(parameters.values, labels, self._there[view], settings, weights)
+        self._losses[self.step - 1] = found.loss
+        pace = decayed(params.rates.position, params.rates.position_final, done_share)
+        rates = _by_name(params.rates, pace * self._extents[parameters.origin])
+        parameters.step(found.gradients, AdamStep(self.step, rates, degree))
         if params.max_scale:
             parameters.limit_scale(self._longest[parameters.origin])
         if self._control is not None:
-            seen = Seen(found.gradients["centers"], found.radii, target.pixels)
+            seen = Seen(found.gradients["centers"], found.radii, self._targets[view].pixels)
             self._control.after(self.step, parameters, seen, self._generator)
 
-    def check(self) -> None:
-        """Raises TrainingDiverged when a parameter is no longer finite."""
-        if not self.parameters.finite():
-            raise TrainingDiverged(f"training of {len(self.parameters)} Gaussians diverged at step {self.step}")
+    def losses(self) -> Float32:
+        """Of the steps so far. Raises TrainingDiverged when one of them or a parameter is not finite.
+
+        A step does not wait to know that: it is found out when somebody looks.
+        """
+        losses = self._backend.host(self._losses[: self.step])
+        wrong = np.flatnonzero(~np.isfinite(losses))
+        if len(wrong) or not self.parameters.finite():
+            step = int(wrong[0]) + 1 if len(wrong) else self.step
+            raise TrainingDiverged(f"training of {len(self.parameters)} Gaussians diverged at step {step}")
+        return losses
 
     def save(self) -> None:
         """Keep everything for a later try."""
         state: dict[str, NDArray[Any]] = {
             "step": np.array(self.step),
-            "losses": self.losses,
+            "losses": self._backend.host(self._losses),
             "order": np.array(self._order, np.int64),
             "generator": np.frombuffer(json.dumps(self._generator.bit_generator.state).encode(), np.uint8),
         }
@@ -227,7 +240,7 @@ class _Training:
         if state is None:
             return
         self.step, self._order = int(state["step"]), state["order"].tolist()
-        self.losses[:] = state["losses"]
+        self._losses = self._backend.put(state["losses"])
         self._generator.bit_generator.state = json.loads(state["generator"].tobytes())
         self.parameters.restore(state)
         if self._control is not None:
@@ -235,30 +248,29 @@ class _Training:
 
     def finish(self) -> TrainResult:
         """Drop what shows nowhere; the PSNR of what stays."""
-        parameters, params = self.parameters, self._params
-        settings = Settings((0.0, 0.0, 0.0), 0, self._last_degree, winners=True)
+        parameters, params, xp = self.parameters, self._params, self._backend.xp
+        losses = self.losses()
         parameters.keep(parameters.opacities() >= params.prune_opacity)
-        strongest = np.zeros(len(parameters), np.float32)
+        strongest = xp.zeros_like(parameters.values["opacity_logits"])
         error, count = 0.0, 0
-        for target in self._targets:
-            rendered = NativePass(parameters.arrays(), None, target.camera, settings, threads=cores())
-            assert rendered.strongest is not None
-            np.maximum(strongest, rendered.strongest, out=strongest)
+        for target, there in zip(self._targets, self._there, strict=True):
+            rgb, weights = self._backend.shown(parameters.values, there, self._last_degree)
+            strongest = xp.maximum(strongest, weights)
             inside = target.inside > 0
-            off = np.clip(rendered.rgb[inside], 0, 1) - target.image[inside]
+            off = np.clip(rgb[inside], 0, 1) - target.image[inside]
             error += float(np.square(off, dtype=np.float64).sum())
             count += 3 * int(inside.sum())
         if params.prune_contribution > 0:
             parameters.keep(strongest >= params.prune_contribution)
         psnr = float(-10 * np.log10(max(error / max(count, 1), 1e-10))) if count else 0.0
-        return TrainResult(parameters.to_gaussians(self._initial), psnr, self.step, self.losses[: self.step])
+        return TrainResult(parameters.to_gaussians(self._initial), psnr, self.step, losses)
 
 
-def _control(params: TrainParams, count: int, extent: float) -> AdaptiveControl | None:
+def _control(params: TrainParams, record: GradientRecord, extent: float) -> AdaptiveControl | None:
     if params.densify == "none":
         return None
     return AdaptiveControl(
-        count,
+        record,
         params.schedule.of(params.iterations),
         threshold=params.densify_grad,
         extent=extent,
@@ -267,9 +279,9 @@ def _control(params: TrainParams, count: int, extent: float) -> AdaptiveControl 
     )
 
 
-def _by_name(rates: LearningRates) -> dict[str, float]:
+def _by_name(rates: LearningRates, means: Array) -> dict[str, Any]:
     return {
-        "means": 1.0,
+        "means": means,
         "quaternions": rates.rotation,
         "log_scales": rates.scale,
         "opacity_logits": rates.opacity,

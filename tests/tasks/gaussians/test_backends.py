@@ -1,16 +1,74 @@
-"""Both ways to the gradients of a view."""
+"""The contract of a trainer's backend: what each gives, held against the native one and against torch's own Adam.
+
+The torch backend runs here on torch's CPU device, once with the native rasterizer behind it and once with the adapter
+to gsplat, which a dense stand-in completes; where there is CUDA, on that.
+"""
 
 from __future__ import annotations
 
+import gc
+import inspect
+import sys
+from dataclasses import dataclass, replace
+
+import gsplat_on_the_cpu
 import numpy as np
 import pytest
+import torch
+from torch.overrides import TorchFunctionMode
 
-from ss_flow.tasks.gaussians.backends import NativeBackend
+from ss_flow.running import Surroundings, running
+from ss_flow.tasks.gaussians.backends import AdamStep, NativeBackend, backend_for
+from ss_flow.tasks.gaussians.densification import GradientRecord, Schedule, densify
+from ss_flow.tasks.gaussians.initialise import initialise, select
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
+from ss_flow.tasks.gaussians.optimizer import Parameters
+from ss_flow.tasks.gaussians.rasterize import renderer_on, training_device
 from ss_flow.tasks.gaussians.torch_backend import TorchBackend
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
+
+NATIVE = NativeBackend(1)
+CUDA = pytest.param("cuda", marks=pytest.mark.skipif(training_device() != "cuda", reason="no CUDA with gsplat here"))
+
+
+@dataclass
+class Looking:
+    """As much of a target as it takes to be drawn."""
+
+    camera: Camera
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """Have the module `gsplat` be its stand-in."""
+    monkeypatch.setitem(sys.modules, "gsplat", gsplat_on_the_cpu)
+
+
+def through_gsplat(device: str) -> TorchBackend:
+    backend = TorchBackend(device)
+    backend._renderer = renderer_on(torch.device("cuda"))
+    return backend
+
+
+@pytest.fixture(params=["torch", "adapter", CUDA])
+def backend(request, monkeypatch) -> TorchBackend:
+    """Each of the backends that are not the native one."""
+    if request.param == "adapter":
+        request.getfixturevalue("stand_in")
+        return through_gsplat("cpu")
+    return TorchBackend("cpu" if request.param == "torch" else "cuda")
+
+
+def tolerance(backend: TorchBackend) -> float:
+    """How far gradients may be from the native ones: gsplat has thresholds of its own."""
+    return 2e-4 if backend._device.type == "cpu" else 2e-3
+
+
+def put(backend, values):
+    return {name: backend.put(value) for name, value in values.items()}
 
 
 def example(seed: int, objective: Objective, *, with_labels: bool):
@@ -33,22 +91,265 @@ def example(seed: int, objective: Objective, *, with_labels: bool):
         rng.integers(-2, 5, (h, w)).astype(np.int32) if with_labels else None,
     )
     labels = rng.integers(-1, 7, n).astype(np.int32) if with_labels else None
-    return tuple(np.ascontiguousarray(p, np.float32) for p in parameters), labels, Target.of(view, objective, 7)
+    values = {n: np.ascontiguousarray(p, np.float32) for n, p in zip(PARAMETERS, parameters, strict=True)}
+    return values, labels, Target.of(view, objective, 7)
 
 
 @pytest.mark.parametrize("with_labels", [False, True])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
 @pytest.mark.parametrize("background", ["random", "black"])
 @pytest.mark.parametrize("depth_error", ["relative", "inverse"])
-def test_torch_and_the_native_library_find_the_same_descent(with_labels, ssim_weight, background, depth_error):
+def test_every_backend_finds_the_same_descent(backend, with_labels, ssim_weight, background, depth_error):
     objective = Objective(ssim_weight, background, 0.5, depth_error, 0.3, 0.3)
-    parameters, labels, target = example(3, objective, with_labels=with_labels)
+    values, labels, target = example(3, objective, with_labels=with_labels)
     settings = Settings((0.2, 0.4, 0.6), 7, 1, winners=False)
     weights = objective.at(0.5, 0.7)
-    native = NativeBackend(1).descent(parameters, labels, target, settings, weights)
-    torch_ = TorchBackend("cpu").descent(parameters, labels, target, settings, weights)
-    assert native.loss == pytest.approx(torch_.loss, rel=1e-5)
-    assert np.array_equal(native.radii, torch_.radii)
+    expected = NATIVE.descent(values, labels, target, settings, weights)
+    there = None if labels is None else backend.put(labels)
+    found = backend.descent(put(backend, values), there, backend.target(target, 7), settings, weights)
+    limit = tolerance(backend)
+    assert backend.host(found.loss) == pytest.approx(expected.loss, rel=0.1 * limit)
+    assert np.array_equal(backend.host(found.radii) > 0, expected.radii > 0)
     for name in (*PARAMETERS, "centers"):
-        a, b = native.gradients[name], torch_.gradients[name]
-        assert np.linalg.norm(a - b) <= 2e-4 * np.linalg.norm(b), name
+        a, b = expected.gradients[name], backend.host(found.gradients[name])
+        assert np.linalg.norm(a - b) <= limit * np.linalg.norm(a), name
+
+
+def test_a_view_without_a_pixel_that_counts_pulls_nowhere(backend):
+    values, _, target = example(4, Objective(), with_labels=False)
+    nothing = np.zeros_like(target.inside)
+    blind = Target(target.camera, target.image, nothing, nothing, nothing, np.ones_like(nothing), nothing, None, None)
+    settings, weights = Settings((0.2, 0.4, 0.6), 0, 1, winners=False), Objective().at(0.5, 0.0)
+    for one in (NATIVE, backend):
+        found = one.descent(put(one, values), None, one.target(blind, 0), settings, weights)
+        assert one.host(found.loss) == 0
+        assert all(not one.host(found.gradients[name]).any() for name in PARAMETERS)
+
+
+def test_every_backend_shows_a_view_and_what_weighs_most(backend):
+    values, _, target = example(5, Objective(), with_labels=False)
+    expected, heaviest = NATIVE.shown(values, target, 1)
+    found, weights = backend.shown(put(backend, values), backend.target(target, 0), 1)
+    # What is next to nothing counts or does not, by rounding.
+    for theirs, ours in ((found, expected), (backend.host(weights), heaviest)):
+        off = np.abs(theirs - ours)
+        assert off.max() < 1 / 255 and np.quantile(off, 0.98) <= tolerance(backend)
+    assert (heaviest > 0.05).sum() > 30
+
+
+@pytest.mark.parametrize("which", ["native", "torch"])
+def test_adam_is_torchs_own_and_each_mean_has_its_rate(which):
+    backend = NATIVE if which == "native" else TorchBackend("cpu")
+    rng = np.random.default_rng(0)
+    values, _, _ = example(6, Objective(), with_labels=False)
+    paces = rng.uniform(1e-4, 1e-2, len(values["means"])).astype(np.float32)
+    rates = {"quaternions": 3e-3, "log_scales": 2e-2, "opacity_logits": 0.05, "sh": 1e-2, "sh_rest": 5e-4}
+    exact = {n: torch.tensor(v, dtype=torch.float64) for n, v in values.items() if n not in ("means", "sh")}
+    exact |= {"sh": torch.tensor(values["sh"][:, :1], dtype=torch.float64)}
+    exact |= {"sh_rest": torch.tensor(values["sh"][:, 1:], dtype=torch.float64)}
+    rows = [torch.tensor(row, dtype=torch.float64) for row in values["means"]]
+    groups = [{"params": [value], "lr": rates[name]} for name, value in exact.items()]
+    groups += [{"params": [row], "lr": float(pace)} for row, pace in zip(rows, paces, strict=True)]
+    oracle = torch.optim.Adam(groups, eps=1e-15)
+    moved = put(backend, values)
+    first, second = ({n: backend.xp.zeros_like(v) for n, v in moved.items()} for _ in range(2))
+    for number in range(1, 8):
+        gradients = {
+            n: np.float32(10.0 ** rng.integers(-6, 2)) * rng.normal(size=v.shape).astype(np.float32)
+            for n, v in values.items()
+        }
+        for name, value in exact.items():
+            whole = gradients["sh"] if name.startswith("sh") else gradients[name]
+            part = whole[:, :1] if name == "sh" else whole[:, 1:] if name == "sh_rest" else whole
+            value.grad = torch.tensor(part, dtype=torch.float64)
+        for row, gradient in zip(rows, gradients["means"], strict=True):
+            row.grad = torch.tensor(gradient, dtype=torch.float64)
+        oracle.step()
+        step = AdamStep(number, {**rates, "means": backend.put(paces)}, 1)
+        backend.adam(moved, put(backend, gradients), first, second, step)
+    exact["sh"] = torch.cat([exact["sh"], exact.pop("sh_rest")], dim=1)
+    exact["means"] = torch.stack(rows)
+    for name, value in exact.items():
+        np.testing.assert_allclose(backend.host(moved[name]), value.numpy(), rtol=1e-5, atol=2e-6, err_msg=name)
+
+
+def test_colours_above_the_degree_in_use_stay(backend):
+    values, _, _ = example(7, Objective(), with_labels=False)
+    rates = dict.fromkeys(("quaternions", "log_scales", "opacity_logits", "sh", "sh_rest"), 0.1)
+    for one in (NATIVE, backend):
+        moved = put(one, values)
+        gradients = {n: one.xp.ones_like(v) for n, v in moved.items()}
+        gradients["sh"][:, 1:] = 0
+        first, second = ({n: one.xp.zeros_like(v) for n, v in moved.items()} for _ in range(2))
+        paces = one.put(np.full(len(values["means"]), 0.1, np.float32))
+        one.adam(moved, gradients, first, second, AdamStep(1, {**rates, "means": paces}, 0))
+        assert np.array_equal(one.host(moved["sh"])[:, 1:], values["sh"][:, 1:])
+        assert np.allclose(one.host(moved["sh"])[:, :1], values["sh"][:, :1] - 0.1)
+
+
+@pytest.mark.parametrize("most", [200, 10_000])
+def test_every_backend_clones_and_splits_the_same_ones(backend, most):
+    values, _, _ = example(8, Objective(), with_labels=False)
+    gradient = np.random.default_rng(1).random(len(values["means"]))
+    gradient[:60] = gradient[60:]  # of equal ones the first goes first
+    made = [
+        densify(
+            put(one, values), one.put(gradient), threshold=0.2, extent=8.0, most=most,
+            generator=np.random.default_rng(2), backend=one,
+        )
+        for one in (NATIVE, backend)
+    ]  # fmt: skip
+    (expected, rows, fresh), (found, their_rows, theirs_fresh) = made
+    assert np.array_equal(backend.host(their_rows), rows) and np.array_equal(backend.host(theirs_fresh), fresh)
+    assert len(set(rows[fresh])) < fresh.sum() and len(rows) <= most  # some are split, some cloned
+    for name in PARAMETERS:
+        np.testing.assert_allclose(backend.host(found[name]), expected[name], rtol=1e-6, atol=1e-6)
+
+
+def test_every_backend_remembers_the_same_gradients_and_limits_the_same_values(backend):
+    values, _, _ = example(9, Objective(), with_labels=False)
+    made = initialise(values["means"], np.zeros(values["means"].shape, np.uint8), 1, 1.0)
+    rng = np.random.default_rng(0)
+    seen = [
+        (rng.normal(size=(120, 2)).astype(np.float32), (rng.random(120) > 0.4).astype(np.float32)) for _ in range(3)
+    ]
+    found = []
+    for one in (NATIVE, backend):
+        record, parameters = GradientRecord(120, one), Parameters(made, 1, one)
+        for centers, radii in seen:
+            record.add(one.put(centers), one.put(radii), 500)
+        parameters.limit_opacity(0.05)
+        parameters.limit_scale(one.put(np.linspace(0.01, 1, 120, dtype=np.float32)))
+        parameters.keep(parameters.longest() > 0.05)
+        found.append((one.host(record.mean()), parameters.to_gaussians(made), one.host(parameters.opacities())))
+    (mean, gaussians, opacities), (their_mean, theirs, their_opacities) = found
+    np.testing.assert_allclose(their_mean, mean, rtol=1e-6)
+    np.testing.assert_allclose(their_opacities, opacities, rtol=1e-6)
+    assert 0 < len(gaussians) < 120 and len(theirs) == len(gaussians)
+    for name in PARAMETERS:
+        np.testing.assert_allclose(getattr(theirs, name), getattr(gaussians, name), rtol=1e-6, atol=1e-7)
+
+
+class FromTheHost(TorchFunctionMode):
+    """Notes every tensor that is made of values of the host, or carried between devices."""
+
+    MOVES = (torch.tensor, torch.as_tensor, torch.from_numpy, torch.Tensor.to, torch.Tensor.cpu, torch.Tensor.cuda,
+             torch.Tensor.new_tensor)  # fmt: skip
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.moves: list[str] = []
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if func in self.MOVES:
+            self.moves.append(func.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("with_labels", [False, True])
+def test_a_step_carries_nothing_to_the_host_or_from_it(stand_in, with_labels):
+    # Tensors on "meta" have shapes and no values: whatever asks for one of them fails.
+    backend = TorchBackend("meta")
+    values, labels, target = example(3, Objective(), with_labels=with_labels)
+    there, moved = backend.target(target, 7), put(backend, values)
+    channels = None if labels is None else backend.put(labels)
+    first, second = ({n: torch.zeros_like(v) for n, v in moved.items()} for _ in range(2))
+    record, made = GradientRecord(120, backend), initialise(values["means"], np.zeros((120, 3), np.uint8), 1, 1.0)
+    parameters, longest = Parameters(made, 1, backend), backend.put(np.ones(120, np.float32))
+    rates = dict.fromkeys(("quaternions", "log_scales", "opacity_logits", "sh", "sh_rest"), 0.1)
+    with FromTheHost() as heard:
+        settings, weights = Settings((0.2, 0.4, 0.6), 7, 1, winners=False), Objective().at(0.5, 0.7)
+        found = backend.descent(moved, channels, there, settings, weights)
+        backend.adam(moved, found.gradients, first, second, AdamStep(1, {**rates, "means": 0.1 * longest}, 1))
+        record.add(found.gradients["centers"], found.radii, target.pixels)
+        parameters.limit_scale(longest)
+    assert heard.moves == []
+    for name in PARAMETERS:
+        assert found.gradients[name].shape == values[name].shape == moved[name].shape
+    assert (found.loss.shape, found.radii.shape, found.gradients["centers"].shape) == ((), (120,), (120, 2))
+    with pytest.raises((NotImplementedError, RuntimeError)):
+        backend.host(found.loss)
+
+
+def trained(backend, params: TrainParams, seed: int = 1):
+    """A few dozen Gaussians on four views of a scene of many."""
+    rng = np.random.default_rng(seed)
+    made = initialise(rng.uniform((-0.8, -0.6, 1.5), (0.8, 0.6, 3.0), (150, 3)).astype(np.float32),
+                      rng.integers(0, 255, (150, 3)).astype(np.uint8), 3, 1.0, opacity=0.5)  # fmt: skip
+    views = []
+    for x in (-0.3, -0.1, 0.1, 0.3):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        camera = Camera(46, 33, 40.0, 40.0, 23.0, 16.5, pose)
+        image = NATIVE.shown({n: np.ascontiguousarray(getattr(made, n)) for n in PARAMETERS}, Looking(camera), 0)[
+            0
+        ].clip(0, 1)
+        inside = image.sum(axis=2) > 0.2
+        views.append(TrainView(camera, image, inside, ~inside, np.zeros(inside.shape, np.float32)))
+    first = select(made, np.arange(60))
+    return train(first, views, params=params, extent=2.0, seed=seed, backend=backend)
+
+
+def test_a_training_is_the_same_on_every_backend(backend):
+    params = TrainParams(iterations=60, densify="none")
+    ours, theirs = trained(NATIVE, params), trained(backend, params)
+    np.testing.assert_allclose(theirs.loss, ours.loss, rtol=10 * tolerance(backend))
+    assert len(ours.gaussians) == len(theirs.gaussians)
+    assert theirs.psnr == pytest.approx(ours.psnr, abs=200 * tolerance(backend))
+
+
+def test_a_training_that_densifies_is_the_same_until_rounding_parts_them(backend):
+    # A millionth of the gradients decides, some steps later, who is split: then all goes other ways, here too.
+    params = TrainParams(iterations=40, schedule=Schedule(10, 30, 10, 25, shorten=False), max_scale=0.05)
+    ours, theirs = (trained(one, replace(params, densify_grad=1e-5)) for one in (NATIVE, backend))
+    np.testing.assert_allclose(theirs.loss[:20], ours.loss[:20], rtol=0.5 * tolerance(backend))
+    assert len(theirs.gaussians) > 100
+    assert abs(len(ours.gaussians) - len(theirs.gaussians)) <= 0.05 * len(ours.gaussians)
+
+
+def test_a_training_by_torch_repeats_to_the_byte_and_goes_on_after_a_kill(tmp_path):
+    params = TrainParams(iterations=120, schedule=Schedule(10, 90, 10, 60, shorten=False), densify_grad=1e-5)
+    alone = trained(TorchBackend("cpu"), params)
+
+    class Killed(Exception):
+        pass
+
+    def stop(done, total, note):
+        if done == 50:
+            raise Killed
+
+    here = Surroundings(stop, checkpoint=tmp_path / "kept.npz")
+    with running(here), pytest.raises(Killed):
+        trained(TorchBackend("cpu"), params)
+    with running(replace(here, listener=lambda *_: None)):
+        resumed = trained(TorchBackend("cpu"), params)
+    for name in PARAMETERS:
+        assert getattr(resumed.gaussians, name).tobytes() == getattr(alone.gaussians, name).tobytes()
+    assert resumed.loss.tobytes() == alone.loss.tobytes()
+
+
+def test_a_training_by_torch_keeps_no_tensor():
+    def alive() -> int:
+        gc.collect()
+        return sum(isinstance(some, torch.Tensor) for some in gc.get_objects())
+
+    params = TrainParams(iterations=60, schedule=Schedule(10, 40, 10, 25, shorten=False), densify_grad=1e-5)
+    trained(TorchBackend("cpu"), params)
+    before = alive()
+    trained(TorchBackend("cpu"), params)
+    assert alive() <= before
+
+
+def test_the_stand_in_takes_what_gsplat_takes():
+    gsplat = pytest.importorskip("gsplat")
+    for name in ("fully_fused_projection", "isect_tiles", "isect_offset_encode", "rasterize_to_pixels",
+                 "rasterize_to_indices_in_range", "spherical_harmonics"):  # fmt: skip
+        ours, theirs = (inspect.signature(getattr(one, name)) for one in (gsplat_on_the_cpu, gsplat))
+        assert [(p.name, p.default) for p in ours.parameters.values()] == [
+            (p.name, p.default) for p in theirs.parameters.values()
+        ]
+
+
+def test_a_backend_for_cuda_is_of_torch():
+    assert isinstance(backend_for("cpu", 2), NativeBackend)
+    assert isinstance(backend_for("meta", 2), TorchBackend)

@@ -131,12 +131,12 @@ def test_the_objective_of_paper_is_the_papers(task, w_mask, small, monkeypatch):
     assert asked.params.mask_weight == w_mask and len(asked.views) == len(small.frames)
     # Round or faint ones, as trainings start from, have hardly a gradient to compare.
     asked.initial = concatenate([some(small, i, EVERY[i]) for i in sorted(asked.ids)])
-    arrays = tuple(getattr(asked.initial, name) for name in PARAMETERS)
+    arrays = {name: getattr(asked.initial, name) for name in PARAMETERS}
     labels = channels_of(asked.initial.instance_id, asked.ids) if w_mask else None
     num_labels = len(asked.ids) if w_mask else 0
     for number in (0, 3):
         view = asked.views[number]
-        parameters = [torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in arrays]
+        parameters = [torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in arrays.values()]
         expected = paper_loss(asked, parameters, view, number, w_mask, small)
         expected.backward()
         target = Target.of(view, asked.params.objective, num_labels)
@@ -145,10 +145,12 @@ def test_the_objective_of_paper_is_the_papers(task, w_mask, small, monkeypatch):
         for share in (0.0, 1.0):
             weights = asked.params.objective.at(share, asked.params.mask_weight)
             for backend in (NativeBackend(1), TorchBackend("cpu")):
-                found = backend.descent(arrays, labels, target, options, weights)
-                assert found.loss == pytest.approx(expected.item(), rel=1e-5)
+                values = {name: backend.put(a) for name, a in arrays.items()}
+                channels = None if labels is None else backend.put(labels)
+                found = backend.descent(values, channels, backend.target(target, num_labels), options, weights)
+                assert backend.host(found.loss) == pytest.approx(expected.item(), rel=1e-5)
                 for name, exact in zip(PARAMETERS, parameters, strict=True):
-                    off = np.linalg.norm(found.gradients[name] - exact.grad.numpy())
+                    off = np.linalg.norm(backend.host(found.gradients[name]) - exact.grad.numpy())
                     assert off <= 1e-3 * np.linalg.norm(exact.grad.numpy()), name
         one = train(
             asked.initial,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ss_flow.running import Surroundings, running
+from ss_flow.tasks.gaussians.backends import NativeBackend
 from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify, rotations
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, laid_flat, select
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
@@ -171,13 +172,25 @@ def test_a_training_that_blows_up_says_so():
         )
 
 
+def test_a_loss_that_is_not_finite_is_told_with_its_step_wherever_training_ends():
+    class Broken(NativeBackend):
+        def descent(self, values, *rest):
+            found = super().descent(values, *rest)
+            return found._replace(loss=np.nan if len(values["means"]) == 300 else 0.0)
+
+    params = TrainParams(iterations=7, densify="none")
+    with pytest.raises(TrainingDiverged, match=r"300 Gaussians diverged at step 1$"):
+        train(ball_points(), VIEWS, params=params, extent=1.6, seed=0, backend=Broken(1))
+
+
 def test_large_gaussians_are_split_and_small_ones_cloned():
     points = initialise(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8), 1, 1.0)
     parameters = {"means": points.means, "quaternions": points.quaternions, "log_scales": points.log_scales.copy()}
     parameters["log_scales"][0] = np.log(0.001)
     values, source, fresh = densify(
-        parameters, np.array([1.0, 1.0, 0.0]), threshold=0.5, extent=1.0, most=10, generator=np.random.default_rng(0)
-    )
+        parameters, np.array([1.0, 1.0, 0.0]), threshold=0.5, extent=1.0, most=10, generator=np.random.default_rng(0),
+        backend=NativeBackend(1),
+    )  # fmt: skip
     assert source.tolist() == [0, 2, 0, 1, 1] and fresh.tolist() == [False, False, True, True, True]
     assert np.array_equal(values["means"][2], points.means[0])
     assert np.allclose(np.exp(values["log_scales"][3:]), np.exp(points.log_scales[1]) / 1.6)
@@ -189,7 +202,8 @@ def test_densification_ends_at_the_limit_with_the_largest_gradients_first():
     parameters = {"means": points.means, "quaternions": points.quaternions, "log_scales": points.log_scales - 9}
     gradient = np.array([1, 6, 2, 5, 3, 4.0])
     _, source, _ = densify(
-        parameters, gradient, threshold=0.5, extent=1, most=8, generator=np.random.default_rng(0)
+        parameters, gradient, threshold=0.5, extent=1, most=8, generator=np.random.default_rng(0),
+        backend=NativeBackend(1),
     )  # fmt: skip
     assert source.tolist() == [0, 1, 2, 3, 4, 5, 1, 3]
 
@@ -204,7 +218,7 @@ def test_a_limit_of_none_lets_densification_go_on():
 
 
 def test_the_gradient_record_averages_over_the_views_that_saw():
-    record = GradientRecord(2)
+    record = GradientRecord(2, NativeBackend(1))
     record.add(np.array([[3, 4], [0, 0]], np.float32), np.array([1, 0], np.float32), 2 * REFERENCE_ROWS)
     record.add(np.array([[0, 1], [0, 2]], np.float32), np.array([1, 1], np.float32), 2 * REFERENCE_ROWS)
     assert record.mean().tolist() == [3, 2]
