@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = {"cache": "ss_flow.cache", "ss_flow": "ss_flow", "tasks": "ss_flow.tasks", "flows": "ss_flow.flows"}
 ORDER = list(FLOORS)
 ROOMS = (
-    {"artifacts", "ranges", "processor"},
+    {"artifacts", "ranges", "processor", "device"},
     {"geometry"},
     {"models", "gaussians", "masks"},
     {"capture"},
@@ -23,7 +23,7 @@ ROOMS = (
     {"edit"},
 )
 """The folders of `tasks`, in the order in which they may know of each other; those of one line know nothing of it."""
-LATE = {f"ss_flow.tasks.gaussians.{name}" for name in ("autograd", "cuda", "torch_backend")}
+LATE = {f"ss_flow.tasks.gaussians.{name}" for name in ("autograd", "cuda", "torch_backend", "torch_render")}
 """Modules that cannot be defined without torch, and so are imported inside functions only."""
 HEAVY = {"torch", "cv2", "scipy", "open3d", "onnxruntime", "onnx", "pycolmap", "zarr", "matplotlib", "jinja2"}
 HEAVY |= {"dask", "distributed", "obstore"}

@@ -35,7 +35,7 @@ class GivenSceneParams:
     """Alpha from which a pixel has a depth."""
 
 
-@task(name="capture.given_scene", resources=Resources(cores=1, memory_mb=2000), environment=backend_identity)
+@task(name="capture.given_scene", resources=Resources(cores=1, memory_mb=2000, gpus=0.1), environment=backend_identity)
 def given_scene(
     frames: tuple[Frame, ...], cameras: Cameras, *, file: FileRef, params: GivenSceneParams = GivenSceneParams()
 ) -> Gaussians:
@@ -66,7 +66,9 @@ def given_scene(
     return scene
 
 
-@task(name="capture.rendered_depth", resources=Resources(cores=1, memory_mb=1000), environment=backend_identity)
+@task(
+    name="capture.rendered_depth", resources=Resources(cores=1, memory_mb=1000, gpus=0.1), environment=backend_identity
+)
 def rendered_depth(
     scene: Gaussians, frame: Frame, camera: Camera, *, params: GivenSceneParams = GivenSceneParams()
 ) -> DepthMap:

@@ -8,12 +8,12 @@ from typing import Any, Literal
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.task import FileRef, task
+from ss_flow.task import FileRef, Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.geometry.alignment import fit_scale_shift
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
-from ss_flow.tasks.models.onnx import load_onnxruntime, network_identity
+from ss_flow.tasks.models.onnx import load_onnxruntime, network_identity, providers
 from ss_flow.tasks.ranges import Count, Fraction, Positive
 
 _MEAN = np.array((0.485, 0.456, 0.406), np.float32)
@@ -42,7 +42,7 @@ class MonoParams:
     """Depths beyond so many times the farthest known depth are unknown."""
 
 
-@task(name="capture.mono", environment=network_identity)
+@task(name="capture.mono", resources=Resources(gpus=0.1), environment=network_identity)
 def mono(
     frame: Frame,
     cameras: Cameras,
@@ -90,7 +90,7 @@ def _predict(frame: Frame, model: FileRef, params: MonoParams) -> Float32:
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     try:
-        session: Any = onnxruntime.InferenceSession(str(model.path), options, providers=["CPUExecutionProvider"])
+        session: Any = onnxruntime.InferenceSession(str(model.path), options, providers=providers())
     except Exception as error:  # onnxruntime has no public base class of its errors
         raise InputError(f"{model.path} cannot be loaded as an ONNX model ({str(error).splitlines()[0]}).") from error
     wanted = session.get_inputs()[0]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.running import progress
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Float32, Gaussians, UInt8
 from ss_flow.tasks.deliver.export.content import FileContent
 from ss_flow.tasks.deliver.palette import paint_ids, turbo
@@ -28,7 +28,7 @@ _PAPER = (1.0, 1.0, 1.0)
 _FARTHEST = np.iinfo(np.uint16).max
 
 
-@task(name="deliver.pictures.picture", environment=backend_identity)
+@task(name="deliver.pictures.picture", resources=Resources(gpus=0.1), environment=backend_identity)
 def picture(gaussians: Gaussians, camera: Camera, *, what: What, width: int, depth_unit: float) -> FileContent:
     """A rendering as a PNG file.
 
@@ -38,7 +38,7 @@ def picture(gaussians: Gaussians, camera: Camera, *, what: What, width: int, dep
     """
     if width:
         camera = camera.scaled(width, max(1, round(camera.height * width / camera.width)))
-    seen = render(gaussians, camera, background=_PAPER)
+    seen = render(gaussians, camera, background=_PAPER, winners=what == "labels")
     if what == "colour":
         pixels: np.ndarray = np.rint(255 * seen.rgb.clip(0, 1)).astype(np.uint8)
     elif what == "alpha":

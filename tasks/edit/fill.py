@@ -49,7 +49,7 @@ _OPACITY = 0.95
 _LARGEST_BLOCK = 20_000
 
 
-@task(name="edit.fill", resources=Resources(cores=1, memory_mb=1500), environment=backend_identity)
+@task(name="edit.fill", resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=backend_identity)
 def fill(
     before: EditedScene,
     after: EditedScene,

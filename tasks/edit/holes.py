@@ -112,7 +112,7 @@ class Uncovered:
     """[h, w] of what is there now; infinite where one can see through it."""
 
 
-@task(name="edit.holes", resources=Resources(cores=1, memory_mb=1000), environment=backend_identity)
+@task(name="edit.holes", resources=Resources(cores=1, memory_mb=1000, gpus=0.1), environment=backend_identity)
 def holes(
     before: EditedScene,
     after: EditedScene,

@@ -72,7 +72,7 @@ def read_label(file: Path) -> LabelledFrame:
     return labelled_frame(document, str(file))
 
 
-@task(name="evaluate.lerf_strict", resources=Resources(cores=1), environment=backend_identity)
+@task(name="evaluate.lerf_strict", resources=Resources(cores=1, gpus=0.1), environment=backend_identity)
 def strict(
     frames: Sequence[Frame],
     cameras: Cameras,
@@ -130,7 +130,9 @@ def oracle(
 
 
 @task(
-    name="evaluate.lerf_2d", resources=Resources(cores=1), environment=lambda: backend_identity() | network_identity()
+    name="evaluate.lerf_2d",
+    resources=Resources(cores=1, gpus=0.1),
+    environment=lambda: backend_identity() | network_identity(),
 )
 def langsplat_2d(
     frames: Sequence[Frame],

@@ -54,7 +54,7 @@ class Removals:
     """[L] mean absolute difference of colour, 0..1, outside the instance's mask; 0 for a clean object."""
 
 
-@task(name="evaluate.object_views", resources=Resources(cores=1), environment=backend_identity)
+@task(name="evaluate.object_views", resources=Resources(cores=1, gpus=0.1), environment=backend_identity)
 def object_views(frames: Sequence[Frame], cameras: Cameras, scene: Gaussians, truth: Sequence[LabelMap]) -> ObjectViews:
     """Render the annotated views and compare them with their photos, box by box.
 
@@ -93,7 +93,7 @@ def object_views(frames: Sequence[Frame], cameras: Cameras, scene: Gaussians, tr
     )
 
 
-@task(name="evaluate.removals", resources=Resources(cores=1), environment=backend_identity)
+@task(name="evaluate.removals", resources=Resources(cores=1, gpus=0.1), environment=backend_identity)
 def removals(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> Removals:
     """Take each instance out and compare the renderings with and without it, outside its mask.
 

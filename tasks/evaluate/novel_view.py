@@ -20,7 +20,7 @@ _PSNR_OF_EQUALS = 100.0
 
 
 @task(
-    resources=Resources(cores=1),
+    resources=Resources(cores=1, gpus=0.1),
     environment=backend_identity,
 )
 def novel_view(

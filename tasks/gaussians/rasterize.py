@@ -7,7 +7,6 @@ before its transmittance T would fall below 1e-4; weight = T * alpha. A Gaussian
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import importlib.util
 from collections.abc import Callable, Sequence
@@ -17,7 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Gaussians, Int32
+from ss_flow.tasks.device import VARIABLE, has_device, wanted
 from ss_flow.tasks.gaussians.library import instruction_set
 from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.geometry.cameras import Camera
@@ -115,24 +116,31 @@ class Renderer(NamedTuple):
 
 
 @functools.cache
-def training_device() -> str:
-    """Where Gaussians are trained: "cuda" where gsplat, a torch with CUDA and a driver are there, else "cpu".
+def device_here() -> str:
+    """Where Gaussians are trained and drawn: "cuda" where gsplat, a torch with CUDA, a device and its driver are there,
+    else "cpu".
 
-    Found without importing torch, since every key that depends on it asks.
+    Found without importing torch, since every key that depends on it asks. Raises InputError when CUDA was asked for
+    and something of it is missing (`SS_FLOW_DEVICE`).
     """
-    if importlib.util.find_spec("gsplat") is None or "+cpu" in version("torch"):
+    if wanted() == "cpu":
         return "cpu"
-    try:
-        driver = ctypes.CDLL("libcuda.so.1")
-    except OSError:
-        return "cpu"
-    return "cuda" if driver.cuInit(0) == 0 else "cpu"
+    missing = ""
+    if importlib.util.find_spec("gsplat") is None:
+        missing = "gsplat is not installed (pip install 'ss-flow[cuda]')"
+    elif "+cpu" in version("torch"):
+        missing = f"torch {version('torch')} was built without it"
+    elif not has_device():
+        missing = "there is no device with a driver"
+    if missing and wanted() == "cuda":
+        raise InputError(f"{VARIABLE} asks for CUDA, but {missing}.")
+    return "cpu" if missing else "cuda"
 
 
 def backend_identity() -> dict[str, str]:
     """What renderings and trainings depend on besides their inputs: the instruction set, and CUDA's rasterizer."""
     rendering = {"rasterizer": on_this_processor(instruction_set())}
-    return rendering if training_device() == "cpu" else {**rendering, "training": f"gsplat {version('gsplat')}, CUDA"}
+    return rendering if device_here() == "cpu" else {**rendering, "device": f"CUDA, gsplat {version('gsplat')}"}
 
 
 def rasterize(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
 from ss_flow.tasks.gaussians.initialise import SH_ZERO
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
-from ss_flow.tasks.gaussians.rasterize import NAMES
+from ss_flow.tasks.gaussians.rasterize import NAMES, device_here
 from ss_flow.tasks.geometry.cameras import Camera
 
 OPAQUE_LOGIT = 20.0
@@ -31,11 +31,11 @@ class Rendering(NamedTuple):
     label_masks: Float32
     """[L, H, W] sum of the weights of each label's Gaussians."""
     top_contributor: Int32
-    """[H, W] row of the Gaussian with the largest weight T * alpha, -1 = none."""
+    """[H, W] row of the Gaussian with the largest weight T * alpha, -1 = none; all -1 without `winners`."""
     visible: Bool
     """[N] reaches the image."""
     max_contribution: Float32
-    """[N] largest weight over the image."""
+    """[N] largest weight over the image; zeros without `winners`."""
 
 
 def channels_of(instance_id: Int32, label_ids: Sequence[int]) -> Int32:
@@ -53,10 +53,12 @@ def render(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     opaque: bool = False,
     label_ids: Sequence[int] = (),
+    winners: bool = True,
 ) -> Rendering:
-    """Render Gaussians on the CPU.
+    """Render Gaussians, on CUDA where Gaussians are trained there.
 
-    opaque: every opacity 1, with the falloff kept (spec P2). label_ids: instance ids, one mask channel each.
+    opaque: every opacity 1, with the falloff kept (spec P2). label_ids: instance ids, one mask channel each. winners:
+    whether `top_contributor` and `max_contribution` are asked for, which take long on CUDA.
     Raises ValueError when a parameter is not finite.
     """
     if opaque:
@@ -68,10 +70,20 @@ def render(
     labels = channels_of(gaussians.instance_id, label_ids) if len(label_ids) else None
     degree = round(gaussians.sh.shape[1] ** 0.5) - 1
     red, green, blue = background
-    settings = Settings((red, green, blue), len(label_ids), degree, winners=True)
+    settings = Settings((red, green, blue), len(label_ids), degree, winners)
+    if _device(gaussians) != "cpu":
+        from ss_flow.tasks.gaussians.torch_render import draw
+
+        there = draw(_device(gaussians), parameters, labels, camera, settings)
+        return Rendering(
+            *(t.cpu().numpy() for t in (there.rgb, there.alpha, there.depth, there.label_masks, there.top_contributor)),
+            there.radii.cpu().numpy() > 0,
+            there.max_contribution.cpu().numpy(),
+        )
     done = NativePass(parameters, labels, camera, settings)  # type: ignore[arg-type]
-    assert done.top is not None and done.strongest is not None
-    return Rendering(done.rgb, done.alpha, done.depth, done.masks, done.top, done.radii > 0, done.strongest)
+    none = np.full(done.alpha.shape, -1, np.int32), np.zeros(len(gaussians), np.float32)
+    top, strongest = none if done.top is None or done.strongest is None else (done.top, done.strongest)
+    return Rendering(done.rgb, done.alpha, done.depth, done.masks, top, done.radii > 0, strongest)
 
 
 def weights_by_id(gaussians: Gaussians, camera: Camera, ids: NDArray[np.integer]) -> Iterator[tuple[int, Float32]]:
@@ -83,13 +95,30 @@ def weights_by_id(gaussians: Gaussians, camera: Camera, ids: NDArray[np.integer]
     """
     grey = replace(gaussians, sh=np.zeros((len(gaussians), 1, 3), np.float32))  # no colour is cut off at 0
     parameters = tuple(np.ascontiguousarray(getattr(grey, name), np.float32) for name in NAMES)
-    drawn = NativePass(parameters, None, camera, Settings((0.0, 0.0, 0.0), 0, 0, winners=False))  # type: ignore[arg-type]
+    weigh = _weigher(_device(grey), parameters, camera, Settings((0.0, 0.0, 0.0), 0, 0, winners=False))
     found = np.unique(ids[ids >= 0]).tolist()
     for start in range(0, len(found), 3):
         some = found[start : start + 3]
         towards = np.zeros((camera.height, camera.width, 3), np.float32)
         for channel, one in enumerate(some):
             towards[..., channel] = ids == one
-        weights = drawn.backward(towards, None, None, None)["sh"][:, 0] / np.float32(SH_ZERO)
+        weights = weigh(towards) / np.float32(SH_ZERO)
         for channel, one in enumerate(some):
             yield one, weights[:, channel]
+
+
+def _weigher(
+    device: str, parameters: tuple[Float32, ...], camera: Camera, settings: Settings
+) -> Callable[[Float32], Float32]:
+    """What gives the gradient towards the constant colours [N, 3] for one towards the picture [H, W, 3]."""
+    if device != "cpu":
+        from ss_flow.tasks.gaussians.torch_render import weigher
+
+        return weigher(device, parameters, camera, settings)
+    drawn = NativePass(parameters, None, camera, settings)  # type: ignore[arg-type]
+    return lambda towards: drawn.backward(towards, None, None, None)["sh"][:, 0]
+
+
+def _device(gaussians: Gaussians) -> str:
+    """Where to draw them; nothing at all is drawn on the CPU."""
+    return device_here() if len(gaussians) else "cpu"

@@ -19,7 +19,7 @@ from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecor
 from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target, decayed
 from ss_flow.tasks.gaussians.optimizer import Parameters
-from ss_flow.tasks.gaussians.rasterize import training_device
+from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.gaussians.render import channels_of
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
@@ -112,7 +112,7 @@ def train(
 
     extent: size of what is trained, world units, or [N] of what each Gaussian is part of: scales the learning rate of
     the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. backend: where, by default
-    on this machine's `training_device`. On the CPU the number of threads changes no byte, and neither does a kill: a
+    on this machine's `device_here`. On the CPU the number of threads changes no byte, and neither does a kill: a
     later try goes on from the last checkpoint.
     Raises ValueError when there are no views or Gaussians or an array does not fit its camera, TrainingDiverged when
     numbers blow up. The result has no Gaussians when all were pruned.
@@ -129,7 +129,7 @@ def train(
     ):
         if value not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {value!r}")
-    backend = backend or backend_for(training_device(), cores())
+    backend = backend or backend_for(device_here(), cores())
     with backend.stream():
         return _Training(initial, views, params, extents, seed, label_ids, backend).run()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Mapping
+from importlib.metadata import distributions, version
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
@@ -12,7 +13,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ss_flow.errors import InputError
+from ss_flow.running import warn
 from ss_flow.task import FileRef
+from ss_flow.tasks.device import VARIABLE, has_device, wanted
 from ss_flow.tasks.processor import on_this_processor, widest_instruction_set
 
 if TYPE_CHECKING:
@@ -20,12 +23,64 @@ if TYPE_CHECKING:
     import onnxruntime
 
 
+_CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+_CUDA_OPTIONS = {"arena_extend_strategy": "kSameAsRequested", "cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"}
+"""Others share the device, and the algorithm must not be what happened to be fastest this time."""
+
+
 def network_identity() -> dict[str, str]:
-    """What the outputs of a network depend on besides the network, its inputs and ONNX Runtime: the instruction set.
+    """What the outputs of a network depend on besides the network, its inputs and ONNX Runtime: the instruction set,
+    and whether CUDA runs it.
 
     ONNX Runtime picks its kernels by the widest one, and sums in another order in each. For the `environment` of tasks.
     """
-    return {"instruction set": on_this_processor(widest_instruction_set())}
+    here = {"instruction set": on_this_processor(widest_instruction_set())}
+    return here if lacks_cuda() is not None else {**here, "networks": f"CUDA, {_GPU_BUILD} {version(_GPU_BUILD)}"}
+
+
+_GPU_BUILD = "onnxruntime-gpu"
+"""The distribution of ONNX Runtime that has the CUDA provider."""
+
+
+@functools.cache
+def lacks_cuda() -> str | None:
+    """Why networks run on the CPU, None where they run on CUDA.
+
+    Whether the provider starts is tried out, on one node: ONNX Runtime itself goes back to the CPU without a word.
+    """
+    if wanted() == "cpu":
+        return f"{VARIABLE} says so"
+    if not any(distributions(name=_GPU_BUILD)):
+        return f"{_GPU_BUILD} is not installed in the place of onnxruntime"
+    if not has_device():
+        return "there is no CUDA device with a driver"
+    runtime = load_onnxruntime()
+    if _CUDA not in runtime.get_available_providers():
+        return f"{_GPU_BUILD} is installed, but another onnxruntime hides it"
+    quiet = runtime.SessionOptions()
+    quiet.log_severity_level = 4
+    tried = runtime.InferenceSession(_one_node(), quiet, providers=[(_CUDA, _CUDA_OPTIONS), _CPU])
+    return None if _CUDA in tried.get_providers() else f"the CUDA provider of {_GPU_BUILD} does not start here"
+
+
+def providers() -> list[Any]:
+    """What runs networks, in the order of preference, as ONNX Runtime takes it; warns where CUDA was asked for, by
+    `SS_FLOW_DEVICE` or by installing ONNX Runtime for it, and is not to be had."""
+    reason = lacks_cuda()
+    if reason is None:
+        return [(_CUDA, _CUDA_OPTIONS), _CPU]
+    if wanted() == "cuda" or (wanted() == "" and has_device() and any(distributions(name=_GPU_BUILD))):
+        warn(f"Networks run on the CPU: {reason}.")
+    return [_CPU]
+
+
+def _one_node() -> bytes:
+    import onnx
+
+    value, result = (onnx.helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, [1]) for n in ("x", "y"))
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Identity", ["x"], ["y"])], "one", [value], [result])
+    opset = onnx.helper.make_opsetid("", 17)
+    return bytes(onnx.helper.make_model(graph, opset_imports=[opset], ir_version=9).SerializeToString())
 
 
 def load_onnxruntime() -> ModuleType:
@@ -45,13 +100,14 @@ def open_session(
     wires: tuple[tuple[str, str, str], ...] = (),
     inputs: tuple[str, ...] = (),
 ) -> onnxruntime.InferenceSession:
-    """The session of a network on the CPU, one a process for each file content, thread count and cut.
+    """The session of a network, one a process for each file content, thread count and cut; on CUDA where it can be.
 
     file: an ONNX file. threads: cores that one run may use; nodes run one after the other in a fixed order, so the
     count does not change what a node is given. outputs, batched, wires: how to cut the graph (see `expose`); no outputs
     keeps the graph as it is. inputs: names that the network has to take.
     Raises InputError when the file is missing, is damaged, is no ONNX graph, or lacks one of the names.
     """
+    providers()  # warns, also where the session is open already
     session = _open(str(file.path), file.digest, threads, outputs, batched, wires)
     taken = [node.name for node in session.get_inputs()]
     missing = [name for name in inputs if name not in taken]
@@ -64,7 +120,7 @@ def open_session(
 
 
 def open_written(weights: FileRef, write: Callable[[], bytes], *, threads: int = 1) -> onnxruntime.InferenceSession:
-    """The session of a network that is written down from a file of weights, on the CPU; one a caller.
+    """The session of a network that is written down from a file of weights; one a caller.
 
     write: gives the network as an ONNX file's content. threads: as for `open_session`.
     Raises InputError when the file lacks a weight that the network has.
@@ -101,7 +157,7 @@ def _session(source: str | bytes, path: str, threads: int) -> onnxruntime.Infere
     options.use_deterministic_compute = True
     options.log_severity_level = 3
     try:
-        return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(source, options, providers=providers())
     except Exception as error:  # onnxruntime has a class for every cause, with no common base
         raise InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.") from error
 

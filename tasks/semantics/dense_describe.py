@@ -60,7 +60,7 @@ class DenseDescribeParams:
 
 
 def _identity() -> dict[str, str]:
-    return network_identity() | {"rasterizer": backend_identity()["rasterizer"]}
+    return network_identity() | backend_identity()
 
 
 @task(name="semantics.dense_describe.apart")
@@ -69,7 +69,7 @@ def apart(scene: Gaussians) -> tuple[Gaussians, ...]:
     return tuple(select(scene, rows) for i, rows in sorted(rows_by_label(scene.instance_id).items()) if i != 0)
 
 
-@task(resources=Resources(cores=1, memory_mb=1500), environment=_identity)
+@task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=_identity)
 def dense_describe(
     own: Gaussians, cameras: Cameras, *, network: Model, params: DenseDescribeParams = DenseDescribeParams()
 ) -> DenseDescriptors:

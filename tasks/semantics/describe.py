@@ -44,7 +44,7 @@ class DescribeParams:
     """How much of the mask's border is left out."""
 
 
-@task(resources=Resources(cores=1, memory_mb=1200), environment=network_identity)
+@task(resources=Resources(cores=1, memory_mb=1200, gpus=0.1), environment=network_identity)
 def describe(
     frames: tuple[Frame, ...],
     instance: InstanceMasks | PartMasks,

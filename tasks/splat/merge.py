@@ -262,7 +262,7 @@ def quality(gaussians: Gaussians, views: Sequence[TrainView], ids: Int32) -> Qua
     overlaps: list[float] = []
     error, count = 0.0, 0
     for view in views:
-        rendering = render(gaussians, view.camera, label_ids=ids.tolist())
+        rendering = render(gaussians, view.camera, label_ids=ids.tolist(), winners=False)
         error += float(((rendering.rgb - view.image)[view.inside].astype(np.float64) ** 2).sum())
         count += 3 * int(view.inside.sum())
         assert view.ids is not None

@@ -85,7 +85,7 @@ class RenderedMask:
 
 @task(
     name="splat.refine",
-    resources=Resources(cores=1, memory_mb=1800),
+    resources=Resources(cores=1, memory_mb=1800, gpus=0.1),
     environment=lambda: backend_identity() | network_identity(),
 )
 def refine(
@@ -146,7 +146,7 @@ def refine(
 
 @task(
     name="splat.rendered",
-    resources=Resources(cores=1, memory_mb=1800),
+    resources=Resources(cores=1, memory_mb=1800, gpus=0.1),
     environment=backend_identity,
 )
 def rendered(
@@ -200,7 +200,7 @@ def render_mask(
     nothing = np.zeros((full.height, full.width), bool)
     whole = CropParams(margin_px=margin_px, max_side=max(full.width, full.height))
     camera = crop_camera(full, nothing, gaussians.means, whole)
-    outline, surface = render(gaussians, camera, opaque=True), render(gaussians, camera)
+    outline, surface = (render(gaussians, camera, opaque=opaque, winners=False) for opaque in (True, False))
     solid = outline.alpha >= alpha_threshold
     total, weight = np.where(surface.alpha >= 0.5, (surface.depth, surface.alpha), (outline.depth, outline.alpha))
     depth = np.where(solid, total / np.maximum(weight, 1e-6), 0)

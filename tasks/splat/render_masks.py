@@ -43,7 +43,7 @@ class RenderMasksParams:
 
 @task(
     name="splat.render_masks",
-    resources=Resources(cores=1, memory_mb=1000),
+    resources=Resources(cores=1, memory_mb=1000, gpus=0.1),
     environment=backend_identity,
 )
 def render_masks(
@@ -86,14 +86,14 @@ def _at_border(ids: np.ndarray) -> Bool:
 
 def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap, share: float) -> np.ndarray:
     """[H, W] uint16."""
-    whole = render(scene, camera)
+    whole = render(scene, camera, winners=False)
     shown = select(scene, whole.visible)
     ids = np.zeros((camera.height, camera.width), np.uint16)
     heaviest, of_known = np.zeros(ids.shape, np.float32), np.zeros(ids.shape, np.float32)
     present = np.unique(shown.instance_id)
     for start in range(0, len(present), _LABELS_AT_ONCE):
         labels = present[start : start + _LABELS_AT_ONCE]
-        weights = render(shown, camera, label_ids=labels.tolist()).label_masks
+        weights = render(shown, camera, label_ids=labels.tolist(), winners=False).label_masks
         for label, weight in zip(labels, weights, strict=True):
             ids[weight > heaviest] = label
             np.maximum(heaviest, weight, out=heaviest)

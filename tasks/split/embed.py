@@ -10,7 +10,7 @@ from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, Sam
 
 
-@task(resources=Resources(cores=1, memory_mb=1500), environment=network_identity)
+@task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=network_identity)
 def embed(frame: Frame, *, model: Model) -> Embedding:
     """The embedding of one photo (4 MB); it takes as long as some twenty prompts.
 

@@ -34,7 +34,7 @@ _MOST = 0.5
 """Share of the labelled pixels that counts as most of them."""
 
 
-@task(resources=Resources(cores=1, memory_mb=1500), environment=network_identity)
+@task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=network_identity)
 def clicked(photo: EmbeddedPhoto, clicks: Clicks, *, model: Model) -> PromptedMasks:
     """One mask for each object that was clicked in a view, none in a view without clicks.
 
@@ -82,7 +82,7 @@ def label(
     )
 
 
-@task(resources=Resources(cores=1, memory_mb=1500), environment=network_identity)
+@task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=network_identity)
 def spread(
     photo: EmbeddedPhoto,
     visibility: Visibility,

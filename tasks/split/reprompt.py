@@ -36,7 +36,7 @@ class RepromptParams:
     """Whether the outermost points are no prompts."""
 
 
-@task(resources=Resources(cores=1, memory_mb=1500), environment=network_identity)
+@task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=network_identity)
 def reprompt(
     photo: EmbeddedPhoto,
     visibility: Visibility,

@@ -108,7 +108,7 @@ class _Candidates:
 
 @task(
     name="split.segment",
-    resources=Resources(cores=1, memory_mb=1500),
+    resources=Resources(cores=1, memory_mb=1500, gpus=0.1),
     environment=network_identity,
 )
 def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model: Model) -> MaskSet:

@@ -96,7 +96,7 @@ def test_a_task_declares_the_instruction_set_where_native_code_picks_its_loops_b
         expected.add("instruction set")
     if "ss_flow.tasks.gaussians.library.library" in recipe.closure:
         expected.add("rasterizer")
-    assert recipe.components["environment"].keys() - {"training"} == expected
+    assert recipe.components["environment"].keys() - {"device", "networks"} == expected
 
 
 @pytest.fixture

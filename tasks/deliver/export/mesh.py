@@ -47,7 +47,7 @@ class TriangleMesh:
 
 @task(
     name="deliver.export.mesh",
-    resources=Resources(cores=1, memory_mb=900),
+    resources=Resources(cores=1, memory_mb=900, gpus=0.1),
     environment=backend_identity,
 )
 def mesh(own: Gaussians, cameras: Cameras, *, instance_id: int, holes: Literal["open", "closed"]) -> TriangleMesh:

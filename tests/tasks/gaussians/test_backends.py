@@ -24,14 +24,15 @@ from ss_flow.tasks.gaussians.initialise import initialise, select
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
 from ss_flow.tasks.gaussians.optimizer import Parameters
-from ss_flow.tasks.gaussians.rasterize import renderer_on, training_device
+from ss_flow.tasks.gaussians.rasterize import device_here, renderer_on
+from ss_flow.tasks.gaussians.render import render, weights_by_id
 from ss_flow.tasks.gaussians.torch_backend import TorchBackend
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
 
 NATIVE = NativeBackend(1)
-CUDA = pytest.param("cuda", marks=pytest.mark.skipif(training_device() != "cuda", reason="no CUDA with gsplat here"))
+CUDA = pytest.param("cuda", marks=pytest.mark.skipif(device_here() != "cuda", reason="no CUDA with gsplat here"))
 
 
 @dataclass
@@ -228,6 +229,25 @@ def test_every_backend_remembers_the_same_gradients_and_limits_the_same_values(b
     assert 0 < len(gaussians) < 120 and len(theirs) == len(gaussians)
     for name in PARAMETERS:
         np.testing.assert_allclose(getattr(theirs, name), getattr(gaussians, name), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("label_ids", [(), (4, 9, 11)])
+def test_renderings_by_torch_are_the_native_ones(monkeypatch, label_ids):
+    values, labels, target = example(11, Objective(), with_labels=True)
+    made = initialise(
+        values["means"], np.zeros((120, 3), np.uint8), np.take([4, 9, 2, 11], labels % 4), 1.0, opacity=0.6
+    )
+    made = replace(made, sh=values["sh"], quaternions=values["quaternions"])
+    expected = render(made, target.camera, background=(0.1, 0.2, 0.3), label_ids=label_ids)
+    ids = np.random.default_rng(0).integers(-1, 5, expected.alpha.shape)
+    weights = dict(weights_by_id(made, target.camera, ids))
+    drawing = sys.modules[render.__module__]
+    monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))  # torch's, not "cpu", the native one
+    found = render(made, target.camera, background=(0.1, 0.2, 0.3), label_ids=label_ids)
+    for name, image in expected._asdict().items():
+        assert getattr(found, name).dtype == image.dtype and np.array_equal(getattr(found, name), image), name
+    for one, weight in weights_by_id(made, target.camera, ids):
+        np.testing.assert_allclose(weight, weights[one], atol=1e-5)
 
 
 class FromTheHost(TorchFunctionMode):

@@ -17,7 +17,7 @@ from ss_flow.tasks.gaussians import library, native_pass
 from ss_flow.tasks.gaussians.library import BUILDS, Workspace
 from ss_flow.tasks.gaussians.library import library as native_library
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
-from ss_flow.tasks.gaussians.rasterize import GaussianTensors, backend_identity, rasterize, training_device
+from ss_flow.tasks.gaussians.rasterize import GaussianTensors, backend_identity, device_here, rasterize
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.processor import INSTRUCTION_SETS, features
 
@@ -28,7 +28,7 @@ _spec.loader.exec_module(reference)
 
 DEVICES = [
     "cpu",
-    pytest.param("cuda", marks=pytest.mark.skipif(training_device() != "cuda", reason="no CUDA with gsplat here")),
+    pytest.param("cuda", marks=pytest.mark.skipif(device_here() != "cuda", reason="no CUDA with gsplat here")),
 ]
 IMAGES = ("rgb", "alpha", "depth", "label_masks")
 NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")

@@ -3,14 +3,17 @@
 import re
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
 from ss_flow.errors import InputError
+from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef
 from ss_flow.tasks.models import onnx as networks
 from ss_flow.tasks.models.onnx import expose, open_session, run
@@ -107,3 +110,76 @@ def test_onnx_runtime_is_told_not_to_report_its_use_before_it_is_imported():
     found = (re.findall(r"^ +import onnxruntime", p.read_text(), re.MULTILINE) for p in sources)
     others = [p.name for p, lines in zip(sources, found, strict=True) if lines]
     assert others == ["onnx.py"]
+
+
+class Runtime:
+    """An ONNX Runtime with the CUDA provider; whether that starts is said when it is made."""
+
+    def __init__(self, starts: bool) -> None:
+        self.starts, self.asked = starts, []
+
+    def get_available_providers(self):
+        return ["CUDAExecutionProvider", "CPUExecutionProvider"]
+
+    def SessionOptions(self):
+        return onnxruntime.SessionOptions()
+
+    def InferenceSession(self, source, options, providers):
+        self.asked.append(providers)
+        session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
+        names = ["CPUExecutionProvider"] if not self.starts else ["CUDAExecutionProvider", "CPUExecutionProvider"]
+        return types.SimpleNamespace(get_providers=lambda: names, run=session.run)
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Have this machine be one with or without CUDA and ONNX Runtime for it."""
+
+    def be(*, device: bool, installed: bool, starts: bool = True, wanted: str = "") -> Runtime:
+        runtime = Runtime(starts)
+        monkeypatch.setattr(networks, "has_device", lambda: device)
+        monkeypatch.setattr(networks, "wanted", lambda: wanted)
+        monkeypatch.setattr(networks, "distributions", lambda name: ["one"] * installed)
+        monkeypatch.setattr(networks, "version", lambda name: "1.31.1")
+        monkeypatch.setattr(networks, "load_onnxruntime", lambda: runtime)
+        networks.lacks_cuda.cache_clear()
+        return runtime
+
+    yield be
+    networks.lacks_cuda.cache_clear()
+
+
+def test_networks_run_on_cuda_where_it_starts_and_their_keys_say_so(machine):
+    machine(device=True, installed=True)
+    (name, options), fallback = networks.providers()
+    assert (name, fallback) == ("CUDAExecutionProvider", "CPUExecutionProvider")
+    assert options["use_tf32"] == "0"
+    assert networks.network_identity()["networks"] == "CUDA, onnxruntime-gpu 1.31.1"
+
+
+@pytest.mark.parametrize(
+    ("here", "warned"),
+    [
+        ({"device": False, "installed": False}, None),
+        ({"device": False, "installed": True}, None),
+        ({"device": True, "installed": False}, None),
+        ({"device": True, "installed": True, "wanted": "cpu"}, None),
+        (
+            {"device": True, "installed": True, "starts": False},
+            "the CUDA provider of onnxruntime-gpu does not start here",
+        ),
+        ({"device": True, "installed": False, "wanted": "cuda"}, "onnxruntime-gpu is not installed"),
+        ({"device": False, "installed": True, "wanted": "cuda"}, "there is no CUDA device with a driver"),
+    ],
+)
+def test_networks_run_on_the_cpu_elsewhere_and_say_why_where_cuda_was_asked_for(machine, here, warned):
+    machine(**here)
+    heard = []
+    with running(Surroundings(warned=heard)):
+        assert networks.providers() == ["CPUExecutionProvider"]
+    assert networks.network_identity().keys() == {"instruction set"}
+    if warned is None:
+        assert heard == []
+    else:
+        (sentence,) = heard
+        assert sentence.startswith("Networks run on the CPU: ") and warned in sentence and sentence.endswith(".")

@@ -1,0 +1,33 @@
+"""Whether tasks compute on CUDA: what was asked for, and whether there is a device.
+
+`SS_FLOW_DEVICE` says "cpu", "cuda" or nothing: then CUDA is taken where all that it needs is there.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+
+from ss_flow.errors import InputError
+
+VARIABLE = "SS_FLOW_DEVICE"
+
+
+@functools.cache
+def wanted() -> str:
+    """ "cpu", "cuda" or "" for whatever is there. Raises InputError when something else was asked for."""
+    asked = os.environ.get(VARIABLE, "")
+    if asked not in ("", "cpu", "cuda"):
+        raise InputError(f"{VARIABLE} must be cpu, cuda or empty, not {asked!r}.")
+    return asked
+
+
+@functools.cache
+def has_device() -> bool:
+    """Whether there is a CUDA device with a driver, found without a library that takes long to import."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return bool(driver.cuInit(0) == 0)

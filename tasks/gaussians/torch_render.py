@@ -1,0 +1,45 @@
+"""Renderings of arrays by torch: on CUDA, and on the CPU to test that (imports torch: import it inside functions)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from ss_flow.tasks.artifacts import Float32, Int32
+from ss_flow.tasks.gaussians.native_pass import Settings
+from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered, renderer_on
+from ss_flow.tasks.geometry.cameras import Camera
+
+
+def draw(
+    device: str, parameters: Sequence[Float32], labels: Int32 | None, camera: Camera, settings: Settings
+) -> Rendered:
+    """A rendering without gradients. parameters: in the order of `NAMES`. labels: [N], < 0 = none."""
+    with torch.no_grad():
+        return _drawn(GaussianTensors(*(torch.tensor(a, device=device) for a in parameters)), labels, camera, settings)
+
+
+def weigher(
+    device: str, parameters: Sequence[Float32], camera: Camera, settings: Settings
+) -> Callable[[Float32], Float32]:
+    """The gradient of the picture's sum, weighted by [H, W, 3], towards the constant colours [N, 3]."""
+    gaussians = GaussianTensors(*(torch.tensor(a, device=device) for a in parameters))
+    gaussians.sh.requires_grad_()
+    picture = _drawn(gaussians, None, camera, settings).rgb
+
+    def weigh(towards: Float32) -> Float32:
+        given = torch.tensor(towards, device=device)
+        (found,) = torch.autograd.grad(picture, gaussians.sh, given, retain_graph=True)
+        return found[:, 0].cpu().numpy()
+
+    return weigh
+
+
+def _drawn(gaussians: GaussianTensors, labels: Int32 | None, camera: Camera, settings: Settings) -> Rendered:
+    means = gaussians.means
+    renderer = renderer_on(means.device)
+    channels = None if labels is None else torch.tensor(labels, device=means.device)
+    background = means.new_tensor(settings.background)
+    seen_from = renderer.camera_on(means.device, camera)
+    return renderer.draw(gaussians, seen_from, background, channels, settings, means.new_zeros(len(gaussians), 2))

@@ -1,0 +1,57 @@
+"""Where Gaussians are trained and drawn."""
+
+from __future__ import annotations
+
+import pytest
+
+from ss_flow.errors import InputError
+from ss_flow.tasks import device
+from ss_flow.tasks.gaussians import rasterize
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Have this machine be one with some of what CUDA needs, and somebody ask for a device."""
+
+    def be(*, gsplat: bool = True, torch: str = "2.13.0+cu130", driver: bool = True, asked: str = "") -> None:
+        monkeypatch.setenv(device.VARIABLE, asked)
+        monkeypatch.setattr(rasterize.importlib.util, "find_spec", lambda name: object() if gsplat else None)
+        monkeypatch.setattr(rasterize, "version", lambda name: torch if name == "torch" else "1.5.3")
+        monkeypatch.setattr(rasterize, "has_device", lambda: driver)
+        device.wanted.cache_clear()
+        rasterize.device_here.cache_clear()
+
+    yield be
+    monkeypatch.undo()
+    device.wanted.cache_clear()
+    rasterize.device_here.cache_clear()
+
+
+def test_cuda_is_taken_where_all_of_it_is_there_and_counts_in_keys(machine):
+    machine()
+    assert rasterize.device_here() == "cuda"
+    assert rasterize.backend_identity()["device"] == "CUDA, gsplat 1.5.3"
+    machine(asked="cpu")
+    assert rasterize.device_here() == "cpu" and "device" not in rasterize.backend_identity()
+
+
+@pytest.mark.parametrize(
+    ("lacking", "why"),
+    [
+        ({"gsplat": False}, "gsplat is not installed"),
+        ({"torch": "2.13.0+cpu"}, r"torch 2\.13\.0\+cpu was built without it"),
+        ({"driver": False}, "there is no device with a driver"),
+    ],
+)
+def test_without_a_part_of_cuda_the_cpu_does_it_unless_cuda_was_asked_for(machine, lacking, why):
+    machine(**lacking)
+    assert rasterize.device_here() == "cpu"
+    machine(**lacking, asked="cuda")
+    with pytest.raises(InputError, match=f"^SS_FLOW_DEVICE asks for CUDA, but {why}"):
+        rasterize.device_here()
+
+
+def test_another_device_is_refused(machine):
+    machine(asked="tpu")
+    with pytest.raises(InputError, match="must be cpu, cuda or empty, not 'tpu'"):
+        rasterize.device_here()
