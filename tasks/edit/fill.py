@@ -30,11 +30,19 @@ from ss_flow.tasks.geometry.shape import plane_through
 _NEARBY = 0.5
 """How far around the box of what has left the surfaces are looked for, as a share of its diagonal."""
 _THICK = 1.5
-"""Half the thickness of a plane, in spacings of the dense points."""
+"""Half the thickness of a plane at least, in spacings of the dense points."""
+_NOISE = 2.0
+"""The same, in standard deviations of the points from the surfaces that they lie on: depth from photos is rough."""
+_PATCH = 8.0
+"""How far around a point its surface is taken for flat, in spacings."""
+_PATCHES = 500
+"""Points at which the roughness is looked up."""
 _UNSEEN = 1.5
 """How far from all points of a plane it was not seen, in spacings."""
 _NEAR = 4.0
 """How far from filled places Gaussians may hide that no view has shaped, in spacings."""
+_FAINT = 0.1
+"""Weight in every pixel up to which no view can have shaped a Gaussian."""
 _COVERED = 0.5
 """Share of the convex hull of a plane's points that must hold points; what has less is no surface."""
 _DEPTH_ERROR = 0.02
@@ -60,7 +68,8 @@ def fill(
 ) -> EditedScene:
     """Close the holes that instances leave with the surfaces around them, flagged as filled.
 
-    The dense points near the instances that are still there are cut into planes (at most four, by RANSAC). The ray of
+    The dense points near the instances that are still there are cut into planes (at most four, by RANSAC; as thick as
+    the points are rough; connected). The ray of
     every pixel that showed the instances is followed to the first plane behind them. It counts where it meets the plane
     inside the convex hull of its points, so that nothing is continued beyond what was seen; further than 1.5 spacings
     from any of them; where nothing that is still there hides it; and where no view looked through it, by its depth map.
@@ -77,9 +86,11 @@ def fill(
     if not views or not own.any():
         return after
     around = _around(Remains.of(measured, gone), before.means[own])
-    planes = _planes(points.points[around].astype(np.float64), spacing)
-    places, plane_of = _behind(views, planes, spacing)
-    solid = ~_seen_through(places, cameras, measured.depths, _THICK * spacing)
+    near = points.points[around].astype(np.float64)
+    thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))
+    planes = _planes(near, spacing, thickness)
+    places, plane_of = _behind(views, planes, spacing, thickness)
+    solid = ~_seen_through(places, cameras, measured.depths, thickness)
     places, plane_of = places[solid], plane_of[solid]
     chosen = _one_a_cube(places, spacing)
     places, plane_of = places[chosen], plane_of[chosen]
@@ -89,7 +100,7 @@ def fill(
     for number in np.unique(plane_of).tolist():
         of_plane = plane_of == number
         colors[of_plane] = _colors(places[of_plane], points, around[planes[number].rows])
-    shaped = some_rows(after, ~_came_to_light(before, after, instances, views, places, _NEAR * spacing))
+    shaped = some_rows(after, ~_came_to_light(before, after, instances, views, places, measured, gone))
     return joined([shaped, _with_ids_of(shaped, _flat(places, colors, plane_of, planes, spacing))])
 
 
@@ -117,9 +128,22 @@ def _around(remains: Remains, means: Float32) -> Int32:
     return remains.rows[((places >= low - margin) & (places <= high + margin)).all(axis=1)]
 
 
-def _planes(places: Float64, spacing: float) -> list[_Plane]:
+def _roughness(places: Float64, reach: float) -> float:
+    """How far points [N, 3] lie off the planes through what is near them: the median of standard deviations."""
+    from scipy.spatial import cKDTree
+
+    asked = places[:: max(1, len(places) // _PATCHES)]
+    patches = cKDTree(places).query_ball_point(asked, reach, workers=1)
+    off = [
+        float(np.linalg.svd(places[patch] - places[patch].mean(axis=0), compute_uv=False)[2]) / len(patch) ** 0.5
+        for patch in patches
+        if len(patch) > 3
+    ]
+    return float(np.median(off)) if off else 0.0
+
+
+def _planes(places: Float64, spacing: float, thickness: float) -> list[_Plane]:
     """The planes that points [N, 3] lie on, the largest first; each point on one of them at most."""
-    thickness = _THICK * spacing
     rng = np.random.default_rng(0)
     rest = np.arange(len(places), dtype=np.int32)
     least = max(_FEWEST, len(places) // 20)
@@ -150,10 +174,24 @@ def _planes(places: Float64, spacing: float) -> list[_Plane]:
         centre, normal = best
         axes = np.linalg.svd(own[near] - centre, full_matrices=False)[2][:2]
         flat = (own[near] - centre) @ axes.T
-        if flat[:, 1].std() > thickness and _coverage(flat, spacing) >= _COVERED:
-            found.append(_Plane(centre, normal, axes, rest[near], flat))
+        together = _largest_piece(flat, spacing)
+        piece = flat[together]
+        if piece[:, 1].std() > thickness and _coverage(piece, spacing) >= _COVERED:
+            found.append(_Plane(centre, normal, axes, rest[near][together], piece))
         rest = rest[~near]
     return found
+
+
+def _largest_piece(flat: Float64, spacing: float) -> Bool:
+    """[I] which points [I, 2] lie on the largest connected piece: a plane also cuts other surfaces far away."""
+    from scipy.ndimage import label
+
+    cells = np.floor(flat / (2 * spacing)).astype(np.int64)
+    cells -= cells.min(axis=0)
+    held = np.zeros(cells.max(axis=0) + 1, bool)
+    held[tuple(cells.T)] = True
+    piece = label(held, np.ones((3, 3)))[0][tuple(cells.T)]
+    return piece == np.bincount(piece).argmax()
 
 
 def _coverage(flat: Float64, spacing: float) -> float:
@@ -164,7 +202,7 @@ def _coverage(flat: Float64, spacing: float) -> float:
     return len(cells) * (2 * spacing) ** 2 / float(ConvexHull(flat).volume)
 
 
-def _behind(views: list[Uncovered], planes: list[_Plane], spacing: float) -> tuple[Float64, Int32]:
+def _behind(views: list[Uncovered], planes: list[_Plane], spacing: float, thickness: float) -> tuple[Float64, Int32]:
     """Where the rays of pixels first meet a plane behind what was there, and it was not seen: [M, 3] world, and [M]
     which plane; one of the places of each view in each cube of the spacing."""
     from scipy.spatial import Delaunay, cKDTree
@@ -181,10 +219,10 @@ def _behind(views: list[Uncovered], planes: list[_Plane], spacing: float) -> tup
         for number, (plane, hull) in enumerate(zip(planes, hulls, strict=True)):
             with np.errstate(divide="ignore", invalid="ignore"):
                 z = ((plane.centre - camera.center) @ plane.normal) / (rays @ plane.normal)
-            fits = np.isfinite(z) & (z > view.depth[v, u] - _THICK * spacing) & (z < nearest)
+            fits = np.isfinite(z) & (z > view.depth[v, u] - thickness) & (z < nearest)
             fits[fits] = hull.find_simplex(plane.flattened(camera.center + rays[fits] * z[fits, None])) >= 0
             nearest[fits], which[fits] = z[fits], number
-        met = np.flatnonzero((which >= 0) & (nearest < view.depth_now[v, u] + 2 * _THICK * spacing))
+        met = np.flatnonzero((which >= 0) & (nearest < view.depth_now[v, u] + 2 * thickness))
         at = camera.center + rays[met] * nearest[met, None]
         unseen = np.zeros(len(met), bool)
         for number, (plane, tree) in enumerate(zip(planes, trees, strict=True)):
@@ -212,25 +250,38 @@ def _came_to_light(
     instances: tuple[int, ...],
     views: list[Uncovered],
     places: Float64,
-    reach: float,
+    measured: Measured,
+    gone: tuple[int, ...],
 ) -> Bool:
-    """[N] small Gaussians of `after` near filled places that what has left had hidden: they weigh twice as much now.
+    """[N] Gaussians of `after` that what has left had hidden, and no view has shaped: they weigh twice as much now.
 
-    No view has shaped them; they often carry the colours of what hid them. Large ones show elsewhere too, and stay.
+    They often carry the colours of what hid them. Small ones go near filled places (large ones show elsewhere too), and
+    of those that lie far from every measured point that remains, inside of what has left, say, all that are faint in
+    all views.
     """
     from scipy.spatial import cKDTree
 
     own = np.isin(before.instance_id, instances)
     rest = some_rows(before, ~own)
+    reach = _NEAR * measured.points.spacing
+
+    def within(of: Float32 | Float64) -> Bool:
+        near: Bool = cKDTree(of).query(rest.means, distance_upper_bound=reach, workers=1)[0] <= reach
+        return near
+
     with_it, without = np.zeros(len(before), np.float32), np.zeros(len(rest), np.float32)
     for view in views:
         np.maximum(with_it, render(before, view.camera).max_contribution, out=with_it)
         np.maximum(without, render(rest, view.camera).max_contribution, out=without)
-    near = cKDTree(places).query(rest.means, distance_upper_bound=reach, workers=1)[0] <= reach
+    small = rest.log_scales.max(axis=1, initial=-np.inf) < np.log(reach)
+    grown = without > 2 * with_it[~own]
+    alone = grown & ~within(measured.points.points[Remains.of(measured, gone).rows])
+    if alone.any():
+        for view in range(len(measured.cameras)):
+            np.maximum(with_it, render(before, camera_of(measured.cameras, view)).max_contribution, out=with_it)
     came = np.zeros(len(after), bool)
     stayed = np.flatnonzero(~np.isin(after.instance_id, instances))[: len(rest)]  # what is new comes last
-    small = rest.log_scales.max(axis=1, initial=-np.inf) < np.log(reach)
-    came[stayed] = near & small & (without > 2 * with_it[~own])
+    came[stayed] = (grown & small & within(places)) | (alone & (with_it[~own] < _FAINT))
     return came
 
 
