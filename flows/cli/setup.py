@@ -211,12 +211,16 @@ def _rasterizer() -> str:
 def _cuda() -> tuple[str, str]:
     import torch
 
+    from ss_flow.tasks.gaussians.rasterize import device_here
+    from ss_flow.tasks.models.onnx import lacks_cuda
+
+    what = f"Gaussians on {device_here()}, networks on {'cuda' if lacks_cuda() is None else 'cpu'}"
     if torch.cuda.is_available():
         gsplat = importlib.util.find_spec("gsplat")
-        return torch.cuda.get_device_name(), "" if gsplat else "to use it: pip install 'ss-flow[cuda]'"
+        return f"{torch.cuda.get_device_name()}: {what}", "" if gsplat else "to use it: pip install 'ss-flow[cuda]'"
     if shutil.which("nvidia-smi"):
         return "a driver, but torch is built without CUDA", "to use the GPU: install a torch built for CUDA"
-    return "none; the CPU does everything", ""
+    return f"none: {what}", ""
 
 
 _WITHOUT = {
