@@ -60,7 +60,10 @@ class Backend(Protocol):
     """NumPy or torch."""
 
     def stream(self) -> AbstractContextManager[Any]:
-        """What a training runs in: so several that share a device do not wait for each other."""
+        """What a training runs in, so that several that share a device do not wait for each other.
+
+        Raises MemoryError when the device has not enough.
+        """
 
     def put(self, array: NDArray[Any]) -> Array:
         """A copy on the device."""

@@ -76,7 +76,11 @@ def render(
 
         there = draw(_device(gaussians), parameters, labels, camera, settings)
         return Rendering(
-            *(t.cpu().numpy() for t in (there.rgb, there.alpha, there.depth, there.label_masks, there.top_contributor)),
+            there.rgb.cpu().numpy(),
+            there.alpha.cpu().numpy(),
+            there.depth.cpu().numpy(),
+            there.label_masks.cpu().numpy(),
+            there.top_contributor.cpu().numpy(),
             there.radii.cpu().numpy() > 0,
             there.max_contribution.cpu().numpy(),
         )

@@ -5,7 +5,8 @@ Imports torch: import it inside functions. The losses are those of `losses.py`, 
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -78,11 +79,17 @@ class TorchBackend:
     def __init__(self, device: str) -> None:
         self._device = torch.device(device)
         self._renderer = renderer_on(self._device)
+        # SSIM takes differences of nearly equal sums, which the ten bits of TF32 do not hold.
+        torch.backends.cudnn.allow_tf32 = False
 
-    def stream(self) -> AbstractContextManager[Any]:
-        if self._device.type != "cuda":
-            return nullcontext()
-        return torch.cuda.stream(torch.cuda.Stream(self._device))
+    @contextmanager
+    def stream(self) -> Iterator[None]:
+        own = torch.cuda.stream(torch.cuda.Stream(self._device)) if self._device.type == "cuda" else nullcontext()
+        try:
+            with own:
+                yield
+        except torch.OutOfMemoryError as error:  # is no MemoryError, upon which a task is tried once more alone
+            raise MemoryError(f"not enough memory on {self._device} for a training") from error
 
     def put(self, array: NDArray[Any]) -> Tensor:
         return torch.tensor(array, device=self._device)
@@ -137,8 +144,9 @@ class TorchBackend:
         rates["sh"] = torch.full_like(values["sh"][:1, :, :1], rates["sh_rest"])
         rates["sh"][:, 0] = step.rates["sh"]
         for name, value in values.items():
-            rate, before = rates[name], value.clone()
+            rate = rates[name]
             single = not isinstance(rate, Tensor)
+            before = value if single else value.clone()
             adam(
                 [value], [gradients[name]], [first[name]], [second[name]], [],
                 [value.new_full((), step.number - 1)],

@@ -111,9 +111,9 @@ def train(
     """Fit Gaussians to views with Adam (Kerbl et al. 2023, Sec. 5; spec P1, P4).
 
     extent: size of what is trained, world units, or [N] of what each Gaussian is part of: scales the learning rate of
-    the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. backend: where, by default
-    on this machine's `device_here`. On the CPU the number of threads changes no byte, and neither does a kill: a
-    later try goes on from the last checkpoint.
+    the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. backend: where it
+    happens; by default, that of `device_here`. On the CPU the number of threads changes no byte, and neither does a
+    kill: a later try goes on from the last checkpoint.
     Raises ValueError when there are no views or Gaussians or an array does not fit its camera, TrainingDiverged when
     numbers blow up. The result has no Gaussians when all were pruned.
     """

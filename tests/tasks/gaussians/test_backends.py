@@ -373,3 +373,14 @@ def test_the_stand_in_takes_what_gsplat_takes():
 def test_a_backend_for_cuda_is_of_torch():
     assert isinstance(backend_for("cpu", 2), NativeBackend)
     assert isinstance(backend_for("meta", 2), TorchBackend)
+
+
+def test_a_device_without_memory_is_told_as_the_host_is():
+    backend = TorchBackend("cpu")
+
+    def descent(*_):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3 GiB.")
+
+    backend.descent = descent
+    with pytest.raises(MemoryError, match="not enough memory on cpu for a training"):
+        trained(backend, TrainParams(iterations=3, densify="none"))
