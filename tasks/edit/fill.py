@@ -277,8 +277,8 @@ def _came_to_light(
     grown = without > 2 * with_it[~own]
     alone = grown & ~within(measured.points.points[Remains.of(measured, gone).rows])
     if alone.any():
-        for view in range(len(measured.cameras)):
-            np.maximum(with_it, render(before, camera_of(measured.cameras, view)).max_contribution, out=with_it)
+        for number in range(len(measured.cameras)):
+            np.maximum(with_it, render(before, camera_of(measured.cameras, number)).max_contribution, out=with_it)
     came = np.zeros(len(after), bool)
     stayed = np.flatnonzero(~np.isin(after.instance_id, instances))[: len(rest)]  # what is new comes last
     came[stayed] = (grown & small & within(places)) | (alone & (with_it[~own] < _FAINT))
