@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> int:
         from ss_flow.flows.cli.start import next_steps
 
         print(next_steps(Path.cwd()))
-        return 0
+        return BAD_INPUT
     if arguments == ["--version"]:
         from importlib.metadata import version
 

@@ -86,15 +86,20 @@ class Query:
             found = query(descriptors, text=self.text, params=params, encoder=encoder, background=self.background)
             return {"query": found, **known}
 
-        reports: list[Report] = []
-        run_flows([Request(build, document["scene"], done=reports.append)], run.store, recorded=False)
-        made = reports[-1].succeeded()
-        found = run.store.get(str(made["query"]))
+        answers: list[tuple[QueryResult, list[PartMasks] | None]] = []
+
+        def read(report: Report) -> None:
+            # Within the run, which finds anew what turns out to be damaged.
+            made = report.succeeded()
+            shown = [run.store.get(digest) for digest in made["parts"]] if self.parts else None
+            answers.append((run.store.get(str(made["query"])), shown))
+
+        run_flows([Request(build, document["scene"], done=read)], run.store, recorded=False)
+        found, shown = answers[-1]
         if self.parts and not len(found.instance_id):
             raise InputError(f"no photo shows a part of any instance of {self.result}; leave --parts out.")
         answer = _document(found, run.instances, parts=self.parts)
         if self.out is not None:
-            shown = [run.store.get(digest) for digest in made["parts"]] if self.parts else None
             write_answer(self.out, run, answer, shown)
         self._tell(found, answer)
         return 0

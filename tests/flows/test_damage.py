@@ -48,7 +48,7 @@ def test_a_run_whose_final_results_are_damaged_makes_them_again_and_says_so(warm
 def test_a_result_damaged_while_the_folder_is_half_written_leaves_no_half_of_it(warm, monkeypatch):
     before = bytes_of(warm.out)
     shutil.rmtree(warm.out)
-    last = warm.called.results()["depth"][4]  # read for the report, after all else is written
+    last = warm.called.results()["report_pictures"][0]  # read for the report, after all else is written
     real, written = deliver_module.write_cloud, []
 
     def write_cloud(folder, *cloud):
@@ -61,7 +61,7 @@ def test_a_result_damaged_while_the_folder_is_half_written_leaves_no_half_of_it(
     again = run_tiny(warm.scene, warm.store, out=warm.out)
     assert again.code == 0, again.err
     assert len(written) == 2 and not written[0].exists()
-    assert again.computed() == {"capture.sensor_depth": 1}
+    assert again.computed() == {"deliver.report_pictures": 1}
     assert differing(before, bytes_of(warm.out)) == set()
     assert not list(warm.out.parent.glob(".out.*"))
 
