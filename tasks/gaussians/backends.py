@@ -56,8 +56,9 @@ class AdamStep:
 class Backend(Protocol):
     """The arrays of a device, and what a training asks for there. No step waits for the host, or carries to it."""
 
-    xp: ModuleType
-    """NumPy or torch."""
+    @property
+    def xp(self) -> ModuleType:
+        """NumPy or torch."""
 
     def stream(self) -> AbstractContextManager[Any]:
         """What a training runs in, so that several that share a device do not wait for each other.

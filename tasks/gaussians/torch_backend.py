@@ -131,7 +131,7 @@ class TorchBackend:
         loss = _color_loss(out.rgb, target.photo, weights.ssim)
         loss = loss + weights.alpha * (target.judged * (out.alpha - target.inside).abs()).sum()
         loss = loss + weights.depth * (target.known * _depth_error(out.alpha, out.depth, target, weights)).sum()
-        if channels is not None:
+        if target.labelled is not None and channels is not None:
             loss = loss + weights.mask * (target.labelled * (out.label_masks - target.one_hot).abs()).sum()
         towards = torch.autograd.grad(loss, tuple(leaves.values()), materialize_grads=True)
         gradients = dict(zip(leaves, towards, strict=True)) | {"centers": out.center_gradient}
