@@ -32,7 +32,11 @@ class DeviceCamera(NamedTuple):
     pose: Tensor
     """[1, 4, 4] world to camera."""
     intrinsics: Tensor
-    """[1, 3, 3]."""
+    """[1, 3, 3] of the whole photo, by whose borders gsplat limits slopes."""
+    photo: tuple[int, int]
+    """Its width and height."""
+    corner: Tensor
+    """[2] where the image lies in it."""
     center: Tensor
     """[3] world."""
 
@@ -40,9 +44,18 @@ class DeviceCamera(NamedTuple):
 def camera_on(device: torch.device, camera: Camera) -> DeviceCamera:
     """See `Renderer`."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32, device=device)
-    intrinsics = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    center = torch.as_tensor(camera.center, dtype=torch.float32, device=device)
-    return DeviceCamera(camera, pose[None], torch.tensor([intrinsics], dtype=torch.float32, device=device), center)
+    left, upper, right, lower = camera.borders
+    cx, cy = -left * camera.fx, -upper * camera.fy
+    intrinsics, corner, center = (
+        torch.tensor(values, dtype=torch.float32, device=device)
+        for values in (
+            [[[camera.fx, 0, cx], [0, camera.fy, cy], [0, 0, 1]]],
+            [cx - camera.cx, cy - camera.cy],
+            camera.center.tolist(),
+        )
+    )
+    photo = round((right - left) * camera.fx), round((lower - upper) * camera.fy)
+    return DeviceCamera(camera, pose[None], intrinsics, photo, corner, center)
 
 
 class _Splats(NamedTuple):
@@ -123,8 +136,12 @@ def _projected(gaussians: GaussianTensors, camera: DeviceCamera) -> _Splats:
     opacities = torch.sigmoid(gaussians.opacity_logits)
     radii, means, depths, conics, _ = fully_fused_projection(
         gaussians.means, None, gaussians.quaternions, torch.exp(gaussians.log_scales), camera.pose, camera.intrinsics,
-        width, height, near_plane=NEAR_PLANE, opacities=opacities,
+        *camera.photo, near_plane=NEAR_PLANE, opacities=opacities,
     )  # fmt: skip
+    means = means - camera.corner
+    low, high = means.detach() - radii, means.detach() + radii
+    shown = (high > 0).all(dim=-1) & (low[..., 0] < width) & (low[..., 1] < height)
+    radii = torch.where(shown[..., None], radii, 0)
     columns, rows = -(-width // _TILE), -(-height // _TILE)
     _, keys, listed = isect_tiles(means, radii, depths, _TILE, columns, rows)
     offsets = isect_offset_encode(keys, 1, columns, rows).reshape(1, rows, columns)

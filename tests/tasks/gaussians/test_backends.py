@@ -24,7 +24,7 @@ from ss_flow.tasks.gaussians.initialise import initialise, select
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
 from ss_flow.tasks.gaussians.optimizer import Parameters
-from ss_flow.tasks.gaussians.rasterize import device_here, renderer_on
+from ss_flow.tasks.gaussians.rasterize import GaussianTensors, device_here, renderer_on
 from ss_flow.tasks.gaussians.render import render, weights_by_id
 from ss_flow.tasks.gaussians.torch_backend import TorchBackend
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
@@ -368,6 +368,24 @@ def test_the_stand_in_takes_what_gsplat_takes():
         assert [(p.name, p.default) for p in ours.parameters.values()] == [
             (p.name, p.default) for p in theirs.parameters.values()
         ]
+
+
+def test_through_gsplat_a_crop_shows_what_its_photo_shows_there(stand_in):
+    values, _, target = example(12, Objective(), with_labels=False)
+    # Some lie far outside the crop, where its own limit of slopes would be another one.
+    gaussians = GaussianTensors(**{n: torch.tensor(v) for n, v in values.items()})
+    gaussians.log_scales += 1
+    renderer, device = renderer_on(torch.device("cuda")), torch.device("cpu")
+    drawn = []
+    for camera in (target.camera, target.camera.cropped(30, 5, 44, 20)):
+        where, settings = renderer.camera_on(device, camera), Settings((0.1, 0.2, 0.3), 0, 1, winners=True)
+        background = torch.tensor(settings.background)
+        drawn.append(renderer.draw(gaussians, where, background, None, settings, torch.zeros(120, 2)))
+    whole, part = drawn
+    for name in ("rgb", "alpha", "depth"):
+        torch.testing.assert_close(getattr(part, name), getattr(whole, name)[5:20, 30:44], rtol=0, atol=1e-5)
+    assert torch.equal(part.top_contributor, whole.top_contributor[5:20, 30:44])
+    assert 0 < int((part.radii > 0).sum()) < int((whole.radii > 0).sum())
 
 
 def test_a_backend_for_cuda_is_of_torch():
