@@ -127,7 +127,7 @@ def browser_page(width: int = 1280, height: int = 800, *flags: str) -> Iterator[
             port = place.read_text().split()[0]
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
                 target = next(t for t in json.load(answer) if t["type"] == "page")
-            with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
+            with connect(target["webSocketDebuggerUrl"], max_size=None, ping_interval=None) as socket:
                 yield Page(socket)
         finally:
             process.terminate()

@@ -1,0 +1,165 @@
+"""The page of a run: one file that shows it without a server and without a network."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import browser_page, needs_browser
+
+from ss_flow.cache.store import Store
+from ss_flow.flows.results import finished_run, read_run
+from ss_flow.flows.view.drawing import start_view
+from ss_flow.flows.view.page import page_html, write_page
+from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.gaussians.initialise import select
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.geometry.cameras import Camera, looking
+
+pytest.importorskip("websockets", reason="needs the extra `view`, whose websockets drive the browser")
+
+
+@pytest.fixture(scope="session")
+def run(tiny):
+    document = read_run(tiny.out)
+    return finished_run(tiny.out, document, Store(tiny.store), ())
+
+
+@pytest.fixture(scope="session")
+def file(run, tmp_path_factory) -> Path:
+    file = tmp_path_factory.mktemp("page") / "room.html"
+    write_page(file, run)
+    return file
+
+
+@pytest.fixture(scope="session")
+def page(file):
+    """The page in a browser; tests leave all objects shown."""
+    with browser_page(1000, 640) as page:
+        page.open(file.as_uri())
+        page.wait_for("document.body?.dataset.drawn")
+        yield page
+
+
+def part(html: str, name: str) -> str:
+    return re.search(rf'id="{name}">(.*?)</script>', html, re.DOTALL).group(1)
+
+
+def rows(page) -> list[int]:
+    return page.evaluate("[...document.querySelectorAll('li')].map(row => Number(row.dataset.id))")
+
+
+def test_the_file_holds_every_gaussian_that_can_be_seen_and_its_instance(file, run):
+    html = file.read_text()
+    scene = run.results.one("scene")
+    ids = np.frombuffer(gzip.decompress(base64.b64decode(part(html, "instances"))), "<u2")
+    seen = scene.instance_id[scene.opacities >= 1 / 255]
+    assert (np.bincount(ids) == np.bincount(seen)).all()
+    spz = gzip.decompress(base64.b64decode(part(html, "gaussians")))
+    assert len(spz) == 16 + 20 * len(seen)
+
+
+def test_no_path_of_the_machine_and_no_address_is_in_the_file(file, run):
+    html = file.read_text()
+    assert str(run.folder) not in html and str(run.folder.parent) not in html and "/home/" not in html
+    assert not re.search(r"\b(https?|wss?|ftp)://", html)
+
+
+def test_a_name_that_is_markup_stays_a_name(run):
+    scene, cameras = run.results.one("scene"), run.results.one("cameras")
+    name = "</script><script>alert(1)</script>"
+    entries = [(entry | {"name": name}, None) for entry in run.instances["instances"]]
+    html = page_html(name, scene, start_view(cameras, scene.means), entries)
+    assert "alert(1)</script>" not in html
+    assert {one["name"] for one in json.loads(part(html, "scene"))["objects"]} == {name, "background"}
+
+
+def test_a_scene_without_gaussians_is_a_page_without_objects(run):
+    scene, cameras = run.results.one("scene"), run.results.one("cameras")
+    nothing: Gaussians = select(scene, np.zeros(len(scene), bool))
+    html = page_html("empty", nothing, start_view(cameras, scene.means), [])
+    assert "0 objects, 0 Gaussians" in html
+
+
+@needs_browser
+def test_the_page_asks_for_nothing_and_complains_of_nothing(page, file):
+    page.evaluate("new Promise(done => setTimeout(done, 500))")
+    assert [url for url in page.requests if not url.startswith("data:")] == [file.as_uri()]
+    assert page.complaints == []
+    assert page.evaluate("fetch('data:,1').then(() => 'let through', () => 'refused')") == "refused"
+    page.complaints.clear()  # the browser says that it refused
+
+
+@needs_browser
+def test_the_page_shows_what_our_rasterizer_renders(page, run):
+    import cv2
+
+    scene, cameras = run.results.one("scene"), run.results.one("cameras")
+    start = start_view(cameras, scene.means)
+    width, height = page.evaluate("[document.querySelector('canvas').width, document.querySelector('canvas').height]")
+    ahead = start.look_at - start.position
+    pose = looking(start.position, ahead / np.linalg.norm(ahead), start.up)
+    focal = height / 2 / np.tan(start.fov / 2)
+    camera = Camera(width, height, focal, focal, width / 2, height / 2, pose)
+    plain = Gaussians(**(vars(scene) | {"sh": scene.sh[:, :1]}))
+    ours = render(plain, camera, background=(0.957, 0.961, 0.969)).rgb.clip(0, 1)
+    picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR_RGB)[:height, :width] / 255
+    unhidden = np.s_[: height - 40]  # a line of words lies over the lowest rows
+    error = np.mean((picture[unhidden] - ours[unhidden]) ** 2)
+    assert -10 * np.log10(error) > 42
+    assert ours[unhidden].std() > 0.05
+
+
+@needs_browser
+def test_objects_are_hidden_shown_and_isolated(page, run):
+    scene = run.results.one("scene")
+    seen = scene.instance_id[scene.opacities >= 1 / 255]
+    drawn = "new Promise(done => requestAnimationFrame(() => setTimeout(() => done(+document.body.dataset.drawn))))"
+    ids = rows(page)
+    assert sorted(ids) == np.unique(seen).tolist() and ids[-1] == 0
+    whole = page.evaluate(drawn)
+    first = int((seen == ids[0]).sum())
+    page.click("li .eye")
+    assert whole - first <= page.evaluate(drawn) < whole
+    page.click("li .eye")
+    assert page.evaluate(drawn) == whole
+    page.click("li .only")
+    assert 0 < page.evaluate(drawn) <= first
+    assert page.evaluate("document.querySelectorAll('li.hidden').length") == len(ids) - 1
+    page.click("li .only")
+    assert page.evaluate(drawn) == whole
+    page.click("li .only")
+    page.click("#all")
+    assert page.evaluate(drawn) == whole
+
+
+@needs_browser
+def test_labels_colour_the_scene_and_a_click_selects_the_object_under_it(page):
+    before = page.screenshot()
+    page.click("#labels")
+    assert page.screenshot() != before
+    page.click("#labels")
+    page.click("canvas")
+    chosen = page.evaluate("document.querySelector('li.selected')?.dataset.id")
+    assert chosen is not None
+    page.evaluate(f"document.querySelector('li[data-id=\"{chosen}\"] .eye').click()")
+    page.click("canvas")
+    assert page.evaluate("document.querySelector('li.selected')?.dataset.id") != chosen
+    page.click("#all")
+
+
+@needs_browser
+def test_the_list_is_searched_by_name(page):
+    name = page.evaluate("document.querySelector('li .name').textContent")
+    page.evaluate(
+        f"(box => {{ box.value = {json.dumps(name.upper())}; box.dispatchEvent(new Event('input')) }})"
+        "(document.getElementById('search'))"
+    )
+    left = page.evaluate("[...document.querySelectorAll('li:not([hidden]) .name')].map(one => one.textContent)")
+    assert left and all(name in one for one in left)
+    assert page.evaluate("document.querySelectorAll('li[hidden]').length") > 0
