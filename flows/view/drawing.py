@@ -124,18 +124,32 @@ def add_gaussians(scene: SceneApi, name: str, gaussians: Gaussians, colors: UInt
 
     gaussians: N > 0. colors: [N, 3] RGB to draw them in, instead of their own.
     """
+    arrays, scale = _splats(gaussians, colors)
+    return scene.add_gaussian_splats(name, **arrays, scale=scale)
+
+
+def change_gaussians(node: GaussianSplatHandle, gaussians: Gaussians, colors: UInt8 | None = None) -> None:
+    """Let a node show others; a new node in its place would have the browser build all splats anew.
+
+    gaussians, colors: as for `add_gaussians`.
+    """
+    arrays, scale = _splats(gaussians, colors)
+    node.set_gaussians(**arrays)
+    node.scale = scale
+
+
+def _splats(gaussians: Gaussians, colors: UInt8 | None) -> tuple[dict[str, Any], float]:
+    """What viser calls Gaussians, and the scale of the node that they are to have."""
     scales = np.exp(gaussians.log_scales.astype(np.float64))
     enlarged = _LARGEST_SCALE / max(float(scales.max(initial=0)), 1e-12)
     axes = rotations(gaussians.quaternions) * (enlarged * scales[:, None, :])
-    rgb = base_colors(gaussians).clip(0, 1) if colors is None else colors
-    return scene.add_gaussian_splats(
-        name,
-        centers=(enlarged * gaussians.means.astype(np.float64)).astype(np.float32),
-        covariances=axes @ axes.transpose(0, 2, 1),
-        rgbs=rgb,
-        opacities=gaussians.opacities[:, None],
-        scale=1 / enlarged,
-    )
+    arrays = {
+        "centers": (enlarged * gaussians.means.astype(np.float64)).astype(np.float32),
+        "covariances": axes @ axes.transpose(0, 2, 1),
+        "rgbs": base_colors(gaussians).clip(0, 1) if colors is None else colors,
+        "opacities": gaussians.opacities[:, None],
+    }
+    return arrays, 1 / enlarged
 
 
 def add_points(scene: SceneApi, name: str, points: Float32, colors: UInt8, spacing: float) -> PointCloudHandle:

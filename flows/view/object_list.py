@@ -1,0 +1,165 @@
+"""The list of objects and the search box above it."""
+
+from __future__ import annotations
+
+import base64
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import viser
+
+from ss_flow.errors import InputError
+from ss_flow.flows.results import BACKGROUND
+from ss_flow.flows.view.search import Search
+from ss_flow.flows.view.session import Session
+from ss_flow.tasks.artifacts import UInt8
+from ss_flow.tasks.deliver.palette import instance_color
+from ss_flow.tasks.semantics.query import QueryResult
+
+_ROWS = 8
+_SELECTED, _MATCHED, _OTHER, _HIDDEN = "orange", "teal", "blue", "gray"
+"""Colours of a row's button."""
+
+
+@dataclass
+class _Row:
+    """A button that stands for the object which has come to lie under it."""
+
+    button: viser.GuiButtonHandle
+    instance: int | None = None
+    look: tuple[str, str, str] | None = None
+    """What it shows: label, colour, picture."""
+
+
+class ObjectList:
+    """Objects page by page, the largest first, or those first that a text means."""
+
+    def __init__(
+        self, gui: viser.GuiApi, session: Session, search: Search | None, choose: Callable[[tuple[int, ...]], None]
+    ) -> None:
+        """choose: called with the objects that were picked from the list."""
+        self._session, self._search, self._choose = session, search, choose
+        self._pictures: dict[int, str] = {}
+        self._found: QueryResult | None = None
+        self._page = 0
+        self._lock = threading.RLock()
+        self._text = gui.add_text("Search", "", hint="What to look for, such as: red mug, not the lamp")
+        tau = search.params.tau_corr if search is not None else 0.02
+        self._tau = gui.add_slider(
+            "tau_corr",
+            min=0.001,
+            max=max(0.3, tau),
+            step=0.001,
+            initial_value=tau,
+            hint="How much further than the best an object may be and still match",
+        )
+        self._answer = gui.add_markdown("" if search is not None else "This run has no descriptors to search.")
+        self._text.disabled = self._tau.disabled = search is None
+        self._rows = [_Row(gui.add_button(" ")) for _ in range(_ROWS)]
+        self._turn = gui.add_button_group("Page", ("Before", "Next", "Select matches"))
+        self._text.on_update(lambda _: self._ask())
+        self._tau.on_update(lambda _: self._ask())
+        self._turn.on_click(self._turned)
+        for row in self._rows:
+            row.button.on_click(lambda _, row=row: self._choose(() if row.instance is None else (row.instance,)))
+
+    def picture(self, instance: int) -> str:
+        """A small picture of an object as HTML: a cut-out of a photo, or its colour."""
+        return self._pictures.get(instance) or _swatch(instance)
+
+    def set_pictures(self, pictures: Mapping[int, UInt8]) -> None:
+        """pictures: [128, 128, 3] RGB by instance."""
+        self._pictures = {instance: _as_html(picture) for instance, picture in pictures.items()}
+        self.show()
+
+    def show(self) -> None:
+        """Bring the rows to the state of the session."""
+        with self._lock:
+            order = self._order()
+            self._page = min(self._page, max(0, (len(order) - 1) // _ROWS))
+            listed = order[self._page * _ROWS : (self._page + 1) * _ROWS]
+            for row, instance in zip(self._rows, [*listed, *[None] * (_ROWS - len(listed))], strict=True):
+                self._fill(row, instance)
+            first = self._page * _ROWS
+            self._turn.label = f"{first + 1}-{first + len(listed)} of {len(order)}" if order else "none"
+
+    def _order(self) -> list[int]:
+        """The ids to list, those that are asked for first."""
+        objects, pieces = self._session.state.objects, self._session.state.pieces
+        by_size = sorted(objects.entries, key=lambda i: -len(pieces[i].rows) if i in pieces else 0)
+        if self._found is None:
+            return by_size + ([BACKGROUND] if BACKGROUND in pieces else [])
+        ranked = [i for i in self._found.instance_id.tolist() if i in objects.entries]
+        return ranked + [i for i in by_size if i not in ranked]
+
+    def _fill(self, row: _Row, instance: int | None) -> None:
+        row.instance = instance
+        if row.button.visible != (instance is not None):
+            row.button.visible = instance is not None
+        if instance is None:
+            return
+        look = (self._label(instance), self._color(instance), self.picture(instance))
+        if look != row.look:
+            row.button.label, row.button.color = look[0], look[1]  # type: ignore[assignment]
+            row.button._icon_html = look[2]  # viser's own icons are set through it
+            row.look = look
+
+    def _label(self, instance: int) -> str:
+        if instance == BACKGROUND:
+            return "background"
+        entry = self._session.state.objects.entries[instance]
+        score = "" if self._found is None else f" · {self._score(instance):.3f}"
+        return f"{entry['name']} · {entry['confidence']:.2f}{score}"
+
+    def _score(self, instance: int) -> float:
+        assert self._found is not None
+        own = self._found.score[self._found.instance_id == instance]
+        return float(own[0]) if len(own) else -1.0
+
+    def _color(self, instance: int) -> str:
+        if instance in self._session.selected:
+            return _SELECTED
+        if instance in self._session.hidden:
+            return _HIDDEN
+        return _MATCHED if self._found is not None and instance in self._found.matches() else _OTHER
+
+    def _ask(self) -> None:
+        """Search anew. Letters that came meanwhile are answered at once, by who comes last."""
+        with self._lock:
+            text, tau = self._text.value.strip(), float(self._tau.value)
+            self._page, self._found = 0, None
+            answer = ""
+            if text and self._search is not None and tau > 0:
+                try:
+                    self._found = self._search(text, tau)
+                    matches = len(self._found.matches())
+                    answer = f"{matches} match" if self._found.accepted else "Nothing in the scene matches."
+                except InputError as error:
+                    answer = str(error)
+            self._answer.content = answer
+            self.show()
+
+    def _turned(self, event: Any) -> None:
+        if event.target.value == "Select matches":
+            self._choose(tuple(self._found.matches()) if self._found is not None else ())
+            return
+        self._page = max(0, self._page + (1 if event.target.value == "Next" else -1))
+        self.show()
+
+
+def _swatch(instance: int) -> str:
+    return _as_html(np.full((1, 1, 3), instance_color(instance), np.uint8))
+
+
+def _as_html(picture: UInt8) -> str:
+    """A picture, as large as a button of viser allows."""
+    small = cv2.resize(picture, (64, 64), interpolation=cv2.INTER_AREA)
+    content = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes()
+    return (
+        '<img style="height:1.9em;width:1.9em;position:absolute;left:-0.6em;top:-0.45em" '
+        f'src="data:image/jpeg;base64,{base64.b64encode(content).decode()}">'
+    )

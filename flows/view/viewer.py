@@ -1,0 +1,65 @@
+"""The interactive viewer of a finished run, put together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import viser
+
+from ss_flow.flows.results import FinishedRun
+from ss_flow.flows.view.camera_views import CameraViews
+from ss_flow.flows.view.drawing import start_view
+from ss_flow.flows.view.panel import Panel
+from ss_flow.flows.view.search import Search
+from ss_flow.flows.view.server import start
+from ss_flow.flows.view.session import Operation, Session
+from ss_flow.tasks.artifacts import Cameras, Gaussians
+
+
+class Viewer:
+    """A server that shows a run; it runs until it is closed."""
+
+    def __init__(
+        self,
+        run: FinishedRun,
+        script: Path,
+        operations: Sequence[Operation] = (),
+        search: Search | None = None,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> None:
+        """run: with the results "scene" and "cameras". script: the file to save to. operations: those to begin with.
+        search: None where the run cannot be searched. host, port: where to listen.
+
+        Raises InputError for an operation that is refused, and when it cannot listen there.
+        """
+        scene, cameras = run.results.one("scene"), run.results.one("cameras")
+        session = Session(scene, run.instances, script.parent, operations)
+        self._run = run
+        self.server, self.address = start(host, port, run.name)
+        _stand(self.server, cameras, scene)
+        self.panel = Panel(self.server, session, script, search)
+        self.cameras = CameraViews(self.server, cameras, run.results)
+
+    def load_pictures(self) -> None:
+        """Give the objects in the list their pictures, which takes a while: every photo is decoded."""
+        from ss_flow.tasks.deliver.thumbnails import thumbnails
+
+        results = self._run.results
+        if not results.missing(("ingest", "masks")):
+            ids = [entry["id"] for entry in self._run.instances["instances"]]
+            self.panel.objects.set_pictures(thumbnails(results.all("ingest"), results.all("masks"), ids))
+
+    def close(self) -> None:
+        """Stop serving."""
+        self.server.stop()
+
+
+def _stand(server: viser.ViserServer, cameras: Cameras, scene: Gaussians) -> None:
+    """Where a browser looks from at first: as the photo that shows most."""
+    view = start_view(cameras, scene.means)
+    server.scene.set_up_direction(view.up)
+    camera = server.initial_camera
+    camera.position, camera.look_at, camera.up, camera.fov = view.position, view.look_at, view.up, view.fov

@@ -1,0 +1,73 @@
+"""`ss-flow view` from the command line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+from tiny_runs import ss_flow
+
+
+def test_without_the_extra_one_sentence_says_which_to_install(tiny, monkeypatch):
+    monkeypatch.setattr("ss_flow.flows.cli.view.find_spec", lambda name: None)
+    called = ss_flow("view", tiny.out)
+    assert called.code == 2 and "pip install 'ss-flow[view]'" in called.err and called.err.count("\n") == 1
+
+
+def started(*arguments: object) -> tuple[subprocess.Popen[str], str, str]:
+    """The command in a process of its own, and the two lines that it prints: the address, and where edits go."""
+    code = "from ss_flow.flows.cli.main import entry; entry()"
+    words = [str(argument) for argument in arguments]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "view", *words, "--port", "0"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert process.stdout is not None
+    return process, process.stdout.readline().strip(), process.stdout.readline()
+
+
+class TestWithTheExtra:
+    @pytest.fixture(autouse=True)
+    def extra(self) -> None:
+        pytest.importorskip("viser", reason="needs the extra `view`")
+
+    @pytest.mark.parametrize(
+        ("options", "sentence"),
+        [
+            (("--port", "70000"), "--port 70000 is out of range; it must be from 0 to 65535."),
+            (("--host", "no.such.host.invalid"), "the viewer cannot listen on no.such.host.invalid"),
+        ],
+    )
+    def test_where_it_cannot_listen_is_said(self, tiny, options, sentence):
+        called = ss_flow("view", tiny.out, "--cache", tiny.store, *options)
+        assert called.code == 2 and sentence in called.err
+
+    def test_a_script_that_does_not_fit_the_run_is_refused(self, tiny, tmp_path):
+        script = tmp_path / "s.json"
+        script.write_text(json.dumps({"operations": [{"op": "remove", "instances": [999]}]}))
+        called = ss_flow("view", tiny.out, "--cache", tiny.store, "--script", script)
+        assert called.code == 2 and "operation 1 (remove): instances is [999]" in called.err
+
+    @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+    def test_it_serves_until_it_is_interrupted_and_that_is_its_good_end(self, tiny, how):
+        process, address, told = started(tiny.out, "--cache", tiny.store)
+        with urllib.request.urlopen(address, timeout=60) as page:
+            assert page.status == 200
+        process.send_signal(how)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 0 and not err and "saved in" in told
+        assert not (tiny.out.parent / "out.edit.json").exists()
+
+    def test_an_edited_run_is_gone_on_with(self, warm, tmp_path):
+        script, edited = tmp_path / "s.json", tmp_path / "edited"
+        script.write_text(json.dumps({"operations": [{"op": "remove", "instances": ["background"]}]}))
+        assert ss_flow("edit", warm.out, script, "--out", edited, "--cache", warm.store).code == 0
+        process, address, told = started(edited, "--cache", warm.store)
+        assert address.startswith("http://127.0.0.1:") and "(1 so far)" in told
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)

@@ -1,0 +1,231 @@
+"""The viewer in a browser: every operation clicked through, and the saved script run on the command line."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Page, browser_page, needs_browser
+from scipy.spatial.transform import Rotation
+from tiny_runs import ss_flow
+
+from ss_flow.cache.store import Store
+from ss_flow.flows.cli.context import StoreOptions, open_run
+from ss_flow.flows.cli.view import search_of
+from ss_flow.tasks.artifacts import EditedScene, Float64
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.geometry.cameras import Camera, project
+
+pytest.importorskip("viser", reason="needs the extra `view`")
+from ss_flow.flows.view.viewer import Viewer
+
+pytestmark = needs_browser
+_LOOK = """
+window.buttons = text => [...document.querySelectorAll('button')].filter(b => b.innerText.trim() === text);
+window.field = label => {
+  let found = [...document.querySelectorAll('label, div, span, p')].find(
+    e => e.children.length === 0 && e.textContent.trim() === label);
+  while (found && !found.querySelector('input')) found = found.parentElement;
+  return found.querySelector('input');
+};
+"""
+
+
+class Hands:
+    """Somebody at the viewer's page."""
+
+    def __init__(self, page: Page, viewer: Viewer) -> None:
+        self.page, self.viewer, self.session = page, viewer, viewer.panel.session
+
+    def has_arrived(self) -> bool:
+        """Whether the page has come, and shows the scene from where it is to be looked at first."""
+        clients = self.viewer.server.get_clients().values()
+        first = self.viewer.server.initial_camera.position
+        return any(np.allclose(client.camera.position, first, atol=1e-4) for client in clients)
+
+    def until(self, told: Callable[[], object], seconds: float = 120) -> None:
+        """Wait until something has come of what was done."""
+        end = time.monotonic() + seconds
+        while not told():
+            assert time.monotonic() < end, (self.session.script(), self.session.selected, self.page.complaints)
+            time.sleep(0.05)
+
+    def press(self, text: str, told: Callable[[], object]) -> None:
+        """Press a button."""
+        self.page.evaluate(f"buttons({json.dumps(text)})[0].click()")
+        self.until(told)
+
+    def pick(self, instance: int) -> None:
+        """Press an object's row in the list."""
+        entry = self.session.state.objects.entries[instance]
+        label = json.dumps(f"{entry['name']} · {entry['confidence']:.2f}")
+        self.page.wait_for(f"buttons({label}).length === 1")
+        self.page.evaluate(f"buttons({label})[0].click()")
+
+    def fill(self, label: str, text: str) -> None:
+        """Type into the field beside a label, in the place of what stands there."""
+        self.page.evaluate(f"field({json.dumps(label)}).focus(); field({json.dumps(label)}).select()")
+        self.page.call("Input.insertText", text=text)
+
+    def key(self, key: str, code: str, modifiers: int = 0) -> None:
+        """Press a key; modifiers: 2 is Ctrl, 8 is Shift."""
+        self.page.evaluate("document.activeElement.blur()")
+        for kind in ("rawKeyDown", "keyUp"):
+            self.page.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, modifiers=modifiers)
+
+    def click(self, place: Float64, modifiers: int = 0) -> None:
+        """Click a pixel of the scene."""
+        self.mouse("mousePressed", place, modifiers)
+        self.mouse("mouseReleased", place, modifiers)
+
+    def mouse(self, kind: str, place: Float64, modifiers: int = 0) -> None:
+        x, y = (float(v) for v in place)
+        self.page.call(
+            "Input.dispatchMouseEvent",
+            type=kind, x=x, y=y, button="left", buttons=1, clickCount=1, modifiers=modifiers,
+        )  # fmt: skip
+
+    def camera(self) -> Camera:
+        """What the browser shows the scene with, in its pixels."""
+        (client,) = self.viewer.server.get_clients().values()
+        seen = client.camera
+        focal = seen.image_height / 2 / np.tan(seen.fov / 2)
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(seen.wxyz, scalar_first=True).as_matrix().T
+        pose[:3, 3] = -pose[:3, :3] @ seen.position
+        return Camera(
+            seen.image_width, seen.image_height, focal, focal, seen.image_width / 2, seen.image_height / 2, pose
+        )
+
+    def seen(self) -> dict[int, Float64]:
+        """Of each instance, pixels that show it, left of the panel; those of most pixels first."""
+        camera = self.camera()
+        top = render(self.session.scene(), camera).top_contributor[20:-20:4, 20:-350:4]
+        shown = np.where(top < 0, 0, self.session.scene().instance_id[top])
+        found = {i: 4.0 * np.argwhere(shown == i)[:, ::-1] + 20.5 for i in np.unique(shown).tolist() if i}
+        return dict(sorted(found.items(), key=lambda item: -len(item[1])))
+
+    def pixel_of(self, instance: int) -> Float64:
+        """A pixel that shows it, in the middle of those that do."""
+        places = self.seen()[instance]
+        return places[np.linalg.norm(places - np.median(places, axis=0), axis=1).argmin()]
+
+
+@pytest.fixture
+def hands(warm, tmp_path: Path) -> Iterator[Hands]:
+    """Somebody who has opened the viewer of the tiny run."""
+    run = open_run(warm.out, StoreOptions(warm.store), ("scene", "cameras"))
+    viewer = Viewer(run, tmp_path / "script.json", (), search_of(run), port=0)
+    viewer.load_pictures()
+    with browser_page(1000, 600) as page:
+        page.open(viewer.address)
+        page.wait_for("document.querySelector('canvas') !== null && document.querySelectorAll('button').length > 12")
+        page.evaluate(_LOOK)
+        hands = Hands(page, viewer)
+        hands.until(hands.has_arrived)
+        yield hands
+    viewer.close()
+
+
+def test_every_operation_is_clicked_through_and_the_script_gives_the_scene_that_was_seen(hands, warm, tmp_path):
+    session, page = hands.session, hands.page
+    first, second = list(hands.seen())[:2]
+
+    hands.click(hands.pixel_of(first))
+    hands.until(lambda: session.selected == (first,))
+    hands.click(hands.pixel_of(second), modifiers=8)
+    hands.until(lambda: session.selected == (first, second))
+    hands.click(hands.pixel_of(first))
+    hands.until(lambda: session.selected == (first,))
+    hands.press("Hide", lambda: first not in session.visible())
+    hands.press("Show all", lambda: first in session.visible())
+    hands.press("Isolate", lambda: set(session.visible()) == {first})
+    hands.press("Show all", lambda: second in session.visible())
+
+    hands.press("Move", lambda: hands.viewer.panel.nodes.gizmo is not None)
+    gizmo = hands.viewer.panel.nodes.gizmo
+    start, end = project(gizmo.position + gizmo.scale * np.array([[0.7, 0, 0], [1.6, 0, 0]]), hands.camera())[0]
+    time.sleep(3)  # the browser draws the gizmo
+    hands.mouse("mouseMoved", start)
+    hands.mouse("mousePressed", start)
+    for part in (0.3, 0.7, 1.0):
+        hands.mouse("mouseMoved", start + part * (end - start))
+        time.sleep(0.3)
+    hands.mouse("mouseReleased", end)
+    hands.until(lambda: len(session.state.done) == 1)
+    moved = session.state.done[0]["move"]
+    assert abs(moved[0]) > 10 * max(abs(moved[1]), abs(moved[2]))  # along the red arrow
+    (tmp_path / "moved.png").write_bytes(page.screenshot())
+
+    hands.fill("Name", "toolbox")
+    hands.press("Rename", lambda: session.state.objects.name(first) == "toolbox")
+    hands.press("Recolour", lambda: session.state.done[-1]["op"] == "recolour")
+    hands.fill("Factor", "0.8")
+    hands.press("Scale", lambda: session.state.done[-1].get("scale") == 0.8)
+    hands.press("Duplicate", lambda: session.state.done[-1]["op"] == "duplicate" and session.selected != (first,))
+    copy = session.selected[0]
+
+    hands.press("Undo", lambda: copy not in session.state.pieces)
+    hands.press("Redo", lambda: copy in session.state.pieces)
+    hands.key("z", "KeyZ", 2)
+    hands.until(lambda: copy not in session.state.pieces)
+    hands.key("Z", "KeyZ", 2 | 8)
+    hands.until(lambda: copy in session.state.pieces)
+
+    hands.pick(copy)
+    hands.until(lambda: session.selected == (copy,))
+    hands.key("Delete", "Delete")
+    hands.until(lambda: copy not in session.state.pieces)
+
+    hands.pick(second)
+    hands.until(lambda: session.selected == (second,))
+    page.evaluate("field('Select several').click()")
+    hands.until(lambda: hands.viewer.panel.several.value)
+    hands.pick(first)
+    hands.until(lambda: session.selected == (second, first))
+    hands.press("Merge", lambda: first not in session.state.objects.entries)
+    hands.press("Split", lambda: session.state.done[-1]["op"] == "split")
+
+    hands.fill("Search", "toolbox")  # no colour word
+    page.wait_for("document.body.innerText.includes('colour')")
+    hands.fill("Search", "red")
+    page.wait_for("/[0-9]+ match|Nothing in the scene/.test(document.body.innerText)")
+    hands.fill("Search", "")
+
+    assert hands.viewer.panel.unsaved
+    hands.press("Save", lambda: not hands.viewer.panel.unsaved)
+    page.wait_for("document.body.innerText.includes('script.json')")
+    (tmp_path / "saved.png").write_bytes(page.screenshot())
+    script = json.loads((tmp_path / "script.json").read_text())
+    assert [step["op"] for step in script["operations"]] == [
+        "transform", "relabel", "recolour", "transform", "duplicate", "remove", "merge", "split",
+    ]  # fmt: skip
+    assert not [text for text in page.complaints if not text.startswith("THREE.")]
+
+    edited = ss_flow(
+        "edit", warm.out, tmp_path / "script.json", "--out", tmp_path / "edited", "--cache", warm.store, "--json"
+    )
+    assert edited.code == 0, edited.err
+    scene = Store(warm.store).get(edited.document()["results"]["scene"])
+    for field in fields(EditedScene):
+        assert np.array_equal(getattr(session.scene(), field.name), getattr(scene, field.name)), field.name
+
+
+@pytest.mark.parametrize("kind", ["outlines", "photos", "masks", "depth"])
+def test_cameras_stand_in_the_scene_with_what_they_saw(hands, tmp_path, kind):
+    page = hands.page
+    page.evaluate("field('Cameras').click()")
+    option = (
+        f"[...document.querySelectorAll('[role=option]')].find(o => o.offsetParent && o.innerText.trim() === '{kind}')"
+    )
+    page.wait_for(f"!!{option}")
+    page.evaluate(f"{option}.click()")
+    hands.until(lambda: len(hands.viewer.cameras.frusta) == 5)
+    assert all((frustum.image is None) == (kind == "outlines") for frustum in hands.viewer.cameras.frusta)
+    (tmp_path / "cameras.png").write_bytes(page.screenshot())
+    assert not [text for text in page.complaints if not text.startswith("THREE.")]
