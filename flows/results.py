@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ss_flow.cache.location import is_url, open_store
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.graph import stored
+from ss_flow.runs import Run
 from ss_flow.tasks.deliver.output import RUN_FILE
 
 BACKGROUND = 0
@@ -44,7 +46,9 @@ class Results:
         """Those of these results that the run did not have, or the store no longer holds."""
 
         def held(name: str) -> bool:
-            value = self.digests.get(name, "")
+            if name not in self.digests:
+                return False
+            value = self.digests[name]
             return all(digest in self.store for digest in ([value] if isinstance(value, str) else value))
 
         return [name for name in names if not held(name)]
@@ -105,9 +109,48 @@ class FinishedRun:
             found.add(int(entry["id"]))
         return tuple(sorted(found))
 
+    def digests(self, name: str) -> list[str]:
+        """Of a result, by its name in run.json; one, or those of a list.
+
+        Raises InputError when the run has no such result, or the store no longer holds it.
+        """
+        if name not in self.results.digests:
+            raise InputError(f"{self.folder} has no result {name!r}; it has {', '.join(self.results.digests)}.")
+        if self.results.missing([name]):
+            raise InputError(f"the store {self.store.location} no longer holds {name} of {self.folder}; run it again.")
+        found = self.results.digests[name]
+        return [found] if isinstance(found, str) else list(found)
+
+    def artifact(self, name: str) -> Any:
+        """A result by its name in run.json, as "propagate": an artifact, or a list. Raises as `digests` does."""
+        found = [self.store.get(digest) for digest in self.digests(name)]
+        return found[0] if isinstance(self.results.digests[name], str) else found
+
+    def show(self, name: str) -> Any:
+        """A result for a notebook, drawn with the run's photos and cameras. Raises as `digests` does."""
+        from ss_flow.flows.notebook import shown
+
+        return shown(self, name)
+
+    def _repr_html_(self) -> str:
+        from ss_flow.flows.notebook import run_html
+
+        return run_html(self)
+
     def all_ids(self) -> tuple[int, ...]:
         """The instances that have a file of their own, ascending."""
         return tuple(sorted(int(entry["id"]) for entry in self.instances["instances"] if entry["file"]))
+
+
+def of_type(store: Store, run: Run, kind: type) -> list[Any]:
+    """What the first step of a run that gives this type gives; empty where none does.
+
+    The flow's own results count before those of other steps, which may have been changed since.
+    """
+    for digests in (*run.results().values(), *(node["outputs"] for node in run.nodes())):
+        if digests and digests[0] in store and isinstance(first := store.get(digests[0]), kind):
+            return [first, *(store.get(digest) for digest in digests[1:])]
+    return []
 
 
 def read_run(folder: Path) -> dict[str, Any]:
@@ -115,6 +158,21 @@ def read_run(folder: Path) -> dict[str, Any]:
     if not (folder / RUN_FILE).is_file():
         raise InputError(f"{folder} is not the output folder of a run: it has no {RUN_FILE}.")
     return _read(folder / RUN_FILE, {"store", "scene", "params", "results"})
+
+
+def open_finished(folder: str | Path, store: Store | None = None) -> FinishedRun:
+    """A finished run by its output folder, to look into from Python.
+
+    store: where its results are; None = where the run says.
+    Raises InputError when the folder is not that of a run, or there is no store.
+    """
+    document = read_run(Path(folder))
+    if store is None:
+        location = document["store"]
+        if not is_url(location) and not Path(location).is_dir():
+            raise InputError(f"there is no store {location}, which {folder} names; give another.")
+        store = open_store(location if is_url(location) else Path(location))
+    return finished_run(Path(folder), document, store, ())
 
 
 def finished_run(folder: Path, document: dict[str, Any], store: Store, needed: Sequence[str]) -> FinishedRun:

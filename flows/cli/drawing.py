@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.cache.store import Store
+from ss_flow.flows.results import of_type
 from ss_flow.runs import Run
 from ss_flow.tasks.artifacts import Cameras, Frame, PointCloud
 from ss_flow.tasks.deliver.draw import draw
@@ -15,12 +16,12 @@ from ss_flow.tasks.geometry.images import encode_png
 
 def draw_results(store: Store, run: Run, values: Sequence[Any], view: int, file: Path) -> None:
     """Draw one result, or a sheet of several, as a PNG file."""
-    frames = _of_type(store, run, Frame)
+    frames = of_type(store, run, Frame)
     by_name = {frame.name: frame for frame in frames}
     context: dict[str, Any] = {
         "frames": frames,
-        "cameras": next(iter(_of_type(store, run, Cameras)), None),
-        "points": next(iter(_of_type(store, run, PointCloud)), None),
+        "cameras": next(iter(of_type(store, run, Cameras)), None),
+        "points": next(iter(of_type(store, run, PointCloud)), None),
         "view": view,
     }
     if len(values) == 1:
@@ -29,11 +30,3 @@ def draw_results(store: Store, run: Run, values: Sequence[Any], view: int, file:
         picture = draw(list(values), **context)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(encode_png(picture).tobytes())
-
-
-def _of_type(store: Store, run: Run, kind: type) -> list[Any]:
-    """The result of the first step of a run that gives this type."""
-    for node in run.nodes():
-        if node["outputs"] and isinstance(first := store.get(node["outputs"][0]), kind):
-            return [first, *(store.get(digest) for digest in node["outputs"][1:])]
-    return []

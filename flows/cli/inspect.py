@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import time
 from collections import defaultdict
@@ -11,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 from rich.markup import escape
 from rich.table import Table
@@ -21,6 +19,7 @@ from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import OptionalPath, PositionalPath, StoreOptions, console
 from ss_flow.flows.cli.telling import print_table
+from ss_flow.flows.describe import told
 from ss_flow.runs import DONE, Run, latest_runs, settled
 from ss_flow.telemetry import trace
 
@@ -242,15 +241,11 @@ class CacheShow:
         store = self.store.existing_store()
         if self.png and (self.png.is_dir() or not next(p for p in self.png.absolute().parents if p.exists()).is_dir()):
             raise InputError(f"{self.png} cannot be written; --png must name a file in a folder.")
-        run, digests = self._found(store)
+        run, digests = results_named(store, self.scene, self.what)
         values = [store.get(digest) for digest in digests]
         out = console(json=False)
-        for value in values[:1] if len(values) > 8 else values:
-            out.print(f"[bold]{type(value).__name__}[/]")
-            for item in dataclasses.fields(value):
-                out.print(f"  {item.name}: {escape(_described(getattr(value, item.name)))}")
-        if len(values) > 8:
-            out.print(f"... and {len(values) - 1} more")
+        for line in told(values, digests, store, run):
+            out.print(escape(line))
         if self.png:
             from ss_flow.flows.cli.drawing import draw_results
 
@@ -258,24 +253,21 @@ class CacheShow:
             out.print(escape(f"drawn to {self.png}"))
         return 0
 
-    def _found(self, store: Store) -> tuple[Run | None, list[str]]:
-        run, nodes = run_with(store, self.scene, self.what)
-        if run:
-            outputs = [digest for node in nodes for digest in node["outputs"]]
-            return run, run.results().get(self.what) or outputs
-        found = store.find(self.what)
-        if len(found) == 1:
-            return None, found
-        problem = f"stands for {len(found)} results" if found else "is neither a step of the latest runs nor a digest"
-        raise InputError(f"{self.what!r} {problem}; `ss-flow cache ls` lists what there is.")
 
+def results_named(store: Store, scene: Path | None, what: str) -> tuple[Run | None, list[str]]:
+    """The digests of a step or result of the latest run that has it, and that run; or of what a digest begins.
 
-def _described(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        span = f", {value.min():.6g} .. {value.max():.6g}" if value.size and value.dtype.kind in "iuf" else ""
-        return f"{value.dtype} {list(value.shape)}{span}"
-    text = str(value)
-    return text if len(text) < 200 else f"{text[:197]}..."
+    Raises InputError when there is nothing of this name, or several things.
+    """
+    run, nodes = run_with(store, scene, what)
+    if run:
+        outputs = [digest for node in nodes for digest in node["outputs"]]
+        return run, run.results().get(what) or outputs
+    found = store.find(what)
+    if len(found) == 1:
+        return None, found
+    problem = f"stands for {len(found)} results" if found else "is neither a step of the latest runs nor a digest"
+    raise InputError(f"{what!r} {problem}; `ss-flow cache ls` lists what there is.")
 
 
 def latest_run(store: Store, scene: Path | None) -> Run:
