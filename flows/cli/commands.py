@@ -78,7 +78,10 @@ A cell that was not measured stays empty.""",
     "query": Entry("query:Query", "Find the instances of a result that a text describes."),
     "export": Entry("export:Export", "Write a result, or some of its instances, in another format."),
     "render": Entry("render:Render", "Render a result along a path of cameras, as PNG files or an MP4 film."),
-    "view": Entry("view:View", "Look at a finished run in the browser, and change it."),
+    "view": Entry(
+        "view:View",
+        "Look at a finished run, or at any cached result of one, in the browser; a run can be changed there.",
+    ),
     "edit": Entry("edit:EditRun", "Change a finished scene by a script: remove, move, recolour, replace its objects."),
     "cache": Group(
         "Look into the store, and take care of it.",

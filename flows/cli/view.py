@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -22,12 +23,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """Look at a finished run in the browser, and change it."""
+    """Look at a finished run, or at any cached result of one, in the browser; a run can be changed there."""
 
-    result: Annotated[Path, tyro.conf.Positional]
-    """The output folder of a run, or of an edit."""
+    what: Annotated[str, tyro.conf.Positional]
+    """The output folder of a run, or of an edit; or a step (propagate, segment[0003]) of the latest run that got to it,
+    or the first characters of a digest."""
     script: OptionalPath = None
     """The edit script to go on with and to save; by default NAME.edit.json beside the output folder."""
+    beside: OptionalPath = None
+    """The output folder of another run of the same capture, to stand to the right of this one in the time line."""
+    html: OptionalPath = None
+    """Write a page to this file instead, which needs neither this program nor a network."""
+    rerun: OptionalPath = None
+    """Write a recording for Rerun (.rrd) to this file instead."""
     host: str = "127.0.0.1"
     """The address to listen on; 0.0.0.0 lets other machines in who know the token."""
     port: int = 8080
@@ -36,17 +44,75 @@ class View:
     """Where results are kept."""
 
     def run(self) -> int:
-        if find_spec("viser") is None:
-            raise InputError("the viewer needs a package that is not installed; run `pip install 'ss-flow[view]'`.")
         if not 0 <= self.port < 65536:
             raise InputError(f"--port {self.port} is out of range; it must be from 0 to 65535.")
+        for option, file in (("--html", self.html), ("--rerun", self.rerun)):
+            if file and (file.is_dir() or not file.absolute().parent.is_dir()):
+                raise InputError(f"{file} cannot be written; {option} must name a file in a folder that exists.")
+        folder = Path(self.what)
+        if not folder.exists() and "/" not in self.what:
+            return self._artifact()
+        if self.html or self.rerun:
+            return self._files(folder)
+        return self._viewer(folder)
+
+    def _artifact(self) -> int:
+        """One cached result, the way that suits it."""
+        if self.rerun or self.beside or self.script:
+            raise InputError(
+                f"--rerun, --beside and --script take the output folder of a run, and {self.what} is none."
+            )
+        from ss_flow.flows.cli.inspect import results_named
+        from ss_flow.flows.describe import maker, told
+        from ss_flow.flows.view.artifact import Around, around_of, placed, show, write_artifact_page
+
+        out, store = console(json=False), self.store.existing_store()
+        run, digests = results_named(store, None, self.what)
+        values = [store.get(digest) for digest in digests]
+        made = maker(store, digests[0], run)
+        around = around_of(store, made[0]) if made else Around()
+        if self.html:
+            write_artifact_page(self.html, self.what, digests, store, around, run)
+            out.print(escape(str(self.html)))
+        elif placed(values, around) and find_spec("viser"):
+            from ss_flow.flows.view.server import start
+
+            server, address = start(self.host, self.port, self.what)
+            show(server, values, around)
+            out.print(f"{address}\nCtrl-C ends it.")
+            with contextlib.suppress(KeyboardInterrupt):
+                _wait()
+            server.stop()
+        else:
+            for line in told(values, digests, store, run):
+                out.print(escape(line))
+        return 0
+
+    def _files(self, folder: Path) -> int:
+        """Files that show a run without this program."""
+        out = console(json=False)
+        if self.html:
+            from ss_flow.flows.view import page
+
+            page.write_page(self.html, open_run(folder, self.store, page.SHOWN))
+            out.print(escape(f"{self.html} ({self.html.stat().st_size / 1e6:.1f} MB)"))
+        if self.rerun:
+            from ss_flow.flows.view import rerun_file
+
+            rerun_file.write_recording(self.rerun, open_run(folder, self.store, rerun_file.SHOWN))
+            out.print(escape(f"{self.rerun} ({self.rerun.stat().st_size / 1e6:.1f} MB)"))
+        return 0
+
+    def _viewer(self, folder: Path) -> int:
+        if find_spec("viser") is None:
+            raise InputError("the viewer needs a package that is not installed; run `pip install 'ss-flow[view]'`.")
         from ss_flow.flows.view.session import read_operations
         from ss_flow.flows.view.viewer import Viewer
 
-        document = read_run(self.result)
+        document = read_run(folder)
         edit = document.get("edit")
-        run = open_run(Path(edit["source"]) if edit else self.result, self.store, ("scene", "cameras"))
-        script = self.script or self.result.resolve().with_name(f"{self.result.resolve().name}.edit.json")
+        run = open_run(Path(edit["source"]) if edit else folder, self.store, ("scene", "cameras"))
+        script = self.script or folder.resolve().with_name(f"{folder.resolve().name}.edit.json")
         operations = edit["script"]["operations"] if edit else []
         if script.is_file():
             operations = read_operations(script)
@@ -56,20 +122,26 @@ class View:
         except InputError as error:  # one sees a scene without it
             search = None
             out.print(f"The search box stays empty: {escape(str(error))}")
+        beside = open_run(self.beside, self.store, ("scene",)) if self.beside else None
         viewer = Viewer(run, script, operations, search, host=self.host, port=self.port)
+        viewer.add_timeline(beside)
         out.print(
             f"{viewer.address}\nCtrl-C ends it. Edits are saved in {escape(str(script))} ({len(operations)} so far)."
         )
         try:
-            viewer.load_pictures()
-            while True:
-                time.sleep(3600)
-        except KeyboardInterrupt:
+            with contextlib.suppress(KeyboardInterrupt):
+                viewer.load_pictures()
+                _wait()
             if viewer.panel.unsaved:
                 out.print("The last edits were not saved.")
         finally:
             viewer.close()
         return 0
+
+
+def _wait() -> None:
+    while True:
+        time.sleep(3600)
 
 
 def search_of(run: FinishedRun) -> Search | None:

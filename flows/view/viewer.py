@@ -14,6 +14,7 @@ from ss_flow.flows.view.panel import Panel
 from ss_flow.flows.view.search import Search
 from ss_flow.flows.view.server import start
 from ss_flow.flows.view.session import Operation, Session
+from ss_flow.flows.view.timeline import add_timeline
 from ss_flow.tasks.artifacts import Cameras, Gaussians
 
 
@@ -42,6 +43,20 @@ class Viewer:
         _stand(self.server, cameras, scene)
         self.panel = Panel(self.server, session, script, search)
         self.cameras = CameraViews(self.server, cameras, run.results)
+
+    def add_timeline(self, beside: FinishedRun | None = None) -> None:
+        """Add the slider over the stages of the run; while one is looked at, the objects are hidden.
+
+        beside: another run of the same capture, to show to the right of this one.
+        Raises InputError when nothing of the run is left in the store.
+        """
+
+        def shown(is_now: bool) -> None:
+            for name in ("/objects", "/selected"):
+                if (node := self.server.scene.get_handle_by_name(name)) is not None:
+                    node.visible = is_now
+
+        self.timeline = add_timeline(self.server, self._run, shown, beside)
 
     def load_pictures(self) -> None:
         """Give the objects in the list their pictures, which takes a while: every photo is decoded."""
