@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import viser
-from scipy.spatial.transform import Rotation
+from typing import TYPE_CHECKING, Any
 
 from ss_flow.flows.results import Results
 from ss_flow.flows.view.drawing import Around, add_views, view_picture
 from ss_flow.tasks.artifacts import Cameras, UInt8
 from ss_flow.tasks.deliver.palette import depth_colors
 from ss_flow.tasks.geometry.cameras import camera_of
+
+if TYPE_CHECKING:
+    import viser
 
 _RESULTS = {"photos": "ingest", "masks": "masks", "depth": "depth"}
 """Which result of a run each kind of picture is made from."""
@@ -37,7 +37,10 @@ class CameraViews:
             if kind == "outlines" or pictures:
                 self.frusta = add_views(self._server.scene, "/cameras", self._cameras, pictures)
         for view, frustum in enumerate(self.frusta):
-            frustum.on_click(lambda event, view=view: self._stand_at(event.client, view))
+            self._on_click(frustum, view)
+
+    def _on_click(self, frustum: viser.CameraFrustumHandle, view: int) -> None:
+        frustum.on_click(lambda event: self._stand_at(event.client, view))
 
     def _pictures(self, kind: str) -> dict[str, UInt8]:
         """Of each view, by its name."""
@@ -48,6 +51,8 @@ class CameraViews:
         return {one.name: view_picture(one, around) for one in shown}
 
     def _stand_at(self, client: viser.ClientHandle, view: int) -> None:
+        from scipy.spatial.transform import Rotation
+
         camera = camera_of(self._cameras, view)
         with client.atomic():
             client.camera.wxyz = Rotation.from_matrix(camera.world_to_camera[:3, :3].T).as_quat(scalar_first=True)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import viser
-from scipy.spatial.transform import Rotation
 
 from ss_flow.flows.view.drawing import add_gaussians, change_gaussians
 from ss_flow.flows.view.session import Piece
@@ -15,6 +13,9 @@ from ss_flow.tasks.artifacts import Float64, UInt8
 from ss_flow.tasks.deliver.export.content import base_colors
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.edit.operations import Motion
+
+if TYPE_CHECKING:
+    import viser
 
 Colors = Literal["photos", "objects"]
 _MARK = (255, 140, 0)
@@ -60,6 +61,8 @@ class SceneNodes:
 
         moved: told the motion each time the gizmo was let go.
         """
+        from scipy.spatial.transform import Rotation
+
         self.release()
         held = [self._nodes[instance] for instance in instances]
         boxes = {i: (self._boxes[i], np.array(self._boxes[i].position)) for i in instances if i in self._boxes}
@@ -114,6 +117,8 @@ class SceneNodes:
 
 def motion_of(move: Float64, wxyz: Float64) -> Motion:
     """The motion about a centre that moves it by `move` and turns it by a unit quaternion, in a few digits."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_quat(wxyz, scalar_first=True).as_rotvec(degrees=True)
     degrees = float(np.linalg.norm(turn))
     axis = _short(turn / degrees) if degrees > 1e-3 else (0.0, 0.0, 1.0)

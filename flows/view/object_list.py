@@ -6,11 +6,9 @@ import base64
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
-import viser
 
 from ss_flow.errors import InputError
 from ss_flow.flows.results import BACKGROUND
@@ -19,6 +17,9 @@ from ss_flow.flows.view.session import Session
 from ss_flow.tasks.artifacts import UInt8
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.semantics.query import QueryResult
+
+if TYPE_CHECKING:
+    import viser
 
 _ROWS = 8
 _SELECTED, _MATCHED, _OTHER, _HIDDEN = "orange", "teal", "blue", "gray"
@@ -65,7 +66,10 @@ class ObjectList:
         self._tau.on_update(lambda _: self._ask())
         self._turn.on_click(self._turned)
         for row in self._rows:
-            row.button.on_click(lambda _, row=row: self._choose(() if row.instance is None else (row.instance,)))
+            self._on_click(row)
+
+    def _on_click(self, row: _Row) -> None:
+        row.button.on_click(lambda _: self._choose(() if row.instance is None else (row.instance,)))
 
     def picture(self, instance: int) -> str:
         """A small picture of an object as HTML: a cut-out of a photo, or its colour."""
@@ -157,6 +161,8 @@ def _swatch(instance: int) -> str:
 
 def _as_html(picture: UInt8) -> str:
     """A picture, as large as a button of viser allows."""
+    import cv2
+
     small = cv2.resize(picture, (64, 64), interpolation=cv2.INTER_AREA)
     content = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes()
     return (

@@ -6,11 +6,9 @@ import html
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import viser
-from scipy.spatial.transform import Rotation
 
 from ss_flow.errors import InputError
 from ss_flow.flows.results import BACKGROUND
@@ -22,12 +20,16 @@ from ss_flow.flows.view.session import Operation, Piece, Session, write_script
 from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.edit.operations import Motion
 
+if TYPE_CHECKING:
+    import viser
+
+    Client = viser.ClientHandle | None
+
 _BESIDE = 1.1
 """How many of its own widths a copy is put aside."""
 _NOTE_SECONDS = 8.0
 
 Act = Callable[[], None]
-Client = viser.ClientHandle | None
 
 
 class Panel:
@@ -89,7 +91,7 @@ class Panel:
         self._group(gui, "Edits", {name: act[name] for name in ("Undo", "Redo", "Save")})
         for name, hotkey, modifier in _KEYS:
             command = gui.add_command(name, hotkey=hotkey, modifier=modifier)
-            command.on_trigger(lambda event, act=act[name]: self._attempt(event.client, lambda: act(event.client)))
+            self._on_key(command, act[name])
 
     def _actions(self) -> dict[str, Callable[[Client], None]]:
         """What each button does; it is given the browser that asked."""
@@ -111,6 +113,9 @@ class Panel:
             "Save": self._save,
             "Select nothing": lambda _: session.select(None),
         }
+
+    def _on_key(self, command: viser.CommandHandle, act: Callable[[Client], None]) -> None:
+        command.on_trigger(lambda event: self._attempt(event.client, lambda: act(event.client)))
 
     def _group(self, gui: viser.GuiApi, label: str, acts: dict[str, Callable[[Client], None]]) -> None:
         group = gui.add_button_group(label, tuple(acts))
@@ -169,6 +174,8 @@ class Panel:
 
     def _duplicate(self, client: Client) -> None:
         """A copy of each, to the right of who looks; the copies are selected then."""
+        from scipy.spatial.transform import Rotation
+
         session = self.session
         right = np.array([1.0, 0.0, 0.0])
         if client is not None:

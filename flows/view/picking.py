@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ss_flow.flows.view.session import Piece
 from ss_flow.tasks.artifacts import EditedScene, Float64
@@ -53,7 +52,7 @@ class Picker:
         ahead = np.flatnonzero(local[:, 2] > NEAR_PLANE)
         depth = local[ahead, 2]
         t = local[ahead, :2] / depth[:, None]
-        away = np.linalg.norm(pixel.fx * t + np.float32((pixel.cx - 0.5, pixel.cy - 0.5)), axis=1)
+        away = np.linalg.norm(pixel.fx * t + np.array([pixel.cx - 0.5, pixel.cy - 0.5], np.float32), axis=1)
         variance = (pixel.fx * self._sigma[ahead] / depth) ** 2 * (1 + (t * t).sum(axis=1)) + _BLUR
         return ahead[away < 1 + _REACH * np.sqrt(variance)]
 
@@ -64,6 +63,8 @@ def pixel_met(origin: Float64, direction: Float64, wxyz: Float64, focal: float) 
     origin: [3] where the camera stands, world. direction: [3] the ray, world, of any length but 0. wxyz: [4] the
     camera's turn, camera-to-world. focal: the picture's focal length, pixels.
     """
+    from scipy.spatial.transform import Rotation
+
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(wxyz, scalar_first=True).as_matrix().T
     pose[:3, 3] = -pose[:3, :3] @ origin

@@ -16,16 +16,8 @@ import math
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
-
-import msgspec
-import rich
-import viser
-import websockets.asyncio.server
-from viser import _messages as messages
-from websockets.asyncio.server import ServerConnection
-from websockets.http11 import Request, Response
 
 from ss_flow.errors import InputError
 
@@ -33,19 +25,16 @@ _LARGEST = 64 * 1024
 """Bytes of the largest message that a browser may send; those of a viewer have some hundred."""
 _PORTS = 100
 """So many ports from the one asked for on are tried."""
-_KINDS: dict[str, type[Any]] = {
-    kind.__name__: kind
-    for kind in (
-        messages.ViewerCameraMessage,
-        messages.ScenePointerMessage,
-        messages.SceneNodeClickMessage,
-        messages.TransformControlsUpdateMessage,
-        messages.TransformControlsDragStartMessage,
-        messages.TransformControlsDragEndMessage,
-        messages.GuiUpdateMessage,
-        messages.CommandTriggerMessage,
-    )
-}
+_KINDS = (
+    "ViewerCameraMessage",
+    "ScenePointerMessage",
+    "SceneNodeClickMessage",
+    "TransformControlsUpdateMessage",
+    "TransformControlsDragStartMessage",
+    "TransformControlsDragEndMessage",
+    "GuiUpdateMessage",
+    "CommandTriggerMessage",
+)
 """What a browser may say. Not among them: uploads, and the request to share the scene over a server of others."""
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob:; "
@@ -56,8 +45,13 @@ _HEADERS = {
     "Cache-Control": "no-store",
 }
 
-_Answer = Callable[[ServerConnection, Request], Response | None]
-_Handler = Callable[[Any], Awaitable[None]]
+if TYPE_CHECKING:
+    import viser
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+    _Answer = Callable[[ServerConnection, Request], Response | None]
+    _Handler = Callable[[Any], Awaitable[None]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +84,9 @@ def start(host: str, port: int, title: str) -> tuple[viser.ViserServer, str]:
     host: the name or number of the address to listen on. port: the first to try. title: stands above the panel.
     Raises InputError when it cannot listen there.
     """
+    import rich
+    import viser
+
     port = _free_port(host, port)
     guard = Guard(secrets.token_urlsafe(24), _is_local(host))
     rich.reconfigure(quiet=True)  # through which viser tells its own address, without the token
@@ -109,9 +106,11 @@ def _guarded(guard: Guard) -> Iterator[list[bool]]:
 
     Yields a list that is empty until one has begun.
     """
+    import websockets.asyncio.server
+
     serve, begun = websockets.asyncio.server.serve, list[bool]()
 
-    def guarded(handler: _Handler, *place: Any, process_request: _Answer, **options: Any) -> serve:
+    def guarded(handler: _Handler, *place: Any, process_request: _Answer, **options: Any) -> Any:
         begun.append(True)
 
         async def checked(connection: ServerConnection) -> None:
@@ -161,17 +160,23 @@ class _Checked:
 
 def understood(raw: object) -> bool:
     """Whether a message is one that a browser may send, with all its fields and nothing else."""
+    import msgspec
+    from viser import _messages
+
     if not isinstance(raw, bytes):
         return False
     try:
         document = msgspec.msgpack.decode(raw)
-        kind = _KINDS[document.pop("type")]
+        name = document.pop("type")
+        if name not in _KINDS:
+            return False
+        kind = getattr(_messages, name)
         if document.keys() - {field.name for field in dataclasses.fields(kind)} or not _is_finite(document):
             return False
         message = msgspec.convert(document, kind)
     except (msgspec.MsgspecError, KeyError, TypeError, AttributeError, RecursionError):
         return False
-    return not isinstance(message, messages.GuiUpdateMessage) or message.updates.keys() == {"value"}
+    return not isinstance(message, _messages.GuiUpdateMessage) or message.updates.keys() == {"value"}
 
 
 def _is_finite(value: object) -> bool:

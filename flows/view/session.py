@@ -119,7 +119,7 @@ class Session:
     def select(self, instance: int | None, *, more: bool = False) -> None:
         """Select an instance, or nothing. more: besides those that are; one that is selected already is let go."""
         known = instance is not None and (instance in self.state.objects.entries or instance in self.state.pieces)
-        chosen = (instance,) if known and instance is not None else ()
+        chosen: tuple[int, ...] = (instance,) if known and instance is not None else ()
         if more:
             kept = tuple(i for i in self.selected if i not in chosen)
             chosen = kept + tuple(i for i in chosen if i not in self.selected)

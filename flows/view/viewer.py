@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-
-import viser
+from typing import TYPE_CHECKING
 
 from ss_flow.flows.results import FinishedRun
 from ss_flow.flows.view.camera_views import CameraViews
@@ -16,6 +15,9 @@ from ss_flow.flows.view.server import start
 from ss_flow.flows.view.session import Operation, Session
 from ss_flow.flows.view.timeline import add_timeline
 from ss_flow.tasks.artifacts import Cameras, Gaussians
+
+if TYPE_CHECKING:
+    import viser
 
 
 class Viewer:

@@ -165,8 +165,8 @@ def test_every_operation_is_clicked_through_and_the_script_gives_the_scene_that_
     hands.fill("Name", "toolbox")
     hands.press("Rename", lambda: session.state.objects.name(first) == "toolbox")
     hands.press("Recolour", lambda: session.state.done[-1]["op"] == "recolour")
-    hands.fill("Factor", "0.8")
-    hands.press("Scale", lambda: session.state.done[-1].get("scale") == 0.8)
+    hands.fill("Factor", "1.5")
+    hands.press("Scale", lambda: session.state.done[-1].get("scale") == 1.5)
     hands.press("Duplicate", lambda: session.state.done[-1]["op"] == "duplicate" and session.selected != (first,))
     copy = session.selected[0]
 
@@ -220,9 +220,8 @@ def test_every_operation_is_clicked_through_and_the_script_gives_the_scene_that_
 def test_cameras_stand_in_the_scene_with_what_they_saw(hands, tmp_path, kind):
     page = hands.page
     page.evaluate("field('Cameras').click()")
-    option = (
-        f"[...document.querySelectorAll('[role=option]')].find(o => o.offsetParent && o.innerText.trim() === '{kind}')"
-    )
+    mine = f"o.parentElement.textContent.includes('outlines') && o.textContent === '{kind}'"
+    option = f"[...document.querySelectorAll('[role=option]')].find(o => {mine})"
     page.wait_for(f"!!{option}")
     page.evaluate(f"{option}.click()")
     hands.until(lambda: len(hands.viewer.cameras.frusta) == 5)
