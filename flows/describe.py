@@ -140,7 +140,7 @@ def told(values: Sequence[Any], digests: Sequence[str], store: Store, run: Run |
 
 def as_html(value: Any, picture: bytes | None = None, made: Provenance | None = None) -> str:
     """An artifact as a piece of HTML: a picture (the bytes of a PNG), its fields, and how it came about."""
-    from ss_flow.tasks.deliver.report import data_uri
+    from ss_flow.tasks.deliver.compressed import data_uri
 
     rows = "".join(
         f"<tr><th style='text-align:left;vertical-align:top'>{escape(fact.name)}</th>"

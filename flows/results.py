@@ -13,6 +13,7 @@ from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.graph import stored
 from ss_flow.runs import Run
+from ss_flow.tasks.deliver.compressed import Thumbnail
 from ss_flow.tasks.deliver.output import RUN_FILE
 
 BACKGROUND = 0
@@ -41,6 +42,16 @@ class Results:
     def nodes(self) -> dict[str, Any]:
         """A node for every result, by name."""
         return {name: self.node(name) for name in self.digests}
+
+    def thumbnails(self) -> tuple[Thumbnail, ...]:
+        """A small picture of each instance; cut out of the photos where the run kept none; none where they are gone."""
+        if not self.missing(("thumbnails",)):
+            return tuple(self.all("thumbnails"))
+        if self.missing(("ingest", "masks")):
+            return ()
+        from ss_flow.tasks.deliver.thumbnails import thumbnails
+
+        return thumbnails(self.all("ingest"), self.all("masks"))
 
     def missing(self, names: Iterable[str]) -> list[str]:
         """Those of these results that the run did not have, or the store no longer holds."""

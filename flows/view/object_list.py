@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from ss_flow.flows.results import BACKGROUND
 from ss_flow.flows.view.search import Search
 from ss_flow.flows.view.session import Session
 from ss_flow.tasks.artifacts import UInt8
+from ss_flow.tasks.deliver.compressed import compressed, data_uri
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.semantics.query import QueryResult
 
@@ -76,7 +76,7 @@ class ObjectList:
         return self._pictures.get(instance) or _swatch(instance)
 
     def set_pictures(self, pictures: Mapping[int, UInt8]) -> None:
-        """pictures: [128, 128, 3] RGB by instance."""
+        """pictures: the bytes of a PNG or JPEG file by instance."""
         self._pictures = {instance: _as_html(picture) for instance, picture in pictures.items()}
         self.show()
 
@@ -156,16 +156,10 @@ class ObjectList:
 
 
 def _swatch(instance: int) -> str:
-    return _as_html(np.full((1, 1, 3), instance_color(instance), np.uint8))
+    return _as_html(compressed(np.full((1, 1, 3), instance_color(instance), np.uint8)))
 
 
 def _as_html(picture: UInt8) -> str:
-    """A picture, as large as a button of viser allows."""
-    import cv2
-
-    small = cv2.resize(picture, (64, 64), interpolation=cv2.INTER_AREA)
-    content = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes()
-    return (
-        '<img style="height:1.9em;width:1.9em;position:absolute;left:-0.6em;top:-0.45em" '
-        f'src="data:image/jpeg;base64,{base64.b64encode(content).decode()}">'
-    )
+    """A picture (the bytes of a file), as large as a button of viser allows."""
+    style = "height:1.9em;width:1.9em;position:absolute;left:-0.6em;top:-0.45em"
+    return f'<img style="{style}" src="{data_uri(picture)}">'

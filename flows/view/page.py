@@ -19,19 +19,16 @@ import numpy as np
 from ss_flow.cache.files import write_atomically
 from ss_flow.flows.results import BACKGROUND, FinishedRun
 from ss_flow.flows.view.drawing import StartView, start_view
-from ss_flow.tasks.artifacts import Float32, Gaussians, UInt8
+from ss_flow.tasks.artifacts import Float32, Gaussians
+from ss_flow.tasks.deliver.compressed import Thumbnail, data_uri
 from ss_flow.tasks.deliver.export.content import morton_order
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.palette import instance_colors
-from ss_flow.tasks.deliver.report import data_uri
-from ss_flow.tasks.deliver.thumbnails import shares_of_views, thumbnails
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 
 SHOWN = ("scene", "cameras")
 """The results of a run that its page cannot do without."""
-PICTURED = ("ingest", "masks")
-"""Those from which thumbnails are cut out; an edited run has none."""
 _LARGEST_SCALE = 100.0
 """Standard deviation of the largest Gaussian in the page's units: SPZ holds from e^-10 to e^5.9 of them."""
 _FAINTEST = 1 / 255
@@ -44,27 +41,20 @@ def write_page(file: Path, run: FinishedRun) -> None:
     """Write the page of a run, whole or not at all."""
     results = run.results
     scene, cameras = results.one("scene"), results.one("cameras")
-    pictures: dict[int, UInt8] = {}
-    shares: dict[int, float] = {}
-    if not results.missing(PICTURED):
-        frames, maps = results.all("ingest"), results.all("masks")
-        pictures = thumbnails(frames, maps, map(int, run.names))
-        shares = shares_of_views(maps)
+    pictured = {one.instance_id: one for one in results.thumbnails()}
     start = start_view(cameras, scene.means)
-    objects = [
-        (entry, pictures.get(entry["id"]))
-        for entry in sorted(run.instances["instances"], key=lambda entry: -shares.get(entry["id"], 0.0))
-    ]
+    objects = [(entry, pictured.get(entry["id"])) for entry in run.instances["instances"]]
+    objects.sort(key=lambda of: -of[1].share if of[1] else 0.0)
     title = PurePath(str(run.document["scene"])).name or "scene"
     write_atomically(file, page_html(title, scene, start, objects))
 
 
 def page_html(
-    title: str, scene: Gaussians, start: StartView, objects: list[tuple[Mapping[str, Any], UInt8 | None]]
+    title: str, scene: Gaussians, start: StartView, objects: list[tuple[Mapping[str, Any], Thumbnail | None]]
 ) -> str:
     """The page of a scene.
 
-    objects: entries of instances.json with a small picture [h, w, 3] RGB, in the order of the list. Those without
+    objects: entries of instances.json with a small picture, in the order of the list. Those without
     Gaussians are left out; the background comes last.
     """
     from jinja2 import Environment, StrictUndefined
@@ -115,10 +105,10 @@ def page_html(
     )
 
 
-def _object(instance_id: int, name: str, about: str, picture: UInt8 | None) -> dict[str, Any]:
+def _object(instance_id: int, name: str, about: str, picture: Thumbnail | None) -> dict[str, Any]:
     """What the list says of an object."""
     color = instance_colors(instance_id + 1)[instance_id].tolist()
-    thumbnail = "data:," if picture is None else data_uri(picture)
+    thumbnail = "data:," if picture is None else data_uri(picture.content)
     return {"id": instance_id, "name": name, "about": about, "color": color, "thumbnail": thumbnail}
 
 

@@ -61,13 +61,8 @@ class Viewer:
         self.timeline = add_timeline(self.server, self._run, shown, beside)
 
     def load_pictures(self) -> None:
-        """Give the objects in the list their pictures, which takes a while: every photo is decoded."""
-        from ss_flow.tasks.deliver.thumbnails import thumbnails
-
-        results = self._run.results
-        if not results.missing(("ingest", "masks")):
-            ids = [entry["id"] for entry in self._run.instances["instances"]]
-            self.panel.objects.set_pictures(thumbnails(results.all("ingest"), results.all("masks"), ids))
+        """Give the objects in the list their pictures; this may take a while, where the run kept none."""
+        self.panel.objects.set_pictures({one.instance_id: one.content for one in self._run.results.thumbnails()})
 
     def close(self) -> None:
         """Stop serving."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,3 +53,10 @@ def decompressed(content: UInt8) -> UInt8:
 
     bgr = cv2.imdecode(content, cv2.IMREAD_COLOR)
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8)
+
+
+def data_uri(content: UInt8 | bytes) -> str:
+    """The bytes of a PNG or JPEG file as a data URI."""
+    data = content if isinstance(content, bytes) else content.tobytes()
+    kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"

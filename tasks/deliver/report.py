@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -11,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import PointLabels, UInt8
-from ss_flow.tasks.deliver.compressed import Picture, Thumbnail
+from ss_flow.tasks.artifacts import PointLabels
+from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, data_uri
 from ss_flow.tasks.deliver.timeline import timeline
 
 _KINDS = {
@@ -132,7 +131,7 @@ def report_html(
         instances=[entry for entry in listed if not entry["crumb"]],
         crumbs=[entry for entry in listed if entry["crumb"]],
         shares=shares,
-        thumbnails={i: _data_uri(one.content) for i, one in thumbnails.items()},
+        thumbnails={i: data_uri(one.content) for i, one in thumbnails.items()},
         suspects=insight.suspects if insight else (),
         votes=insight.votes if insight else None,
         timeline=timeline(nodes),
@@ -150,21 +149,14 @@ def _views(pictures: Sequence[Picture]) -> tuple[list[dict[str, Any]], list[dict
     for picture in pictures:
         view, _, kind = picture.name.rpartition("/")
         if view and kind in _KINDS:
-            rows.setdefault(view, {})[kind] = _data_uri(picture.content)
+            rows.setdefault(view, {})[kind] = data_uri(picture.content)
         else:
-            others.append({"caption": picture.name, "uri": _data_uri(picture.content)})
+            others.append({"caption": picture.name, "uri": data_uri(picture.content)})
     views = [
         {"name": view, "pictures": [{"caption": _KINDS[kind], "uri": found[kind]} for kind in _KINDS if kind in found]}
         for view, found in rows.items()
     ]
     return views, others
-
-
-def _data_uri(content: UInt8) -> str:
-    """The bytes of a PNG or JPEG file as a data URI."""
-    data = content.tobytes()
-    kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 _BY_STAGE = ("split", "refined", "splat")
