@@ -60,12 +60,12 @@ class ObjectList:
         )
         self._answer = gui.add_markdown("" if search is not None else "This run has no descriptors to search.")
         self._text.disabled = self._tau.disabled = search is None
-        self._rows = [_Row(gui.add_button(" ")) for _ in range(_ROWS)]
+        self.rows = [_Row(gui.add_button(" ")) for _ in range(_ROWS)]
         self._turn = gui.add_button_group("Page", ("Before", "Next", "Select matches"))
         self._text.on_update(lambda _: self._ask())
         self._tau.on_update(lambda _: self._ask())
         self._turn.on_click(self._turned)
-        for row in self._rows:
+        for row in self.rows:
             self._on_click(row)
 
     def _on_click(self, row: _Row) -> None:
@@ -86,7 +86,7 @@ class ObjectList:
             order = self._order()
             self._page = min(self._page, max(0, (len(order) - 1) // _ROWS))
             listed = order[self._page * _ROWS : (self._page + 1) * _ROWS]
-            for row, instance in zip(self._rows, [*listed, *[None] * (_ROWS - len(listed))], strict=True):
+            for row, instance in zip(self.rows, [*listed, *[None] * (_ROWS - len(listed))], strict=True):
                 self._fill(row, instance)
             first = self._page * _ROWS
             self._turn.label = f"{first + 1}-{first + len(listed)} of {len(order)}" if order else "none"

@@ -76,7 +76,7 @@ void main() {
   mat3 turned = axes * rotation(second.x);
   vec3 s = exp(bytes(second.y).xyz / 16.0 - 10.0);
   mat3 half_axes = mat3(turned[0] * s.x, turned[1] * s.y, turned[2] * s.z);
-  vec2 limit = max(vec2(2.0), 0.65 * viewport / focal); // as our rasterizer
+  vec2 limit = 0.65 * viewport / focal; // 1.3 tan of half the field of view, as our rasterizer
   vec2 slope = clamp(p.xy / p.z, -limit, limit);
   vec3 along = vec3(1.0, 0.0, -slope.x) * half_axes, across = vec3(0.0, 1.0, -slope.y) * half_axes;
   float f = focal / p.z;

@@ -83,7 +83,7 @@ class Panel:
             self._group(gui, label, {name: act[name] for name in names})
         self._name = gui.add_text("Name", "")
         self._color = gui.add_rgb("Colour", (208, 32, 32))
-        self._factor = gui.add_number("Factor", 1.0, min=0.01, max=100.0, step=0.05)
+        self.factor = gui.add_number("Factor", 1.0, min=0.01, max=100.0, step=0.05)
         self._fill = gui.add_checkbox(
             "Fill the holes", False, hint="What leaves its place has its surroundings continued; shown by ss-flow edit"
         )
@@ -107,7 +107,7 @@ class Panel:
             "Split": lambda _: self._do(self._one_of("split")),
             "Rename": lambda _: self._do({**self._one_of("relabel"), "name": self._name.value}),
             "Recolour": lambda _: self._do(self._several_of("recolour", color=list(self._color.value))),
-            "Scale": lambda _: self._do(self._several_of("transform", scale=self._factor.value, **self._filled())),
+            "Scale": lambda _: self._do(self._several_of("transform", scale=self.factor.value, **self._filled())),
             "Undo": lambda _: session.undo(),
             "Redo": lambda _: session.redo(),
             "Save": self._save,
@@ -214,7 +214,8 @@ class Panel:
         focal = camera.image_height / 2 / np.tan(camera.fov / 2)
         if not (np.any(direction) and focal > 0):
             return
-        pixel = pixel_met(np.array(event.ray_origin), direction, camera.wxyz, float(focal))
+        size = camera.image_width, camera.image_height
+        pixel = pixel_met(np.array(event.ray_origin), direction, camera.wxyz, float(focal), size)
         with self._lock:
             found = self.pick().instance_at(pixel) if pixel is not None else None
             self.session.select(found or None, more=more or self.several.value)

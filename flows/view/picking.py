@@ -57,11 +57,11 @@ class Picker:
         return ahead[away < 1 + _REACH * np.sqrt(variance)]
 
 
-def pixel_met(origin: Float64, direction: Float64, wxyz: Float64, focal: float) -> Camera | None:
+def pixel_met(origin: Float64, direction: Float64, wxyz: Float64, focal: float, size: tuple[int, int]) -> Camera | None:
     """The pixel of a picture that a ray goes through; None for a ray that points away from it.
 
     origin: [3] where the camera stands, world. direction: [3] the ray, world, of any length but 0. wxyz: [4] the
-    camera's turn, camera-to-world. focal: the picture's focal length, pixels.
+    camera's turn, camera-to-world. focal: the picture's focal length, pixels. size: its width and height, pixels.
     """
     from scipy.spatial.transform import Rotation
 
@@ -71,4 +71,6 @@ def pixel_met(origin: Float64, direction: Float64, wxyz: Float64, focal: float) 
     x, y, z = pose[:3, :3] @ (direction / np.abs(direction).max())
     if z <= 0:
         return None
-    return Camera(1, 1, focal, focal, 0.5 - focal * x / z, 0.5 - focal * y / z, pose)
+    right, lower = np.array(size) / (2 * focal)
+    borders = (float(-right), float(-lower), float(right), float(lower))
+    return Camera(1, 1, focal, focal, 0.5 - focal * x / z, 0.5 - focal * y / z, pose, borders)

@@ -119,7 +119,7 @@ def _clicks(panel: Panel, eye: np.ndarray, middle: np.ndarray, side: float) -> d
     for _ in range(_CLICKS):
         target = middle + rng.uniform(-side / 2, side / 2, 3) * (1, 1, 0)
         begun, busy = time.perf_counter(), time.process_time()
-        pixel = pixel_met(eye, target - eye, wxyz, 500.0)
+        pixel = pixel_met(eye, target - eye, wxyz, 500.0, (1280, 800))
         assert pixel is not None
         found = panel.pick().instance_at(pixel)
         seconds.append(time.perf_counter() - begun)

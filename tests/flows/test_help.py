@@ -54,7 +54,7 @@ def test_the_name_alone_says_what_to_do_next_here(tmp_path, monkeypatch):
     monkeypatch.setenv("SS_FLOW_MODELS", "")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first = ss_flow()
-    assert first.code == 0
+    assert first.code == 2
     assert re.findall(r"^  ss-flow (\w+)", first.out, re.MULTILINE) == ["doctor", "models", "demo", "run"]
     for name in ("older", "newer"):
         folder = tmp_path / "ss-flow-out" / name

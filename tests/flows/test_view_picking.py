@@ -41,7 +41,7 @@ def test_a_click_meets_exactly_what_a_picture_shows_at_that_pixel(seed):
     for v in range(0, 48, 3):
         for u in range(0, 64, 3):
             ray = pose[:3, :3].T @ np.array([(u + 0.5 - 32) / FOCAL, (v + 0.5 - 24) / FOCAL, 1])
-            pixel = pixel_met(center, 3 * ray, wxyz, FOCAL)
+            pixel = pixel_met(center, 3 * ray, wxyz, FOCAL, (64, 48))
             assert pixel is not None
             found = picker.instance_at(pixel)
             assert (-1 if found is None else found) == shown[v, u]
@@ -50,8 +50,8 @@ def test_a_click_meets_exactly_what_a_picture_shows_at_that_pixel(seed):
 
 def test_a_ray_that_points_away_from_the_picture_meets_no_pixel():
     ahead = np.array([1.0, 0, 0, 0])
-    assert pixel_met(np.zeros(3), np.array([0, 0, -1.0]), ahead, FOCAL) is None
-    far = pixel_met(np.zeros(3), np.array([0, 0, 1e300]), ahead, FOCAL)
+    assert pixel_met(np.zeros(3), np.array([0, 0, -1.0]), ahead, FOCAL, (64, 48)) is None
+    far = pixel_met(np.zeros(3), np.array([0, 0, 1e300]), ahead, FOCAL, (64, 48))
     assert far is not None and (far.cx, far.cy) == (0.5, 0.5)
 
 
