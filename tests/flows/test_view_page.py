@@ -115,41 +115,48 @@ def test_the_page_shows_what_our_rasterizer_renders(page, run):
     assert ours[unhidden].std() > 0.05
 
 
+DRAWN = "new Promise(done => requestAnimationFrame(() => setTimeout(() => done(+document.body.dataset.drawn))))"
+"""How many Gaussians are drawn, after the next frame."""
+
+
 @needs_browser
 def test_objects_are_hidden_shown_and_isolated(page, run):
     scene = run.results.one("scene")
     seen = scene.instance_id[scene.opacities >= 1 / 255]
-    drawn = "new Promise(done => requestAnimationFrame(() => setTimeout(() => done(+document.body.dataset.drawn))))"
     ids = rows(page)
     assert sorted(ids) == np.unique(seen).tolist() and ids[-1] == 0
-    whole = page.evaluate(drawn)
+    whole = page.evaluate(DRAWN)
     first = int((seen == ids[0]).sum())
     page.click("li .eye")
-    assert whole - first <= page.evaluate(drawn) < whole
+    assert whole - first <= page.evaluate(DRAWN) < whole
     page.click("li .eye")
-    assert page.evaluate(drawn) == whole
+    assert page.evaluate(DRAWN) == whole
     page.click("li .only")
-    assert 0 < page.evaluate(drawn) <= first
+    assert 0 < page.evaluate(DRAWN) <= first
     assert page.evaluate("document.querySelectorAll('li.hidden').length") == len(ids) - 1
     page.click("li .only")
-    assert page.evaluate(drawn) == whole
+    assert page.evaluate(DRAWN) == whole
     page.click("li .only")
     page.click("#all")
-    assert page.evaluate(drawn) == whole
+    assert page.evaluate(DRAWN) == whole
 
 
 @needs_browser
 def test_labels_colour_the_scene_and_a_click_selects_the_object_under_it(page):
     before = page.screenshot()
     page.click("#labels")
+    page.evaluate(DRAWN)
     assert page.screenshot() != before
     page.click("#labels")
+    page.evaluate(DRAWN)
     page.click("canvas")
-    chosen = page.evaluate("document.querySelector('li.selected')?.dataset.id")
-    assert chosen is not None
+    page.wait_for("document.querySelector('li.selected') !== null")
+    chosen = page.evaluate("document.querySelector('li.selected').dataset.id")
+    shown = page.evaluate(DRAWN)
     page.evaluate(f"document.querySelector('li[data-id=\"{chosen}\"] .eye').click()")
+    page.wait_for(f"document.body.dataset.drawn < {shown}")
     page.click("canvas")
-    assert page.evaluate("document.querySelector('li.selected')?.dataset.id") != chosen
+    page.wait_for(f"document.querySelector('li.selected')?.dataset.id !== '{chosen}'")
     page.click("#all")
 
 
