@@ -42,7 +42,7 @@ class Panel:
         """script: the file that the edit script is saved to. search: None where a run cannot be searched."""
         self._server, self.session, self._script = server, session, script
         self.nodes = SceneNodes(server)
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         self._picker: tuple[dict[int, Piece], Picker] | None = None
         self._saved = session.script()
         self._is_moving = False
@@ -66,7 +66,7 @@ class Panel:
     def refresh(self) -> None:
         """Show the state of the session."""
         session = self.session
-        with self._lock, self._server.atomic():
+        with self.lock, self._server.atomic():
             pieces = session.state.pieces
             self.nodes.show(pieces, session.visible(), session.selected, self._colors.value)  # type: ignore[arg-type]
             self.objects.show()
@@ -128,7 +128,7 @@ class Panel:
 
     def _attempt(self, client: Client, act: Act) -> None:
         """Do something, and show what became of it; what is refused is told."""
-        with self._lock:
+        with self.lock:
             try:
                 act()
             except InputError as error:
@@ -167,7 +167,7 @@ class Panel:
         fields: dict[str, Any] = {"move": list(motion.move)} if any(motion.move) else {}
         if motion.degrees:
             fields["rotate"] = {"axis": list(motion.axis), "degrees": motion.degrees}
-        with self._lock:
+        with self.lock:
             solid = self._solid()
             operation = {"op": "transform", "instances": solid, **fields, **self._filled()}
             self._attempt(None, lambda: self.session.do(operation) if fields and solid else None)
@@ -201,7 +201,7 @@ class Panel:
 
     def _chosen(self, instances: tuple[int, ...]) -> None:
         """Picked from the list."""
-        with self._lock:
+        with self.lock:
             if not self.several.value:
                 self.session.select(None)
             for instance in instances:
@@ -216,7 +216,7 @@ class Panel:
             return
         size = camera.image_width, camera.image_height
         pixel = pixel_met(np.array(event.ray_origin), direction, camera.wxyz, float(focal), size)
-        with self._lock:
+        with self.lock:
             found = self.pick().instance_at(pixel) if pixel is not None else None
             self.session.select(found or None, more=more or self.several.value)
             self.refresh()
