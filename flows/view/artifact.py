@@ -13,7 +13,7 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.flows.describe import as_html, provenance
 from ss_flow.flows.results import Results, of_type
-from ss_flow.flows.view.drawing import Around, draw, is_spatial, start_view
+from ss_flow.flows.view.drawing import Around, draw, is_spatial, look_from, start_view
 from ss_flow.runs import Run
 from ss_flow.tasks.artifacts import Cameras, Frame, PointCloud
 from ss_flow.tasks.deliver.draw import draw as picture_of
@@ -60,9 +60,7 @@ def show(server: viser.ViserServer, values: Sequence[Any], around: Around) -> No
     if around.cameras is None:
         return
     points = np.zeros((0, 3), np.float32) if around.points is None else around.points.points
-    first, camera = start_view(around.cameras, points), server.initial_camera
-    server.scene.set_up_direction(first.up)
-    camera.position, camera.look_at, camera.up, camera.fov = first.position, first.look_at, first.up, first.fov
+    look_from(server, start_view(around.cameras, points))
 
 
 def write_artifact_page(

@@ -44,7 +44,7 @@ from ss_flow.tasks.geometry.cameras import (
 from ss_flow.tasks.geometry.images import decode_rgb
 
 if TYPE_CHECKING:
-    from viser import CameraFrustumHandle, GaussianSplatHandle, PointCloudHandle, SceneApi
+    from viser import CameraFrustumHandle, GaussianSplatHandle, PointCloudHandle, SceneApi, ViserServer
 
 _UNLABELLED = (190, 190, 190)
 _PICTURE_HEIGHT = 240
@@ -110,6 +110,13 @@ def start_view(cameras: Cameras, points: Float32) -> StartView:
     forward = camera.world_to_camera[2, :3]
     fov = 2 * np.arctan(camera.height / 2 / camera.fy)
     return StartView(camera.center, camera.center + ahead * forward, up_of(cameras), float(fov))
+
+
+def look_from(server: ViserServer, first: StartView) -> None:
+    """Let browsers that come look from there."""
+    camera = server.initial_camera
+    server.scene.set_up_direction(first.up)
+    camera.position, camera.look_at, camera.up, camera.fov = first.position, first.look_at, first.up, first.fov
 
 
 def up_of(cameras: Cameras) -> Float64:

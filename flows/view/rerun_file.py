@@ -18,7 +18,7 @@ from ss_flow.flows.view.drawing import agreement_colors, label_colors, spacing_o
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.deliver.export.content import base_colors
 from ss_flow.tasks.deliver.palette import instance_colors
-from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.images import suffix_of
 
 SHOWN = ("ingest", "cameras")
@@ -71,29 +71,26 @@ def _log_views(stream: Any, run: FinishedRun) -> None:
         stream.log(place, rr.Transform3D(translation=camera.center, mat3x3=pose[:3, :3].T))
         stream.log(
             f"{place}/photo",
-            rr.Pinhole(
-                focal_length=(camera.fx, camera.fy),
-                principal_point=(camera.cx, camera.cy),
-                resolution=(camera.width, camera.height),
-                camera_xyz=rr.ViewCoordinates.RDF,
-            ),
+            _pinhole(camera),
             rr.EncodedImage(contents=frame.encoded.tobytes(), media_type=_MEDIA[suffix_of(frame)]),
         )
         for name, one in several.items():
             if name == "depth":
                 pixels = camera.scaled(*one[view].depth.shape[::-1])
-                stream.log(
-                    f"{place}/depth",
-                    rr.Pinhole(
-                        focal_length=(pixels.fx, pixels.fy),
-                        principal_point=(pixels.cx, pixels.cy),
-                        resolution=(pixels.width, pixels.height),
-                        camera_xyz=rr.ViewCoordinates.RDF,
-                    ),
-                    rr.DepthImage(one[view].depth, meter=1.0),
-                )
+                stream.log(f"{place}/depth", _pinhole(pixels), rr.DepthImage(one[view].depth, meter=1.0))
             else:
                 stream.log(f"{place}/photo/{name}", rr.SegmentationImage(one[view].ids))
+
+
+def _pinhole(camera: Camera) -> Any:
+    import rerun as rr
+
+    return rr.Pinhole(
+        focal_length=(camera.fx, camera.fy),
+        principal_point=(camera.cx, camera.cy),
+        resolution=(camera.width, camera.height),
+        camera_xyz=rr.ViewCoordinates.RDF,
+    )
 
 
 def _log_points(stream: Any, run: FinishedRun) -> None:

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ss_flow.flows.results import FinishedRun
 from ss_flow.flows.view.camera_views import CameraViews
-from ss_flow.flows.view.drawing import start_view
+from ss_flow.flows.view.drawing import look_from, start_view
 from ss_flow.flows.view.panel import Panel
 from ss_flow.flows.view.search import Search
 from ss_flow.flows.view.server import start
 from ss_flow.flows.view.session import Operation, Session
 from ss_flow.flows.view.timeline import add_timeline
-from ss_flow.tasks.artifacts import Cameras, Gaussians
-
-if TYPE_CHECKING:
-    import viser
 
 
 class Viewer:
@@ -42,7 +37,7 @@ class Viewer:
         session = Session(scene, run.instances, script.parent, operations)
         self._run = run
         self.server, self.address = start(host, port, run.name)
-        _stand(self.server, cameras, scene)
+        look_from(self.server, start_view(cameras, scene.means))
         self.panel = Panel(self.server, session, script, search)
         self.cameras = CameraViews(self.server, cameras, run.results)
 
@@ -67,11 +62,3 @@ class Viewer:
     def close(self) -> None:
         """Stop serving."""
         self.server.stop()
-
-
-def _stand(server: viser.ViserServer, cameras: Cameras, scene: Gaussians) -> None:
-    """Where a browser looks from at first: as the photo that shows most."""
-    view = start_view(cameras, scene.means)
-    server.scene.set_up_direction(view.up)
-    camera = server.initial_camera
-    camera.position, camera.look_at, camera.up, camera.fov = view.position, view.look_at, view.up, view.fov
