@@ -24,6 +24,7 @@ from ss_flow.engine import RUN_CLAIM
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import OptionalCount, OptionalText, StoreOptions, console
 from ss_flow.flows.cli.pins import tell_pins
+from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.runs import Run, latest_runs
 from ss_flow.units import parse_bytes, parse_seconds
@@ -86,7 +87,7 @@ class CacheCollect:
             print(json.dumps(document | {"over_bytes": over}, indent=1))
             return
         out = console(json=False)
-        out.print(_table("would go" if self.dry_run else "deleted", rows, {"total": total}))
+        print_table(_table("would go" if self.dry_run else "deleted", rows, {"total": total}), out)
         out.print(f"{left.count} results stay, {size_text(left.bytes)}")
         if over:
             out.print(
@@ -172,7 +173,7 @@ class CacheUsage:
         out = console(json=False)
         for name, usage in usages.items():
             ends = {"of none of them": usage.unreachable, "total": total}
-            out.print(_table(name, usage.rows, ends))
+            print_table(_table(name, usage.rows, ends), out)
             if usage.shared_bytes:
                 out.print(f"of the rows, {size_text(usage.shared_bytes)} are shared and counted more than once")
             out.print()
@@ -209,7 +210,7 @@ class CacheVerify:
         else:
             out = console(json=False)
             rows = {"objects": seen.objects, "results": seen.actions, "parts of keys": seen.parts}
-            out.print(_table("read", rows, {}))
+            print_table(_table("read", rows, {}), out)
             for damage in seen.damaged[:SHOWN]:
                 out.print(escape(f"taken out: {damage.kind} {damage.name[:12]} {damage.reason}"))
             if len(seen.damaged) > SHOWN:

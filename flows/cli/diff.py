@@ -17,6 +17,7 @@ from rich.table import Table
 
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import console
+from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.results import read_run
 from ss_flow.tasks.evaluate.comparison import Correspondence, correspondence
 
@@ -130,12 +131,12 @@ def _tell(document: dict[str, Any], out: Console) -> None:
         for name, pair in document["metrics"].items():
             a, b = ("" if value is None else f"{value:.4f}" for value in pair)
             table.add_row(name, a, b, "" if None in pair else f"{pair[1] - pair[0]:+.4f}")
-        out.print(table)
+        print_table(table, out)
     table = Table("step", "same", "different", "only first", "only second", "seconds", box=None)
     for step, row in document["steps"].items():
         counts = (str(row[name] or "") for name in ("same", "different", "only_first", "only_second"))
         table.add_row(step, *counts, "{:.1f} / {:.1f}".format(*row["seconds"]))
-    out.print(table)
+    print_table(table, out)
     found = document["instances"]
     if found is None:
         out.print("objects: not compared; the two results have no view of the same name.")

@@ -26,6 +26,7 @@ from ss_flow.flows.cli.context import (
     references,
 )
 from ss_flow.flows.cli.query import encoder_name, query_params
+from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.evaluate import (
     LERF,
     LabelledScene,
@@ -228,10 +229,10 @@ def _tell(tables: _Tables, out: Console) -> None:
     stages = tables.stages.values()
     for name in dict.fromkeys(name for values in stages for name in values):
         table.add_row(name, *(f"{values[name]:.4f}" if name in values else "" for values in stages))
-    out.print(table)
+    print_table(table, out)
     for title, rows in (tables.objects or {}).items():
         if rows:
             table = Table(title, *list(rows[0])[1:], box=None)
             for row in rows:
                 table.add_row(*(str(v) if isinstance(v, int) else f"{v:.4f}" for v in row.values()))
-            out.print(table)
+            print_table(table, out)

@@ -19,6 +19,7 @@ from ss_flow.cache.survey import Survey
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import OptionalPath, PositionalText, StoreOptions, console
 from ss_flow.flows.cli.inspect import run_with
+from ss_flow.flows.cli.telling import print_table
 from ss_flow.runs import Run, latest_runs
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -115,8 +116,11 @@ def _described(pinned: Pin) -> str:
 
 def tell_pins(pins: list[Pin]) -> None:
     """Print what is pinned, a line a pin."""
+    if not pins:
+        console(json=False).print("nothing is pinned")
+        return
     table = Table("pinned", "scene", "results", "since", box=None)
     for pinned in pins:
         since = time.strftime("%F %T", time.localtime(pinned.pinned))
         table.add_row(escape(pinned.what), escape(pinned.scene), str(len(pinned.keys)), since)
-    console(json=False).print(table if pins else "nothing is pinned")
+    print_table(table, console(json=False))

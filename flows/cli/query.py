@@ -25,6 +25,7 @@ from ss_flow.flows.cli.context import (
     file_digests,
     open_run,
 )
+from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.query import NEEDED, described_parts
 from ss_flow.flows.results import FinishedRun, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
@@ -130,7 +131,7 @@ class Query:
             mark = "[green]match[/]" if row["matched"] else ""
             place = [str(row[column]) for column in ("id", *part)]
             table.add_row(mark, *place, row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}")
-        out.print(table)
+        print_table(table, out)
 
 
 def query_params(document: dict[str, Any]) -> QueryParams:

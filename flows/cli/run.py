@@ -17,7 +17,7 @@ from ss_flow.errors import InputError
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import OptionalPath, console, file_digests
 from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare, tell_remarks
-from ss_flow.flows.cli.telling import hits_of, would_run
+from ss_flow.flows.cli.telling import hits_of, print_table, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
 from ss_flow.tasks.capture.scene import open_scene
@@ -160,7 +160,7 @@ def _tell(document: dict[str, Any], out_folder: Path | None, out: Console) -> No
         for stage, row in rows:
             figures = (f"{100 * row[name]:.1f}" for name in ("miou", "macc25", "macc50", "pq"))
             table.add_row(f"after {stage.title()}", *figures)
-        out.print(table)
+        print_table(table, out)
     if views := document["metrics"].get("novel_view"):
         out.print(
             f"views that were kept back: PSNR {views['psnr']:.2f} dB, {views['psnr_colour_fitted']:.2f} with "

@@ -18,6 +18,7 @@ from rich.table import Table
 
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import PositionalText, StoreOptions, console
+from ss_flow.flows.cli.telling import print_table
 from ss_flow.tasks.models import catalogue
 
 
@@ -49,7 +50,7 @@ class ModelsList:
         table = Table("name", "kind", "licence", "source", "here", box=None)
         for row in rows:
             table.add_row(*(escape(row[k]) for k in ("name", "kind", "licence", "source")), row["here"] or "[dim]no[/]")
-        console(json=False).print(table)
+        print_table(table, console(json=False))
         return 0
 
 
@@ -154,7 +155,7 @@ class Doctor:
             except Exception as error:
                 bad += 1
                 table.add_row(check.name, f"[red]{escape(str(error) or type(error).__name__)}[/]", escape(check.mend))
-        console(json=False).print(table)
+        print_table(table, console(json=False))
         return 1 if bad else 0
 
 

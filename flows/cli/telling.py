@@ -9,9 +9,11 @@ from ss_flow.engine import Report
 
 
 def print_table(table: Table, out: Console) -> None:
-    """Print a table; into a file or a pipe at its full width."""
+    """Print a table, no word of it cut off; into a file or a pipe at its full width."""
     if not out.is_terminal:
         out.width = 1000
+    for column in table.columns:
+        column.overflow = "fold"
     out.print(table)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import io
 import os
 import re
 import shutil
@@ -10,9 +11,12 @@ import subprocess
 import sys
 
 import pytest
+from rich.console import Console
+from rich.table import Table
 from tiny_runs import ss_flow
 
 from ss_flow.flows.cli.commands import COMMANDS, Entry, Group
+from ss_flow.flows.cli.telling import print_table
 
 ENTRIES: dict[tuple[str, ...], Entry] = {}
 for _name, _entry in COMMANDS.items():
@@ -91,6 +95,22 @@ def test_the_completion_of_zsh_names_the_commands():
     shown = ss_flow("completion", "zsh")
     assert shown.code == 0 and shown.out.startswith("#compdef ss-flow")
     assert {"export", "doctor", "verify"} <= set(re.findall(r"\w+", shown.out))
+
+
+@pytest.mark.parametrize("on_terminal", [False, True])
+def test_a_table_cuts_no_word_off(on_terminal):
+    """A name of the catalogue is there to be typed."""
+    name = "depth-anything-v2-small"
+    shown = Console(file=io.StringIO(), width=12, force_terminal=on_terminal, color_system=None)
+    table = Table("name", "source", box=None)
+    table.add_row(name, "org/" + name)
+    print_table(table, shown)
+    lines = shown.file.getvalue().splitlines()
+    if on_terminal:
+        assert max(map(len, lines)) <= 12
+        assert "".join(line[:6].strip() for line in lines) == "name" + name
+    else:
+        assert lines[1].split() == [name, "org/" + name]
 
 
 def test_the_doctor_says_what_to_do_about_each_thing_that_lacks(tmp_path, monkeypatch):
