@@ -168,7 +168,9 @@ def _masks_of_hints(
         embeddings,
         clicks,
         names=capture.names,
-        build=lambda frame, embedding, own: hints.clicked(EmbeddedPhoto(frame, embedding), own, model=segmenter),
+        build=lambda frame, embedding, own: hints.clicked(
+            EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter
+        ),
     )
     hinted = hints.label(points, seen, clicked, erosion=params.observe.erosion, tau_label=params.propagate.tau_label)
     masks = each(

@@ -23,6 +23,7 @@ from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.masks.packing import grown
+from ss_flow.tasks.masks.pool import without_speckles
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, Sam
@@ -65,6 +66,9 @@ class RefineParams:
     max_change: NonNegative = 1.5
     """A mask that the view's photo gave is only replaced by one of at most so many times its area, and of no less than
     the inverse of that; 0 = any, as in the paper."""
+    speckle: Fraction = 0.05
+    """Pieces of the segmenter's mask smaller than this share of its largest one are taken off, and holes as small are
+    filled; 0 = none, as in the paper."""
     dilation: Natural = 0
     """Pixels by which new masks of the segmenter are dilated; 1 in the code of the paper's authors."""
     min_support: Fraction = 0.7
@@ -257,7 +261,7 @@ def _replacement(
     places = np.stack([column, row], axis=-1) + 0.5
     taken = greedy_farthest(places, params.prompts, alpha=params.prompt_alpha, drop_hull=params.drop_hull)
     candidate, score = prompt(places[taken])
-    candidate = grown(candidate, params.dilation) & valid
+    candidate = grown(without_speckles(candidate, params.speckle), params.dilation) & valid
     agreement = iou(candidate, shown)
     if params.pred_iou and score < params.pred_iou:
         return None

@@ -35,16 +35,16 @@ _MOST = 0.5
 
 
 @task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=network_identity)
-def clicked(photo: EmbeddedPhoto, clicks: Clicks, *, model: Model) -> PromptedMasks:
+def clicked(photo: EmbeddedPhoto, clicks: Clicks, *, speckle: float, model: Model) -> PromptedMasks:
     """One mask for each object that was clicked in a view, none in a view without clicks.
 
-    clicks: those of the photo. Raises InputError when the model cannot be opened.
+    clicks: those of the photo. speckle: as in `RepromptParams`. Raises InputError when the model cannot be opened.
     """
     prompts = {}
     for label in np.unique(clicks.label).tolist():
         of_object = clicks.label == label
         prompts[label] = Prompt(clicks.points[of_object], clicks.inside[of_object])
-    return prompt(photo, prompts, model)
+    return prompt(photo, prompts, model, speckle)
 
 
 @task()
@@ -102,7 +102,7 @@ def spread(
     """
     painted = paint_labels(visibility, labels.label)
     prompts = spread_prompts(painted, photo.frame.width, set(clicked.label.tolist()), params)
-    found = prompt(photo, prompts, model)
+    found = prompt(photo, prompts, model, params.speckle)
     masks = found.dense()
     fits = [_fits(painted, mask, name) for mask, name in zip(masks, found.label.tolist(), strict=True)]
     kept = np.array(fits, bool)

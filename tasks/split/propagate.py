@@ -153,7 +153,7 @@ def _unconfirmed(
     dropped[0] = False
     if dropped.any():
         warn(
-            f"{dropped.sum()} labels ({size[dropped].sum() / len(label):.1%} of the points) go to the background, "
-            f"since masks of fewer than {min_views} views show them though others see them too."
+            f"{dropped.sum()} of {(size[1:] > 0).sum()} labels, with {size[dropped].sum()} of {len(label)} points, go to "
+            f"the background, since masks of fewer than {min_views} views show them though others see them too."
         )
     return dropped

@@ -12,6 +12,7 @@ from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView, agreement, labels_in_front, paint_labels
+from ss_flow.tasks.masks.pool import without_speckles
 from ss_flow.tasks.masks.selection import SelectionParams, select_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
@@ -34,6 +35,8 @@ class RepromptParams:
     """How much prompts keep to the middle of the label."""
     drop_hull: bool = True
     """Whether the outermost points are no prompts."""
+    speckle: Fraction = 0.05
+    """Pieces of an answer smaller than this share of its largest one are taken off, and holes as small are filled."""
 
 
 @task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=network_identity)
@@ -56,7 +59,7 @@ def reprompt(
     painted = paint_labels(visibility, labels.label)
     shown = select_masks(painted, masks, selection)
     good = {label for label, mask in shown.items() if agreement(painted, mask, label) >= params.min_agreement}
-    return prompt(photo, spread_prompts(painted, photo.frame.width, good, params), model)
+    return prompt(photo, spread_prompts(painted, photo.frame.width, good, params), model, params.speckle)
 
 
 @dataclass(frozen=True)
@@ -81,8 +84,11 @@ def spread_prompts(painted: PaintedView, width: int, shown: set[int], params: Re
     return prompts
 
 
-def prompt(photo: EmbeddedPhoto, prompts: dict[int, Prompt], model: Model) -> PromptedMasks:
-    """The masks of one frame that prompts ask for, by label in ascending order; without any the model is not opened."""
+def prompt(photo: EmbeddedPhoto, prompts: dict[int, Prompt], model: Model, speckle: float) -> PromptedMasks:
+    """The masks of one frame that prompts ask for, by label in ascending order; without any the model is not opened.
+
+    speckle: as in `RepromptParams`.
+    """
     frame = photo.frame
     masks = np.zeros((len(prompts), frame.height, frame.width), bool)
     predicted = np.zeros(len(prompts), np.float32)
@@ -92,7 +98,7 @@ def prompt(photo: EmbeddedPhoto, prompts: dict[int, Prompt], model: Model) -> Pr
         for row, label in enumerate(sorted(prompts)):
             asked = prompts[label]
             mask, predicted[row] = sam.predict_prompt(photo.embedding, asked.points, asked.inside)
-            masks[row] = mask & valid
+            masks[row] = without_speckles(mask, speckle) & valid
     return PromptedMasks(
         name=frame.name,
         height=frame.height,

@@ -101,6 +101,7 @@ TABLE = {
     "split.reprompt.min_points": (10, 10, 10),
     "split.reprompt.prompts": (10, 10, 10),
     "split.reprompt.min_agreement": (0.0, 0.0, 0.5),
+    "split.reprompt.speckle": (0.0, 0.0, 0.05),
     # 21
     "split.reproject.min_views": (2, 2, 2),
     "splat.refine.min_views": (2, 2, 2),
@@ -178,6 +179,7 @@ TABLE = {
     "splat.refine.tie": ("new", "new", "old"),
     "splat.refine.pred_iou": (0.0, 0.0, 0.8),
     "splat.refine.margin": (0.0, 0.0, 0.1),
+    "splat.refine.speckle": (0.0, 0.0, 0.05),
     "splat.refine.max_change": (0.0, 0.0, 1.5),
     "splat.refine.dilation": (0, 1, 0),
     # 31: as many steps again, from scratch; ours goes on from the first training, with fewer.

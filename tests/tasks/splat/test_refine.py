@@ -177,6 +177,20 @@ def test_a_missing_mask_is_added_only_above_tau_iou(small, box, monkeypatch):
     assert bad.views == NAMES[:2]
 
 
+def test_an_answer_is_taken_without_its_speckles(small, box, monkeypatch):
+    """Small networks answer with dots and pinholes where they waver."""
+    truth = small.instance(1)
+    rng = np.random.default_rng(0)
+    spots = [(ids == 1) ^ (rng.random(ids.shape) < 0.03) for ids in small.ids]
+
+    def wrong(**params) -> int:
+        found = refined(small, box, small.instance(1, views=(0,)), monkeypatch, lambda view, _: spots[view], **params)
+        assert found.views == NAMES
+        return int((found.dense() != truth.dense())[1:].sum())
+
+    assert wrong() < 0.5 * wrong(speckle=0.0)
+
+
 def test_prompts_lie_on_visible_parts_of_the_instance(small, box, monkeypatch):
     asked = {}
 

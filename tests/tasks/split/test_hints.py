@@ -100,7 +100,7 @@ def test_without_any_mask_no_point_is_labelled():
 
 
 def test_a_view_without_clicks_opens_no_model():
-    found = hints.clicked(EmbeddedPhoto(box_scene.frames()[0], NOTHING), no_clicks(), model=ABSENT)
+    found = hints.clicked(EmbeddedPhoto(box_scene.frames()[0], NOTHING), no_clicks(), speckle=0.05, model=ABSENT)
     assert found.dense().shape == (0, HEIGHT, WIDTH) and len(found.label) == 0
 
 
@@ -151,7 +151,9 @@ def test_the_segmenter_finds_what_was_clicked_and_not_what_was_excluded(segmente
     ids = box_scene.cast(0)[1]
     frame = box_scene.frames()[0]
     embedding = embed(frame, model=segmenter)
-    found = hints.clicked(EmbeddedPhoto(frame, embedding), clicks_on(ids, {2: 5, 3: 7}, "0"), model=segmenter)
+    found = hints.clicked(
+        EmbeddedPhoto(frame, embedding), clicks_on(ids, {2: 5, 3: 7}, "0"), speckle=0.05, model=segmenter
+    )
     assert found.label.tolist() == [5, 7]
     for mask, i in zip(found.dense(), (2, 3), strict=True):
         assert iou(mask, ids == i) > 0.7
@@ -160,7 +162,7 @@ def test_the_segmenter_finds_what_was_clicked_and_not_what_was_excluded(segmente
     both = Clicks(
         "0", np.array([5, 5], np.int32), np.concatenate([inside.points, beside.points]), np.array([1, 0], np.int32)
     )
-    (mask,) = hints.clicked(EmbeddedPhoto(frame, embedding), both, model=segmenter).dense()
+    (mask,) = hints.clicked(EmbeddedPhoto(frame, embedding), both, speckle=0.05, model=segmenter).dense()
     column, row = both.points[1].astype(int)
     assert not mask[row, column] and mask[ids == 2].mean() > 0.7
 
@@ -172,7 +174,7 @@ def test_what_is_clicked_in_two_views_gets_masks_in_all_that_see_it(segmenter):
     ids = [box_scene.cast(k)[1] for k in range(VIEWS)]
     photos = [EmbeddedPhoto(frame, embed(frame, model=segmenter)) for frame in frames]
     clicks = [clicks_on(ids[k], {1: 1, 2: 2}, f"{k}") if k in (0, 3) else no_clicks(f"{k}") for k in range(VIEWS)]
-    own = tuple(hints.clicked(*view, model=segmenter) for view in zip(photos, clicks, strict=True))
+    own = tuple(hints.clicked(*view, speckle=0.05, model=segmenter) for view in zip(photos, clicks, strict=True))
     labels = hints.label(points, seen, own, erosion=ErosionParams(), tau_label=0.7)
     assert set(np.unique(labels.label)) == {0, 1, 2}
     for k, view in enumerate(zip(photos, seen, own, strict=True)):

@@ -1,6 +1,8 @@
+import importlib
 from pathlib import Path
 
 import box_scene
+import cv2
 import numpy as np
 import pytest
 from box_scene import mask_set
@@ -10,8 +12,9 @@ from ss_flow.tasks.masks.selection import SelectionParams
 from ss_flow.tasks.models.catalogue import Model, find
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
 from ss_flow.tasks.split.embed import embed
-from ss_flow.tasks.split.reprompt import RepromptParams, reprompt
+from ss_flow.tasks.split.reprompt import Prompt, RepromptParams, prompt, reprompt
 
+module = importlib.import_module("ss_flow.tasks.split.reprompt")
 WEIGHTS = Path(__file__).parents[4] / "shared" / "models"
 
 
@@ -62,6 +65,27 @@ def test_a_label_without_a_mask_gets_one_from_the_segmenter():
     assert found.label.tolist() == [2]
     mask = found.dense()[0]
     assert (mask & (ids == 2)).sum() / (mask | (ids == 2)).sum() > 0.7
+
+
+def test_an_answer_comes_without_speckles(monkeypatch):
+    ids, *_ = box_view(missing=())
+    frame, answer = box_scene.frames()[0], ids == 2
+    answer[2::9, 2::9] ^= True
+
+    class Scripted:
+        def __init__(self, model: Model) -> None: ...
+
+        def predict_prompt(self, *_: object) -> tuple[np.ndarray, float]:
+            return answer, 0.9
+
+    monkeypatch.setattr(module, "Sam", Scripted)
+    asked = {2: Prompt(np.array([[1.0, 1.0]]), np.ones(1, np.int32))}
+    photo = EmbeddedPhoto(frame, Embedding(np.zeros((1, 256, 64, 64), np.float32), *ids.shape))
+    raw, clean = (prompt(photo, asked, Model("absent", "sam", (), (), ()), share).dense()[0] for share in (0.0, 0.05))
+    np.testing.assert_array_equal(raw, answer)
+    inside = cv2.erode((ids == 2).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    outside = cv2.dilate((ids == 2).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
+    assert clean[inside].all() and not clean[outside].any()
 
 
 def test_a_mask_that_agrees_badly_with_its_label_is_asked_for_again():
