@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Float64, Int32, ViewLists
 from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view
@@ -55,10 +56,10 @@ def neighbors(cameras: Cameras, *, params: NeighborParams = NeighborParams()) ->
     by_view = cameras_by_view(cameras)
     guess = typical_depth(by_view)
     spans = [_span(cameras, camera) for camera in by_view]
-    chosen = [
-        _best(by_view, view, guess if span is None else float(np.sqrt(span[0] * span[1])), params.count)
-        for view, span in enumerate(spans)
-    ]
+    chosen = []
+    for view, span in enumerate(spans):
+        progress(view, len(spans))
+        chosen.append(_best(by_view, view, guess if span is None else float(np.sqrt(span[0] * span[1])), params.count))
     known = np.array([(np.nan, np.nan) if span is None else span for span in spans], np.float64)
     return Neighbors(span=known.reshape(-1, 2), **Neighbors.arrays(chosen))
 

@@ -43,20 +43,25 @@ def view_scores(camera: Camera, others: Sequence[Camera], depth: float | Float32
     rows, columns = ((np.arange(n) + 0.5) / n for n in (6, 8))
     sampled = wide[(rows * wide.shape[0]).astype(int)][:, (columns * wide.shape[1]).astype(int)]
     points = backproject(sampled, camera.scaled(8, 6))
-    to_reference = points - camera.center
     scores = np.zeros(len(others))
-    for i, other in enumerate(others):
-        uv, z = project(points, other)
-        with np.errstate(invalid="ignore"):
-            seen = (z > 0) & (uv >= 0).all(axis=1) & (uv[:, 0] < other.width) & (uv[:, 1] < other.height)
-        if not seen.any():
-            continue
-        to_other = points - other.center
-        cosine = (to_reference * to_other).sum(axis=1)
-        cosine /= np.linalg.norm(to_reference, axis=1) * np.linalg.norm(to_other, axis=1)
-        angle = np.degrees(np.arccos(np.clip(np.median(cosine[seen]), -1, 1)))
-        width = 3.0 if angle < _IDEAL_ANGLE else 10.0
-        scores[i] = seen.mean() * np.exp(-0.5 * ((angle - _IDEAL_ANGLE) / width) ** 2)
+    if not others:
+        return scores
+    poses = np.array([other.world_to_camera for other in others])
+    lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in others])[:, None]
+    local = points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = local[..., :2] / local[..., 2:] * lenses[..., :2] + lenses[..., 2:4]
+        seen = (local[..., 2] > 0) & ((uv >= 0) & (uv < lenses[..., 4:])).all(axis=-1)
+    useful = np.flatnonzero(seen.any(axis=1))
+    to_reference = points - camera.center
+    centers = -poses[:, None, :3, 3] @ poses[:, :3, :3]
+    to_other = points - centers[useful]
+    cosine = (to_reference * to_other).sum(axis=-1)
+    cosine /= np.linalg.norm(to_reference, axis=-1) * np.linalg.norm(to_other, axis=-1)
+    middle = np.nanmedian(np.where(seen[useful], cosine, np.nan), axis=1)
+    angle = np.degrees(np.arccos(np.clip(middle, -1, 1)))
+    width = np.where(angle < _IDEAL_ANGLE, 3.0, 10.0)
+    scores[useful] = seen[useful].mean(axis=1) * np.exp(-0.5 * ((angle - _IDEAL_ANGLE) / width) ** 2)
     return scores
 
 

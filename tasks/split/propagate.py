@@ -153,7 +153,8 @@ def _unconfirmed(
     dropped[0] = False
     if dropped.any():
         warn(
-            f"{dropped.sum()} of {(size[1:] > 0).sum()} labels, with {size[dropped].sum()} of {len(label)} points, go to "
-            f"the background, since masks of fewer than {min_views} views show them though others see them too."
+            f"{dropped.sum()} of {np.count_nonzero(size[1:])} labels, with {size[dropped].sum()} of {len(label)} "
+            f"points, go to the background, since masks of fewer than {min_views} views show them though others see "
+            f"them too."
         )
     return dropped

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from generated_views import views
 
-from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, looking, project
 from ss_flow.tasks.geometry.plane_sweep import (
     SweepView,
     agreeing_depth,
@@ -12,6 +12,7 @@ from ss_flow.tasks.geometry.plane_sweep import (
     matching_cost,
     smooth_cost,
     typical_depth,
+    view_scores,
 )
 
 EYES = [(0, 0, 0), (0.35, 0, 0), (-0.35, 0.1, 0), (0, 0.35, 0), (0.1, -0.35, 0.1)]
@@ -118,6 +119,33 @@ def test_depth_stays_only_where_enough_other_views_agree():
     error = np.abs(kept - depth[0])[right & (kept > 0)] / depth[0][right & (kept > 0)]
     assert error.max() < 0.01
     assert not agreeing_depth(wrong, maps[0][1], maps[1:2], 1.0, 0.01, 2).any()
+
+
+def score_of(camera: Camera, other: Camera, depth: float) -> float:
+    """What `view_scores` gives for one view, pixel by pixel."""
+    cosines = []
+    for point in backproject(np.full((6, 8), depth, np.float32), camera.scaled(8, 6)):
+        ((u, v),), (z,) = project(point[None], other)
+        if z > 0 and 0 <= u < other.width and 0 <= v < other.height:
+            a, b = point - camera.center, point - other.center
+            cosines.append(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+    if not cosines:
+        return 0.0
+    angle = np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))
+    return len(cosines) / 48 * np.exp(-0.5 * ((angle - 6) / (3 if angle < 6 else 10)) ** 2)
+
+
+def test_the_scores_of_all_views_at_once_are_those_of_each():
+    rng = np.random.default_rng(0)
+    cameras = []
+    for _ in range(40):
+        eye = rng.uniform(-2, 2, 3) * (1, 1, 0.3)
+        pose = looking(eye, rng.normal((0, 0, 1), 0.3), np.array([0.0, -1, 0]))
+        cameras.append(Camera(*(40, 30) if rng.random() < 0.5 else (30, 40), *rng.uniform(25, 35, 2), 17, 18, pose))
+    scores = view_scores(cameras[0], cameras[1:], 4.0)
+    np.testing.assert_allclose(scores, [score_of(cameras[0], other, 4.0) for other in cameras[1:]], atol=1e-9)
+    assert 0 < np.count_nonzero(scores) < len(scores)
+    assert len(view_scores(cameras[0], [], 4.0)) == 0
 
 
 def test_the_best_views_have_parallax_and_see_the_same():
