@@ -101,7 +101,7 @@ def _state(ended: dict[str, Any] | None, events: list[dict[str, Any]]) -> str:
 
 @dataclass(frozen=True)
 class Why:
-    """Tell why a step ran in the latest run: the first part of its key that had changed, back to the first cause."""
+    """Tell why a step ran in the latest run that got to it: what of its key had changed, back to the first cause."""
 
     step: Annotated[str, tyro.conf.Positional]
     """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
@@ -111,13 +111,21 @@ class Why:
     """Where results are kept."""
 
     def run(self) -> int:
-        run = latest_run(self.store.existing_store(), self.scene)
-        nodes = [e for e in run.events() if e["event"] in ("hit", "finished", "failed", "started")]
-        asked = named(run, nodes, self.step)
+        out = console(json=False)
+        latest, *earlier = runs_to_ask(self.store.existing_store(), self.scene)
+        nodes = _tried(latest)
+        asked = named(latest, nodes, self.step)
         if not asked:
             known = sorted({n["step"] for n in nodes})
-            raise InputError(f"the latest run of {run.scene} has no step {self.step!r}; it has {', '.join(known)}.")
-        out = console(json=False)
+            for run in earlier:
+                nodes = _tried(run)
+                if asked := named(run, nodes, self.step):
+                    started = time.strftime("%F %T", time.localtime(run.header["started"]))
+                    out.print(escape(f"the latest run has no such step; in that of {run.scene}, started {started}:"))
+                    break
+            else:
+                names = ", ".join(known)
+                raise InputError(f"the latest run of {latest.scene} has no step {self.step!r}; it has {names}.")
         computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
         if not computed:
             out.print(f"{asked[0]['step']}: reused; nothing that it depends on changed")
@@ -133,6 +141,11 @@ class Why:
         return 0
 
 
+def _tried(run: Run) -> list[dict[str, Any]]:
+    """What was begun or found, failures too."""
+    return [event for event in run.events() if event["event"] in ("hit", "finished", "failed", "started")]
+
+
 def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     """The nodes of a run that a user may mean: propagate, split.propagate, segment[0003], or a result, as masks."""
     steps = [n for n in nodes if any(t == name or t.endswith(f".{name}") for t in (n["label"], n["step"]))]
@@ -143,15 +156,27 @@ def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, An
 
 
 def run_with(store: Store, scene: Path | None, name: str) -> tuple[Run | None, list[dict[str, Any]]]:
-    """The latest run of a scene, or of the scene that ran last, that has results of this name, and their nodes.
+    """The latest run of a scene, or of any, that has results of this name, and their nodes; see `runs_to_ask`.
 
-    The very last run may have stopped before them (`--until`, an interrupt). (None, []) where no run has them.
+    (None, []) where no run has them.
     """
     with contextlib.suppress(InputError):  # there is no run at all
-        for run in latest_runs(store.runs, latest_run(store, scene).scene):
+        for run in runs_to_ask(store, scene):
             if nodes := named(run, run.nodes(), name):
                 return run, nodes
     return None, []
+
+
+def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
+    """The runs in which to look for a step, in this order: those of the scene; where none is named, of the scene that
+    ran last, and then all others. Each time the latest first.
+
+    The very last run may have stopped before the step (`--until`, an interrupt), or be an edit, which has other steps.
+    Raises InputError when there is no run.
+    """
+    latest = latest_run(store, scene)
+    every = list(latest_runs(store.runs, latest.scene if scene else None))
+    return sorted(every, key=lambda run: run.scene != latest.scene)
 
 
 def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:

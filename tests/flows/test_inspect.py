@@ -49,6 +49,23 @@ def test_why_says_that_nothing_was_known_on_the_first_run(tiny):
     assert one == "split.visibility[0002]: never computed for this scene\n"
 
 
+def test_why_looks_further_back_where_the_latest_run_is_of_something_else(warm):
+    """An edit has other steps than the run that it changed."""
+    run = next(latest_runs(warm.store / "roots/runs"))
+    later = run.folder.with_name("edit")
+    later.mkdir()
+    header = run.header | {"scene": "/edited", "started": run.header["started"] + 60}
+    (later / "run.json").write_text(json.dumps(header))
+    event = {"event": "finished", "label": "edit.begin", "step": "edit.begin", "key": "k", "outputs": [], "inputs": {}}
+    (later / "events.jsonl").write_text(json.dumps(event | {"why": "never computed for this scene", "seconds": 0}))
+    assert ss_flow("why", "edit.begin", "--cache", warm.store).out == "edit.begin: never computed for this scene\n"
+    told = ss_flow("why", "propagate", "--cache", warm.store).out.splitlines()
+    assert told[0].startswith(f"the latest run has no such step; in that of {warm.scene}, started ")
+    assert told[1].startswith("split.propagate: ")
+    assert ss_flow("why", "propagate", "/edited", "--cache", warm.store).code == 2
+    assert ss_flow("cache", "show", "propagate", "--cache", warm.store).code == 0
+
+
 def test_the_graph_is_mermaid_with_a_box_a_step_and_what_feeds_it(tiny):
     lines = ss_flow("graph", "--cache", tiny.store).out.splitlines()
     assert lines[0] == "flowchart TD"
