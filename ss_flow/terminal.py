@@ -79,6 +79,8 @@ class _Step:
     told: int = 0
     """How many were computed when the step was last told of."""
     seconds: float = 0.0
+    begun: float | None = None
+    """When the first of its nodes was."""
     running: dict[str, _Node] = field(default_factory=dict)
     """By label."""
 
@@ -123,6 +125,7 @@ class _Steps(Messages):
             step.known = details["of"]
             if kind == "started":
                 step.running[label] = _Node(time.monotonic())
+                step.begun = step.begun or step.running[label].begun
                 self._step_of[label] = step
             elif kind in ("finished", "failed", "retried"):
                 step.running.pop(label, None)
@@ -226,9 +229,10 @@ def _clock(seconds: float) -> str:
 
 
 class Log(_Steps):
-    """Plain lines, for a file or a pipe: one a step, and now and then one for each node that runs for long.
+    """Plain lines, for a file or a pipe: one a step, and now and then one for what runs for long, steps of many nodes
+    and single nodes.
 
-    every: seconds between two lines of a running node.
+    every: seconds between two lines of the same.
     """
 
     def __init__(self, console: Console, *, every: float = ALIVE_SECONDS) -> None:
@@ -246,12 +250,12 @@ class Log(_Steps):
         while not self._closed.wait(every):
             with self._lock:
                 now = time.monotonic()
-                lines = [
-                    f"{label}{_so_far(node)}, {now - node.begun:.0f} s so far"
-                    for step in self._steps.values()
-                    for label, node in step.running.items()
-                    if now - node.begun >= every
-                ]
+                lines = []
+                for name, step in self._steps.items():
+                    began = {f"{label}{_so_far(node)}": node.begun for label, node in step.running.items()}
+                    if step.known > 1 and step.running and step.begun:
+                        began = {f"{name}, {step.ended} of {step.known}": step.begun} | began
+                    lines += [f"{what}, {now - at:.0f} s so far" for what, at in began.items() if now - at >= every]
             with contextlib.suppress(BrokenPipeError):  # nobody reads any more: the main thread will find out
                 for line in lines:
                     self.say("cyan", "runs", line)

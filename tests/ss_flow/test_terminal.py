@@ -69,6 +69,18 @@ def test_results_that_are_found_again_after_damage_are_not_told_of_again():
     assert seen.lines() == ["done half 1 of 1", "again an object is damaged"]
 
 
+def test_a_step_of_many_short_nodes_says_how_far_it_is():
+    seen = Seen(every=0.1)
+    for item in "0123456789":
+        seen.log.event("started", label=f"quick[{item}]", step="quick", of=20)
+        time.sleep(0.04)
+        seen.log.event("finished", label=f"quick[{item}]", step="quick", of=20, seconds=0.04)
+    lines = seen.lines()
+    told = [line for line in lines if line.startswith("runs")]
+    assert told and all(re.fullmatch(r"runs quick, \d of 20, so far", line) for line in told)
+    assert lines[-1] == "done quick 10 of 20"
+
+
 def test_a_long_node_says_that_it_lives_and_how_far_it_is():
     seen = Seen(every=0.05)
     seen.log.event("started", label="slow[a]", step="slow", of=1)
