@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import signal
+from collections.abc import Iterator
 from types import ModuleType
 
 
@@ -11,7 +14,23 @@ def load_pycolmap() -> ModuleType:
     """The library, quiet but for its errors."""
     import zlib  # noqa: F401 - pycolmap brings a zlib of its own, which breaks Python's when loaded before it
 
-    import pycolmap
+    # Its logging takes SIGTERM for itself, and would end a run that a cluster's queue stops with a native stack trace.
+    with _action_kept(signal.SIGTERM):
+        import pycolmap
 
     pycolmap.logging.minloglevel = 2
     return pycolmap
+
+
+@contextlib.contextmanager
+def _action_kept(number: int) -> Iterator[None]:
+    """What a signal does is in the end what it did before. Unlike Python's `signal`, for any thread."""
+    import ctypes
+
+    libc = ctypes.CDLL(None)
+    action = ctypes.create_string_buffer(1024)  # a struct sigaction, whose size no header tells here; it is below 200
+    libc.sigaction(number, None, action)
+    try:
+        yield
+    finally:
+        libc.sigaction(number, action, None)
