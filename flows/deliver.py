@@ -41,6 +41,7 @@ FALLBACKS = {
     "encoder": "colour words (no network)",
     "monodepth": None,
     "patches": None,
+    "perception": None,
 }
 
 

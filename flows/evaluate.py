@@ -92,15 +92,24 @@ def scan_truth(folder: Path, reference: Reference, *, compat: bool = False) -> T
     )
 
 
-def on_objects(nodes: Nodes) -> dict[str, ObjectViews | Removals]:
+def on_objects(nodes: Nodes, perception: Model | None) -> dict[str, ObjectViews | Removals]:
     """Renderings object by object: of the views that were kept back, where these are annotated, or else of those that
-    were trained on. Raises InputError when neither are."""
+    were trained on.
+
+    perception: the network of LPIPS. Raises InputError when no views are annotated.
+    """
     kept_back = "truth_held_out" in nodes
     if not kept_back and "truth" not in nodes:
         raise InputError("the capture has no annotated views; without them no object is known to measure.")
     end = "_held_out" if kept_back else ""
     return {
-        "views": object_views(nodes[f"ingest{end}"], nodes[f"cameras{end}"], nodes["scene"], nodes[f"truth{end}"]),
+        "views": object_views(
+            nodes[f"ingest{end}"],
+            nodes[f"cameras{end}"],
+            nodes["scene"],
+            nodes[f"truth{end}"],
+            perception=perception,
+        ),
         "removals": removals(nodes["cameras"], nodes["scene"], nodes["masks"]),
     }
 

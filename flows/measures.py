@@ -21,7 +21,9 @@ NAMES: dict[str, tuple[str, ...]] = {
     "metrics_split": tuple(f"split.{name}" for name in _MASKS + _COUNTS),
     "metrics_refined": tuple(f"refined.{name}" for name in _MASKS + _COUNTS),
     "metrics_splat": tuple(f"splat.{name}" for name in _MASKS + _COUNTS),
-    "novel_view": ("novel_view.psnr", "novel_view.ssim", "novel_view.psnr_colour_fitted"),
+    "novel_view": tuple(
+        f"novel_view.{name}" for name in ("psnr", "ssim", "psnr_colour_fitted", "lpips", "lpips_unscaled")
+    ),
     "query": ("query.matched", "query.matched_share", "query.best"),
 }
 """Which figures each step gives."""

@@ -135,6 +135,9 @@ class EvaluateParams:
     zero_is_void: bool | None = None
     """Whether 0 in the ground truth means "not annotated" and does not count, or is background; none = it does not
     count unless the capture's `instances.json` names 0, as that of a generated room does."""
+    lpips: str = "auto"
+    """The network of LPIPS, for renderings of views that were kept back: a name of the catalogue, "auto", or "none" for
+    no LPIPS."""
 
 
 @dataclass(frozen=True)

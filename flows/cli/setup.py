@@ -40,7 +40,7 @@ class ModelsList:
                     "kind": entry.kind,
                     "licence": entry.licence,
                     "about": entry.about,
-                    "source": f"pip:ss-flow[{entry.extra}]" if entry.extra else entry.hub or f"npm:{entry.npm}",
+                    "source": entry.source,
                     "here": where,
                 }
             )
@@ -143,7 +143,7 @@ class Doctor:
             ),
             *(
                 _Check(f"{kind} network", lambda k=kind: _model(k))  # type: ignore[misc]
-                for kind in ("segmenter", "text-image", "monodepth", catalogue.PATCHES)
+                for kind in _WITHOUT
             ),
         ]
         table = Table("what", "state", "what to do", box=None)
@@ -229,6 +229,7 @@ _WITHOUT = {
     "text-image": "none; colour words answer queries instead",
     "monodepth": "none; depth comes from the sensor or from several views",
     catalogue.PATCHES: "none; a segmenter can give vectors of single Gaussians instead",
+    catalogue.DISTANCES: "none; LPIPS is not measured",
 }
 
 
@@ -236,4 +237,4 @@ def _model(kind: str) -> tuple[str, str]:
     if here := catalogue.available(kind):
         return ", ".join(entry.name for entry in here), ""
     known = next(entry for entry in catalogue.load_catalogue().values() if entry.kind == kind and not entry.on_request)
-    return _WITHOUT[kind], f"if you want one: ss-flow models fetch {known.name}"
+    return _WITHOUT[kind], f"if you want one: {known.commands}"

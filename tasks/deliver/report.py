@@ -32,6 +32,8 @@ _METRIC_NAMES = {
     "psnr": "PSNR",
     "psnr_colour_fitted": "PSNR, colours fitted to each view",
     "ssim": "SSIM",
+    "lpips": "LPIPS (VGG)",
+    "lpips_unscaled": "LPIPS (VGG) of pictures 0..1, as in 3DGS",
     "ap": "AP",
     "ap50": "AP @ 0.5",
     "ap25": "AP @ 0.25",
@@ -182,6 +184,8 @@ def _metrics(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
             if stage in _BY_STAGE:
                 continue
             figures = [(_words(name), _figure(name, value)) for name, value in values.items()]
+            if stage == "novel_view" and "lpips" not in values:
+                figures.append((_words("lpips"), "not measured (no network)"))
             groups.append({"stage": _STAGES.get(stage) or _words(stage), "figures": figures})
         else:
             loose.append((_words(stage), _figure(stage, values)))

@@ -11,13 +11,15 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Frame, Gaussians, Int32, LabelMap
-from ss_flow.tasks.evaluate.novel_view import psnr, ssim, to_8bit
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, Gaussians, Int32, LabelMap, UInt8
+from ss_flow.tasks.evaluate.novel_view import identity, perceived, psnr, ssim, to_8bit
 from ss_flow.tasks.evaluate.objects import change_elsewhere
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.masks.packing import bounds
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.lpips import distance
 
 _BAND = 5
 """Pixels on either side of an instance's border."""
@@ -37,9 +39,12 @@ class ObjectViews:
     """[G] dB in the box around the instance's true mask."""
     ssim: Float64
     """[G] in the same box."""
+    lpips: Float64
+    """[G] in the same box, of features of the whole view; NaN without a network for it."""
     whole_psnr: float
     """dB over whole views."""
     whole_ssim: float
+    whole_lpips: float
     band_psnr: float
     """dB within 5 pixels of the borders of true instances."""
 
@@ -54,41 +59,53 @@ class Removals:
     """[L] mean absolute difference of colour, 0..1, outside the instance's mask; 0 for a clean object."""
 
 
-@task(name="evaluate.object_views", resources=Resources(cores=1, gpus=0.1), environment=backend_identity)
-def object_views(frames: Sequence[Frame], cameras: Cameras, scene: Gaussians, truth: Sequence[LabelMap]) -> ObjectViews:
+@task(name="evaluate.object_views", resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=identity)
+def object_views(
+    frames: Sequence[Frame],
+    cameras: Cameras,
+    scene: Gaussians,
+    truth: Sequence[LabelMap],
+    *,
+    perception: Model | None = None,
+) -> ObjectViews:
     """Render the annotated views and compare them with their photos, box by box.
 
-    frames, cameras: the views, those without ground truth among them. truth: true ids, 0 = none.
+    frames, cameras: the views, those without ground truth among them. truth: true ids, 0 = none. perception: the
+    network of LPIPS.
     Pixels that a frame's `valid` mask excludes do not count. Raises InputError when no view shows an instance.
     """
     from ss_flow.tasks.gaussians.render import render
 
     row_of = {name: row for row, name in enumerate(cameras.names)}
-    boxes: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    boxes: dict[int, list[tuple[float, float, float]]] = defaultdict(list)
     whole, bands = [], []
     for done, ids in enumerate(truth):
         frame = frames[row_of[ids.name]]
         valid, photo = decode_valid(frame), decode_rgb(frame)
         camera = camera_of(cameras, row_of[ids.name]).scaled(frame.width, frame.height)
         image = to_8bit(render(scene, camera).rgb)
-        whole.append((psnr(image, photo, valid), ssim(image, photo, valid)))
+        differences = None if perception is None else perceived(image, photo, valid, perception)
+        whole.append(_compared(image, photo, valid, differences))
         band = border_band(ids.ids) & valid
         if band.any():
             bands.append(psnr(image, photo, band))
         for instance in np.unique(ids.ids[valid & (ids.ids > 0)]).tolist():
             inside = _box(ids.ids == instance) & valid
-            boxes[instance].append((psnr(image, photo, inside), ssim(image, photo, inside)))
+            boxes[instance].append(_compared(image, photo, inside, differences))
         progress(done + 1, len(truth), ids.name)
     if not boxes:
         raise InputError("The annotated views show no instance; at least one is needed to compare objects.")
     means = np.array([np.mean(boxes[i], axis=0) for i in sorted(boxes)])
+    whole_psnr, whole_ssim, whole_lpips = np.mean(whole, axis=0).tolist()
     return ObjectViews(
         np.array(sorted(boxes), np.int32),
         np.array([len(boxes[i]) for i in sorted(boxes)], np.int32),
         means[:, 0],
         means[:, 1],
-        float(np.mean([decibels for decibels, _ in whole])),
-        float(np.mean([similarity for _, similarity in whole])),
+        means[:, 2],
+        whole_psnr,
+        whole_ssim,
+        whole_lpips,
         float(np.mean(bands)) if bands else float("nan"),
     )
 
@@ -120,6 +137,14 @@ def border_band(ids: np.ndarray) -> Bool:
 
     window = np.ones((2 * _BAND + 1,) * 2, np.uint8)
     return np.asarray(cv2.erode(ids, window) != cv2.dilate(ids, window))
+
+
+def _compared(
+    image: UInt8, photo: UInt8, inside: Bool, differences: tuple[Float32, ...] | None
+) -> tuple[float, float, float]:
+    """PSNR, SSIM and LPIPS of the pixels inside."""
+    perceptual = float("nan") if differences is None else distance(differences, inside)
+    return psnr(image, photo, inside), ssim(image, photo, inside), perceptual
 
 
 def _box(mask: Bool) -> Bool:

@@ -11,6 +11,9 @@ from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, Gaus
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.lpips import distance, lpips_of
+from ss_flow.tasks.models.onnx import network_identity
 
 _SIGMA = 1.5
 _RADIUS = 5
@@ -19,21 +22,26 @@ _PSNR_OF_EQUALS = 100.0
 """dB given where two images agree exactly, so that a mean over views stays finite."""
 
 
-@task(
-    resources=Resources(cores=1, gpus=0.1),
-    environment=backend_identity,
-)
+def identity() -> dict[str, str]:
+    """What comparing renderings with photos depends on besides its inputs."""
+    return network_identity() | backend_identity()
+
+
+@task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=identity)
 def novel_view(
     frames_held_out: tuple[Frame, ...],
     cameras_held_out: Cameras,
     scene: Gaussians,
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    perception: Model | None = None,
 ) -> Metrics:
     """Render the scene from the held-out cameras and compare with the photos, as 8-bit images.
 
-    background: colour where nothing is, 0..1. Pixels that a frame's `valid` mask excludes count in neither measure.
-    Returns psnr (dB) and ssim, and psnr_colour_fitted, the PSNR after `colour_fitted`, each the mean over the views.
+    background: colour where nothing is, 0..1. perception: the network of LPIPS. Pixels that a frame's `valid` mask
+    excludes count in no measure.
+    Returns psnr (dB) and ssim, and psnr_colour_fitted, the PSNR after `colour_fitted`; with a network lpips, and
+    lpips_unscaled, that of pictures 0..1 (see `Lpips.differences`); each the mean over the views.
     Raises InputError when there is no view, when frames and cameras do not belong together, or when a view has no valid
     pixel.
     """
@@ -44,7 +52,7 @@ def novel_view(
         raise InputError("There is no held-out view; at least one is needed to evaluate novel views.")
     if names != cameras_held_out.names:
         raise InputError("The held-out frames and cameras are not the same views in the same order.")
-    values = []
+    found: list[dict[str, float]] = []
     for view, frame in enumerate(frames_held_out):
         valid = decode_valid(frame)
         if not valid.any():
@@ -52,10 +60,18 @@ def novel_view(
         camera = camera_of(cameras_held_out, view).scaled(frame.width, frame.height)
         rgb, photo = render(scene, camera, background=background).rgb, decode_rgb(frame)
         image, fitted = to_8bit(rgb), to_8bit(colour_fitted(np.clip(rgb, 0, 1), photo, valid))
-        values.append((psnr(image, photo, valid), ssim(image, photo, valid), psnr(fitted, photo, valid)))
+        found.append(
+            {
+                "psnr": psnr(image, photo, valid),
+                "ssim": ssim(image, photo, valid),
+                "psnr_colour_fitted": psnr(fitted, photo, valid),
+            }
+        )
+        if perception is not None:
+            for name, lowest in (("lpips", -1.0), ("lpips_unscaled", 0.0)):
+                found[-1][name] = distance(perceived(image, photo, valid, perception, lowest=lowest), valid)
         progress(view + 1, len(names), frame.name)
-    mean = np.mean(values, axis=0)
-    return Metrics(dict(zip(("psnr", "ssim", "psnr_colour_fitted"), map(float, mean), strict=True)))
+    return Metrics({name: float(np.mean([values[name] for values in found])) for name in found[0]})
 
 
 def colour_fitted(image: Float32, photo: UInt8, valid: Bool) -> Float32:
@@ -101,6 +117,16 @@ def ssim(image: UInt8, reference: UInt8, valid: Bool | None = None) -> float:
     similarity = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
     similarity /= (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
     return float(similarity.mean() if valid is None else similarity[valid].mean())
+
+
+def perceived(
+    image: UInt8, reference: UInt8, valid: Bool, perception: Model, *, lowest: float = -1.0
+) -> tuple[Float32, ...]:
+    """Where two pictures look different, as `Lpips.differences`; what is not valid agrees by definition, as for `ssim`.
+
+    image, reference: [H, W, 3]; valid: [H, W]. Raises InputError when the pictures are too small for the network.
+    """
+    return lpips_of(perception).differences(np.where(valid[..., None], image, reference), reference, lowest=lowest)
 
 
 def _blurred(image: Float64) -> Float64:

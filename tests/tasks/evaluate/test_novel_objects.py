@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_networks import narrow_lpips
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, Frame, Gaussians, LabelMap
@@ -57,6 +58,18 @@ def test_an_error_in_one_box_is_that_objects_alone() -> None:
     assert found.psnr.tolist() == pytest.approx([100, -10 * np.log10(error.mean())])
     assert found.ssim[0] == pytest.approx(1) and found.ssim[1] < 0.9
     assert found.psnr[1] < found.whole_psnr < 100
+
+
+def test_lpips_of_an_object_is_that_of_its_box(tmp_path) -> None:
+    model, photo = narrow_lpips(tmp_path), SEEN.copy()
+    photo[14:34, 40:56] = SEEN[14:34, 40:56] // 2
+    found = object_views((_frame(photo),), CAMERAS, SCENE, (TRUTH,), perception=model)
+    assert found.lpips[1] > found.whole_lpips > found.lpips[0] >= 0
+    same = object_views((_frame(SEEN),), CAMERAS, SCENE, (TRUTH,), perception=model)
+    assert same.lpips.tolist() == [0, 0] and same.whole_lpips == 0
+    without = object_views((_frame(photo),), CAMERAS, SCENE, (TRUTH,))
+    assert np.isnan(without.lpips).all() and np.isnan(without.whole_lpips)
+    assert without.psnr.tolist() == found.psnr.tolist()
 
 
 def test_the_band_is_five_pixels_on_either_side_of_a_border() -> None:

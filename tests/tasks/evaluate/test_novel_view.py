@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import pathlib
 import sys
 import types
 from typing import Any
 
 import numpy as np
 import pytest
+from random_networks import narrow_lpips
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, Frame, Gaussians
 from ss_flow.tasks.evaluate.novel_view import colour_fitted, novel_view, psnr, ssim, to_8bit
 from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.models.lpips import Lpips, distance
 
 _RNG = np.random.default_rng(0)
 PHOTO = _RNG.integers(0, 256, (20, 24, 3), dtype=np.uint8)
@@ -126,6 +129,26 @@ def test_the_valid_mask_of_a_frame_counts(rendered: list[Any]) -> None:
     image = to_8bit(np.float32(PHOTO * 0.9) / 255)
     assert values["psnr"] == pytest.approx(psnr(image, PHOTO, valid))
     assert values["psnr"] > psnr(image, PHOTO) + 1
+
+
+def test_lpips_is_measured_with_a_network_and_on_valid_pixels_alone(
+    rendered: list[Any], tmp_path: pathlib.Path
+) -> None:
+    model = narrow_lpips(tmp_path)
+    views = (_frame("a"),), _cameras("a"), _gaussians()
+    assert not any(name.startswith("lpips") for name in novel_view(*views).values)
+    rendered.clear()
+    values = novel_view(*views, perception=model).values
+    image, network = to_8bit(np.float32(PHOTO * 0.9) / 255), Lpips(model)
+    assert values["lpips"] == pytest.approx(distance(network.differences(image, PHOTO)))
+    assert values["lpips_unscaled"] == pytest.approx(distance(network.differences(image, PHOTO, lowest=0.0)))
+    assert values["lpips"] > 0 and values["lpips"] != values["lpips_unscaled"]
+    rendered.clear()
+    valid = np.zeros((20, 24), bool)
+    valid[:, :12] = True
+    masked = novel_view((_frame("a", valid),), _cameras("a"), _gaussians(), perception=model).values
+    half = np.where(valid[..., None], image, PHOTO)
+    assert masked["lpips"] == pytest.approx(distance(network.differences(half, PHOTO), valid))
 
 
 def test_an_affine_change_of_colours_is_fitted_away(rendered: list[Any]) -> None:

