@@ -58,6 +58,8 @@ class Capture:
     """Names of the views where they are known beforehand."""
     clicks: tuple[Clicks, ...] | None = None
     """Where its user pointed at objects."""
+    corrections: tuple[Clicks, ...] | None = None
+    """Where its user pointed at what Split is to join or to part."""
     objects: tuple[str, ...] = ()
     """What the user calls these objects."""
     registration: Registration | None = None
@@ -100,13 +102,15 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         frames = registered(frames, cameras)
     names = _known_names(scene)
     known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
-    masks = truth = pointed = None
+    masks = truth = pointed = corrected = None
     if scene.ready_masks is not None:
         masks = ready_masks(frames, cameras, files=all_of(reference, scene.ready_masks), **known)
     elif scene.coco_masks is not None:
         masks = coco_masks(frames, cameras, file=reference(scene.coco_masks), **known)
     elif scene.hints is not None:
         pointed = clicks(frames, cameras, hints=scene.hints, **known)
+    if scene.corrections is not None:
+        corrected = clicks(frames, cameras, hints=scene.corrections, **known)
     if scene.ground_truth is not None:
         truth = ground_truth(frames, cameras, files=all_of(reference, scene.ground_truth), **known)
     given: Gaussians | None = None
@@ -144,6 +148,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         truth=truth,
         names=names,
         clicks=pointed,
+        corrections=corrected,
         objects=objects,
         registration=placing,
         colours=evened,

@@ -24,6 +24,7 @@ from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.appearances import appearances
+from ss_flow.tasks.split.correct import correct, part_masks
 from ss_flow.tasks.split.cut import cut, cut_parts
 from ss_flow.tasks.split.dense import dense
 from ss_flow.tasks.split.dense_splatting import dense_splatting
@@ -64,7 +65,7 @@ class Split:
     """The leaves of the tree."""
     tree: Hierarchy
     labels: PointLabels
-    """The instances, which the cut through the tree leaves."""
+    """The instances, which the cut through the tree leaves, as the user corrected them."""
     parts: PointParts
     instances: tuple[InstanceMasks, ...]
     """The background first."""
@@ -127,14 +128,28 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
     tree = hierarchy(points, capture.cameras, pieces, counted, params=params.hierarchy)
     labels = cut(pieces, tree, granularity=granularity)
-    parts = cut_parts(pieces, find_parts(observed, masks, pieces, params=params.parts), labels)
+    shown = masks
+    nested = find_parts(observed, masks, pieces, params=params.parts)
+    if capture.corrections is not None:
+        clicked: list[PointLabels] = []
+        if segmenter is not None:
+            clicked = [_clicked(capture, capture.corrections, embeddings, points, seen, segmenter, params)[1]]
+        joined, labels = labels, correct(points, seen, capture.corrections, pieces, labels, clicked)
+        contained = params.segment.contained
+        shown = each(
+            seen,
+            masks,
+            names=capture.names,
+            build=lambda visible, pool: part_masks(visible, pool, joined, labels, contained=contained),
+        )
+    parts = cut_parts(pieces, nested, labels)
     prompted: tuple[PromptedMasks, ...] = ()
     if segmenter is not None and capture.masks is None:
         prompted = each(
             capture.frames,
             embeddings,
             seen,
-            masks,
+            shown,
             names=capture.names,
             build=lambda frame, embedding, visible, pool: reprompt(
                 EmbeddedPhoto(frame, embedding),
@@ -146,7 +161,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
                 selection=params.reproject.selection,
             ),
         )
-    instances = reproject(points, seen, masks, labels, parts, prompted, params=params.reproject)
+    instances = reproject(points, seen, shown, labels, parts, prompted, params=params.reproject)
     seen_in = appearances(labels, seen)
     return Split(points, seen, masks, pieces, tree, labels, parts, instances, seen_in, embeddings, hinted)
 
@@ -165,16 +180,7 @@ def _masks_of_hints(
         raise InputError(
             "hints need a segmenter to be prompted with, and there is none; `ss-flow models list` names some."
         )
-    clicked = each(
-        capture.frames,
-        embeddings,
-        clicks,
-        names=capture.names,
-        build=lambda frame, embedding, own: hints.clicked(
-            EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter
-        ),
-    )
-    hinted = hints.label(points, seen, clicked, erosion=params.observe.erosion, tau_label=params.propagate.tau_label)
+    clicked, hinted = _clicked(capture, clicks, embeddings, points, seen, segmenter, params)
     masks = each(
         capture.frames,
         embeddings,
@@ -192,3 +198,26 @@ def _masks_of_hints(
         ),
     )
     return masks, hinted
+
+
+def _clicked(
+    capture: Capture,
+    clicks: tuple[Clicks, ...],
+    embeddings: tuple[Embedding, ...],
+    points: PointCloud,
+    seen: tuple[Visibility, ...],
+    segmenter: Model,
+    params: SplitParams,
+) -> tuple[tuple[PromptedMasks, ...], PointLabels]:
+    """The masks that clicks ask for in their own views, and the points labelled by what was clicked."""
+    clicked = each(
+        capture.frames,
+        embeddings,
+        clicks,
+        names=capture.names,
+        build=lambda frame, embedding, own: hints.clicked(
+            EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter
+        ),
+    )
+    erosion, tau_label = params.observe.erosion, params.propagate.tau_label
+    return clicked, hints.label(points, seen, clicked, erosion=erosion, tau_label=tau_label)

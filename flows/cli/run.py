@@ -43,6 +43,9 @@ class Run:
     COCO file (.json)."""
     hints: OptionalPath = None
     """A file (.json) of a few points clicked on objects in a few views; the segmenter looks for these objects only."""
+    correct: OptionalPath = None
+    """A file (.json) of points clicked on what an earlier run joined or broke, as the viewer saves it: what holds
+    points of one thing becomes one instance, what holds points of several is divided; all else stays."""
     calibrate: Literal["none", "depth"] = "none"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
     refine_poses: bool = False
@@ -59,7 +62,7 @@ class Run:
         if self.refine_poses:
             params = settings.apply(params, ["capture.refine_poses=true"])
         out = self.out or Path("ss-flow-out") / self.capture.resolve().stem
-        scene = open_scene(self.capture, self.masks, self.hints)
+        scene = open_scene(self.capture, self.masks, self.hints, self.correct)
         if self.scene is not None:
             read_columns(self.scene)  # what is no PLY is refused before anything is computed
             if scene.poses is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import time
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -30,6 +31,9 @@ class View:
     or the first characters of a digest."""
     script: OptionalPath = None
     """The edit script to go on with and to save; by default NAME.edit.json beside the output folder."""
+    correct: OptionalPath = None
+    """The file that points picked on joined or broken things are saved to, for `ss-flow run --correct`; by default
+    NAME.hints.json beside the output folder. What it holds is gone on with."""
     beside: OptionalPath = None
     """The output folder of another run of the same capture, to stand to the right of this one in the time line."""
     html: OptionalPath = None
@@ -58,9 +62,9 @@ class View:
 
     def _artifact(self) -> int:
         """One cached result, the way that suits it."""
-        if self.rerun or self.beside or self.script:
+        if self.rerun or self.beside or self.script or self.correct:
             raise InputError(
-                f"--rerun, --beside and --script take the output folder of a run, and {self.what} is none."
+                f"--rerun, --beside, --script and --correct take the output folder of a run, and {self.what} is none."
             )
         from ss_flow.flows.cli.inspect import results_named
         from ss_flow.flows.describe import maker, told
@@ -113,6 +117,7 @@ class View:
         edit = document.get("edit")
         run = open_run(Path(edit["source"]) if edit else folder, self.store, ("scene", "cameras"))
         script = self.script or folder.resolve().with_name(f"{folder.resolve().name}.edit.json")
+        hints = self.correct or run.folder.resolve().with_name(f"{run.name}.hints.json")
         operations = edit["script"]["operations"] if edit else []
         if script.is_file():
             operations = read_operations(script)
@@ -123,11 +128,13 @@ class View:
             search = None
             out.print(f"The search box stays empty: {escape(str(error))}")
         beside = open_run(self.beside, self.store, ("scene",)) if self.beside else None
-        viewer = Viewer(run, script, operations, search, host=self.host, port=self.port)
+        viewer = Viewer(run, script, operations, search, hints, host=self.host, port=self.port)
         viewer.add_timeline(beside)
         out.print(
             f"{viewer.address}\nCtrl-C ends it. Edits are saved in {escape(str(script))} ({len(operations)} so far)."
         )
+        again = shlex.join(["ss-flow", "run", run.document["scene"], "--correct", str(hints), "--out", str(run.folder)])
+        out.print(f"Corrections are made by: {escape(again)}, and the run's other options.")
         try:
             with contextlib.suppress(KeyboardInterrupt):
                 viewer.load_pictures()

@@ -12,6 +12,8 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.flows.results import BACKGROUND
+from ss_flow.flows.view.correcting import Correcting
+from ss_flow.flows.view.corrections import Corrections
 from ss_flow.flows.view.nodes import SceneNodes
 from ss_flow.flows.view.object_list import ObjectList
 from ss_flow.flows.view.picking import Picker, pixel_met
@@ -38,8 +40,16 @@ class Panel:
     viser calls from many threads; one lock lets one of them change the session at a time.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session, script: Path, search: Search | None) -> None:
-        """script: the file that the edit script is saved to. search: None where a run cannot be searched."""
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        script: Path,
+        search: Search | None,
+        corrections: Callable[[], Corrections] | None = None,
+    ) -> None:
+        """script: the file that the edit script is saved to. search: None where a run cannot be searched. corrections:
+        opens those of the run; None where it cannot be run again."""
         self._server, self.session, self._script = server, session, script
         self.nodes = SceneNodes(server)
         self.lock = threading.RLock()
@@ -52,6 +62,11 @@ class Panel:
         self._told = gui.add_html("")
         self.several = gui.add_checkbox("Select several", False, hint="Shift and a click in the scene does the same")
         self._build_actions(gui)
+        self.correcting: Correcting | None = None
+        if corrections is not None:
+            self.correcting = Correcting(server, corrections)
+            self.correcting.box.on_update(lambda event: self._attempt(event.client, lambda: None))
+            self._group(gui, "Points", self._corrections_actions(self.correcting))
         self._colors = gui.add_dropdown("Colours", ("photos", "objects"))
         self._colors.on_update(lambda event: self._attempt(event.client, lambda: None))
         server.scene.on_click()(lambda event: self._clicked(event, more=False))
@@ -71,6 +86,8 @@ class Panel:
             self.nodes.show(pieces, session.visible(), session.selected, self._colors.value)  # type: ignore[arg-type]
             self.objects.show()
             self._told.content = self._selection_html()
+            if self.correcting is not None:
+                self.correcting.show()
             if self._is_moving and (solid := self._solid()):
                 self.nodes.hold(solid, session.center(solid), self._moved)
 
@@ -112,6 +129,13 @@ class Panel:
             "Redo": lambda _: session.redo(),
             "Save": self._save,
             "Select nothing": lambda _: session.select(None),
+        }
+
+    def _corrections_actions(self, correcting: Correcting) -> dict[str, Callable[[Client], None]]:
+        return {
+            "Next thing": lambda _: correcting.corrections.next_thing(),
+            "Undo point": lambda _: correcting.corrections.undo(),
+            "Save hints": lambda client: self._save_corrections(correcting.corrections, client),
         }
 
     def _on_key(self, command: viser.CommandHandle, act: Callable[[Client], None]) -> None:
@@ -199,6 +223,16 @@ class Panel:
         count = len(script["operations"])
         self._tell(client, "Saved", f"{count} operations in {self._script.name}", color="teal")
 
+    def _correct(self, correcting: Correcting, met: tuple[int, Float64] | None) -> None:
+        if self.session.state.done:  # what was edited no longer stands where the photos show it
+            raise InputError("corrections are clicked on the run as it is; undo the edits first.")
+        correcting.corrections.pick(*(met or (BACKGROUND, np.zeros(3))))
+
+    def _save_corrections(self, corrections: Corrections, client: Client) -> None:
+        corrections.save()
+        body = f"{len(corrections.picks)} points in {corrections.file.name}; the command stands in the terminal"
+        self._tell(client, "Saved", body, color="teal")
+
     def _chosen(self, instances: tuple[int, ...]) -> None:
         """Picked from the list."""
         with self.lock:
@@ -217,8 +251,12 @@ class Panel:
         size = camera.image_width, camera.image_height
         pixel = pixel_met(np.array(event.ray_origin), direction, camera.wxyz, float(focal), size)
         with self.lock:
-            found = self.pick().instance_at(pixel) if pixel is not None else None
-            self.session.select(found or None, more=more or self.several.value)
+            met = self.pick().met(pixel) if pixel is not None else None
+            if self.correcting is not None and self.correcting.box.value:
+                correcting = self.correcting
+                self._attempt(event.client, lambda: self._correct(correcting, met))
+                return
+            self.session.select((met[0] or None) if met else None, more=more or self.several.value)
             self.refresh()
 
     def pick(self) -> Picker:

@@ -34,11 +34,21 @@ class Picker:
 
         pixel: the picture's camera, cropped to the one pixel: what is drawn in it does not depend on the others.
         """
+        met = self.met(pixel)
+        return None if met is None else met[0]
+
+    def met(self, pixel: Camera) -> tuple[int, Float64] | None:
+        """The same, and the place [3] on the ray, world, that is as deep as the middle of this Gaussian."""
         if self._scene is None:
             return None
         near = some_rows(self._scene, self._rows_near(pixel))
         row = int(render(near, pixel).top_contributor[0, 0])
-        return None if row < 0 else int(near.instance_id[row])
+        if row < 0:
+            return None
+        turn = pixel.world_to_camera[:3, :3]
+        depth = turn[2] @ near.means[row] + pixel.world_to_camera[2, 3]
+        ray = np.array([(0.5 - pixel.cx) / pixel.fx, (0.5 - pixel.cy) / pixel.fy, 1.0])
+        return int(near.instance_id[row]), pixel.center + depth * (ray @ turn)
 
     def _rows_near(self, pixel: Camera) -> NDArray[np.intp]:
         """The rows that may reach the pixel: all others are spared the rendering.

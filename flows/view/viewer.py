@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from ss_flow.flows.results import FinishedRun
 from ss_flow.flows.view.camera_views import CameraViews
+from ss_flow.flows.view.corrections import Corrections
 from ss_flow.flows.view.drawing import look_from, start_view
 from ss_flow.flows.view.panel import Panel
 from ss_flow.flows.view.search import Search
@@ -24,12 +26,14 @@ class Viewer:
         script: Path,
         operations: Sequence[Operation] = (),
         search: Search | None = None,
+        hints: Path | None = None,
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
     ) -> None:
         """run: with the results "scene" and "cameras". script: the file to save to. operations: those to begin with.
-        search: None where the run cannot be searched. host, port: where to listen.
+        search: None where the run cannot be searched. hints: the file that corrections are saved to; None = none are
+        picked. host, port: where to listen.
 
         Raises InputError for an operation that is refused, and when it cannot listen there.
         """
@@ -38,7 +42,8 @@ class Viewer:
         self._run = run
         self.server, self.address = start(host, port, run.name)
         look_from(self.server, start_view(cameras, scene.means))
-        self.panel = Panel(self.server, session, script, search)
+        corrections = None if hints is None else partial(Corrections, run, hints)
+        self.panel = Panel(self.server, session, script, search, corrections)
         self.cameras = CameraViews(self.server, cameras, run.results)
 
     def add_timeline(self, beside: FinishedRun | None = None) -> None:

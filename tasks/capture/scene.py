@@ -29,12 +29,15 @@ ACCEPTED = (
 _MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff"})
 
 
-def open_scene(path: Path, masks: Path | None = None, hints: Path | None = None) -> SceneFiles:
+def open_scene(
+    path: Path, masks: Path | None = None, hints: Path | None = None, corrections: Path | None = None
+) -> SceneFiles:
     """The files of a capture, whatever its layout.
 
     path: a folder, a video, a `.sens` file or a `transforms.json`.
     masks: a folder of ready-made instance masks, one image of ids a view, named by the view's stem, or a COCO file.
-    hints: a file of points clicked on objects, in the place of masks.
+    hints: a file of points clicked on objects, in the place of masks. corrections: one of points clicked on what was
+    joined or broken, beside any masks.
         By default, `instance_masks/`, `instance_masks.json` or `hints.json` in the scene's folder, where one exists.
         Likewise `instance/` is ground truth, of which every pixel is annotated where `instances.json` (id -> name)
         names 0; and `valid/` (or what the layout itself lists) holds masks that are 0
@@ -50,10 +53,10 @@ def open_scene(path: Path, masks: Path | None = None, hints: Path | None = None)
         raise InputError(f"{masks} and {hints} cannot be used together; give masks or hints.")
     if masks is None and hints is None and in_folder:
         masks, hints = _found_masks(path)
-    if scene.kind == "video" and (masks or hints):
-        raise InputError(
-            f"{masks or hints} cannot go with a video, whose frames have no names yet; extract the frames first."
-        )
+    if scene.kind == "video" and (given := masks or hints or corrections):
+        raise InputError(f"{given} cannot go with a video, whose frames have no names yet; extract the frames first.")
+    if corrections is not None:
+        scene = replace(scene, corrections=read_hints(corrections, scene.names))
     if hints is not None:
         scene = replace(scene, hints=read_hints(hints, scene.names))
     elif masks is not None and masks.is_dir():

@@ -88,6 +88,8 @@ class SceneFiles:
     """The same for all views in one COCO file."""
     hints: Hints | None = None
     """Points clicked on objects, at which the segmenter is to be prompted."""
+    corrections: Hints | None = None
+    """Points clicked on what Split is to join or to part."""
     given_scene: Path | None = None
     """A PLY file of Gaussians that were trained elsewhere, to be labelled in the place of a reconstruction."""
     ground_truth: tuple[Path | None, ...] | None = None

@@ -1,0 +1,135 @@
+"""Instances corrected by points that were clicked on things."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_scene import row_of_points
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ss_flow.tasks.artifacts import Clicks, PointCloud, PointLabels, Visibility
+from ss_flow.tasks.split.correct import clicked_points, correct
+
+SIDE = 12
+GREY, RED = (120, 120, 120), (200, 40, 40)
+
+
+def sheet(*halves: tuple[int, int, int]) -> PointCloud:
+    """A square of points, its left half in the first colour, its right half in the last."""
+    v, u = np.divmod(np.arange(SIDE * SIDE), SIDE)
+    colors = np.where((u < SIDE // 2)[:, None], halves[0], halves[-1])
+    points = np.stack([u, v, np.zeros(SIDE * SIDE)], axis=1)
+    return PointCloud(points.astype(np.float32), colors.astype(np.uint8), 1.0, 1.0)
+
+
+def view() -> Visibility:
+    """One that sees each point of the sheet at a pixel of its own."""
+    every = np.arange(SIDE * SIDE, dtype=np.int32)
+    return Visibility("0", every, every, np.ones(len(every), np.float32), SIDE, SIDE)
+
+
+def left() -> np.ndarray:
+    return np.arange(SIDE * SIDE) % SIDE < SIDE // 2
+
+
+def labelled(label: np.ndarray, confidence: float = 1.0, num_labels: int = 9) -> PointLabels:
+    """With one mask matched to label 1, and one to label 2."""
+    mask = np.array([0, 1], np.int32)
+    share = np.full(len(label), confidence, np.float32)
+    return PointLabels(label.astype(np.int32), share, num_labels, 0 * mask, mask, mask + 1, np.ones(2, np.float32))
+
+
+def clicks(*points: tuple[int, float, float]) -> Clicks:
+    """Points of things: number, x, y."""
+    things, xs, ys = (np.array(column) for column in zip(*points, strict=True))
+    return Clicks(
+        "0", things.astype(np.int32), np.stack([xs, ys], axis=1).astype(float), np.ones(len(things), np.int32)
+    )
+
+
+def corrected(cloud: PointCloud, labels: PointLabels, clicked: Clicks, *, pieces=None, masks=()) -> PointLabels:
+    return correct(cloud, (view(),), (clicked,), labels if pieces is None else pieces, labels, masks)
+
+
+ONE = labelled(np.ones(SIDE * SIDE))
+BOTH = clicks((1, 1.5, 6.5), (2, 10.5, 2.5))
+"""A point on the left half and one on the right."""
+
+
+def test_instances_with_points_of_one_thing_become_one_and_others_stay():
+    label = np.where(left(), 1, 2)
+    label[-5:] = 3
+    found = corrected(sheet(GREY), labelled(label), clicks((1, 1.5, 1.5), (1, 10.5, 1.5)))
+    assert found.label.tolist() == np.where(label < 3, 10, 3).tolist()
+    assert found.num_labels == 10 and found.match_label.tolist() == [10, 10]
+
+
+def test_an_instance_is_divided_where_its_colour_changes():
+    found = corrected(sheet(GREY, RED), ONE, BOTH)
+    assert (found.label == np.where(left(), 10, 11)).all()
+    assert found.match_label.tolist() == [2]  # the mask of what is divided shows no single thing
+
+
+def test_an_instance_of_one_colour_is_divided_where_its_pieces_meet():
+    pieces = labelled(np.where(np.arange(SIDE * SIDE) % SIDE < 4, 5, 6))
+    found = corrected(sheet(GREY), ONE, BOTH, pieces=pieces)
+    assert (found.label == np.where(pieces.label == 5, 10, 11)).all()
+
+
+def test_an_instance_of_one_colour_and_piece_is_divided_where_the_clicked_masks_say():
+    masks = labelled(np.where(np.arange(SIDE * SIDE) % SIDE < 3, 1, 2), 0.9, num_labels=2)
+    found = corrected(sheet(GREY), ONE, BOTH, masks=(masks,))
+    assert (found.label == np.where(masks.label == 1, 10, 11)).all()
+
+
+def test_a_click_counts_for_more_than_the_mask_of_another_thing():
+    wrong = labelled(np.ones(SIDE * SIDE), num_labels=1)
+    found = corrected(sheet(GREY, RED), ONE, BOTH, masks=(wrong,))
+    assert found.label[2 * SIDE + 10] == 11 and found.label[6 * SIDE + 1] == 10
+
+
+def test_what_hangs_together_with_no_click_goes_by_its_colour():
+    cloud = sheet(GREY, RED)
+    cloud.points[SIDE * 6 :, 2] = 500  # the lower half, on which nobody clicks
+    found = corrected(cloud, ONE, clicks((1, 1.5, 1.5), (2, 10.5, 1.5)))
+    assert (found.label == np.where(left(), 10, 11)).all()
+
+
+def test_two_parts_of_divided_instances_can_become_one_thing():
+    label = np.where(np.arange(SIDE * SIDE) < SIDE * 6, 1, 2)
+    all_four = clicks((1, 1.5, 1.5), (1, 1.5, 10.5), (2, 10.5, 1.5), (3, 10.5, 10.5))
+    found = corrected(sheet(GREY, RED), labelled(label), all_four)
+    assert (found.label == np.where(left(), 10, np.where(label == 1, 11, 12))).all()
+
+
+def test_a_thing_that_is_right_keeps_its_id():
+    found = corrected(sheet(GREY), labelled(np.where(left(), 1, 2)), clicks((1, 1.5, 1.5), (2, 10.5, 1.5)))
+    assert found.label.tolist() == np.where(left(), 1, 2).tolist() and found.num_labels == 9
+
+
+@given(st.permutations([(1, 1.5, 6.5), (1, 3.5, 2.5), (2, 10.5, 2.5), (2, 8.5, 9.5)]))
+def test_the_order_of_clicks_does_not_matter(points):
+    assert (
+        corrected(sheet(GREY), ONE, clicks(*points)).label == corrected(sheet(GREY), ONE, clicks(*sorted(points))).label
+    ).all()
+
+
+def test_clicks_beside_all_instances_are_warned_of():
+    label = np.where(left(), 1, 0)
+    with pytest.warns(UserWarning, match="1 clicks lie on no instance; they correct nothing"):
+        found = corrected(sheet(GREY), labelled(label), clicks((1, 1.5, 1.5), (2, 10.5, 1.5)))
+    assert found.label.tolist() == label.tolist()
+
+
+def test_a_click_means_the_nearest_point_that_the_view_sees_within_reach():
+    seen, _ = row_of_points([2, 5], 200)
+    on = Clicks(
+        "0",
+        np.array([1, 1, 4, 1], np.int32),
+        np.array([[2.9, 0.5], [4.6, 0.5], [5.5, 0.5], [100, 0.5]]),
+        np.array([1, 1, 0, 1], np.int32),
+    )
+    nothing = Clicks("1", np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.int32))
+    rows, things = clicked_points((seen, seen), (on, nothing))
+    assert rows.tolist() == [2, 5] and things.tolist() == [1, 1]
