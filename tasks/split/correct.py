@@ -108,7 +108,8 @@ def part_masks(
             origin.append(row)
             continue
         among = of_most & inside & np.isin(new.label, shown)
-        nearest = nearest_labels(PaintedView(old.pixel[among], new.label[among]), *mask.shape, np.inf)
+        held_by = PaintedView(old.pixel[among], new.label[among])
+        nearest = nearest_labels(held_by, visibility.height, visibility.width, np.inf)
         parts += [mask & (nearest == thing) for thing in shown]
         origin += [row] * len(shown)
     if len(parts) == len(dense):
