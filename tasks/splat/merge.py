@@ -43,7 +43,7 @@ class MergeParams:
     """Fewest steps of a pair."""
     max_iterations: Count = 150
     """Most steps of a pair."""
-    global_iterations: Natural = 2000
+    global_iterations: Natural = 3000
     """Steps of the last pass over the whole scene; 0 leaves it out."""
     objective: Objective = Objective()
     """What the training of a pair makes small, besides w_mask times the mask loss."""
@@ -57,8 +57,8 @@ class MergeParams:
     """Fainter Gaussians are dropped in the end."""
     prune_contribution: Fraction = 1 / 255
     """Gaussians that add no more than this to any pixel of any view are dropped in the end."""
-    sh_degree: HarmonicsDegree = 3
-    """Highest degree of the colour's spherical harmonics."""
+    sh_degree: HarmonicsDegree = 2
+    """Highest degree of the colour's spherical harmonics; one more every 1,000 steps of the last pass."""
     ignore_occluded: bool = True
     """Whether pixels where something else is in front of a pair are left out; False calls them empty, as in the
     paper."""

@@ -39,12 +39,12 @@ class ReconstructParams:
 
     iterations_per_view: Count = 8
     """Training steps for each view of the instance, within the two limits below."""
-    min_iterations: Count = 200
+    min_iterations: Count = 30
     """Fewest steps."""
-    max_iterations: Count = 400
+    max_iterations: Count = 60
     """Most steps."""
-    retrain_share: NonNegative = 0.3
-    """Steps of training after refinement, as a share of the first training's."""
+    retrain_share: NonNegative = 0.0
+    """Steps of training after refinement, as a share of the first training's; 0 leaves it out."""
     warm_start: bool = True
     """Whether training after refinement goes on from the Gaussians of the first, or starts over."""
     sh_degree: HarmonicsDegree = 3
@@ -144,9 +144,9 @@ def retrain(
     """The Gaussians of an instance after its masks were refined (spec row 31).
 
     instance: with the refined masks. gaussians: of the first training; they come back as they are where refinement
-    changed no mask. The rest as for `reconstruct`.
+    changed no mask, or where `retrain_share` is 0. The rest as for `reconstruct`.
     """
-    unchanged = not (instance.origin == REFINED).any()
+    unchanged = not (instance.origin == REFINED).any() or not params.retrain_share
     if unchanged or instance.weak or not len(instance.points) or not instance.views:
         return gaussians
     scene = views.compared(visibility)

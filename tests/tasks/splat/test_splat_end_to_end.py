@@ -127,6 +127,7 @@ def test_retraining_happens_only_where_refinement_changed_a_mask(built):
     instance = built.scene.instance(2)
     assert retrain(built.views, instance, built.ball, params=TRAIN) is built.ball
     changed = replace(instance, origin=np.where(np.arange(VIEWS) == 3, REFINED, 0).astype(np.uint8))
+    assert retrain(built.views, changed, built.ball, params=replace(TRAIN, retrain_share=0.0)) is built.ball
     result = retrain(built.views, changed, built.ball, params=replace(TRAIN, retrain_share=0.1))
     assert not same(result, built.ball) and len(result)
 
