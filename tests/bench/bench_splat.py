@@ -180,7 +180,7 @@ def total_steps(found: Outcome, params: Params) -> tuple[int, int]:
             continue
         share = float(np.mean([crop_share(found.cameras, before, row, of.crop) for row in range(len(before.views))]))
         count = of.iterations(before)
-        if (after.origin == REFINED).any():
+        if (after.origin == REFINED).any() and of.retrain_share:
             count += max(1, round(of.retrain_share * of.iterations(after)))
         steps, photos = steps + count, photos + share * count
         shares.append(share)
