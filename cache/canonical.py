@@ -37,6 +37,13 @@ def digest(value: Any) -> str:
     return encoder.hexdigest()
 
 
+def digest_of_fields(kind: str, fields: Mapping[str, Any]) -> str:
+    """The digest of a dataclass instance by its type's name ("module.Class") and its fields, as `digest` gives it."""
+    encoder = _Encoder()
+    encoder.add_fields(kind, fields)
+    return encoder.hexdigest()
+
+
 def digest_file(path: Path | str) -> str:
     """The hexadecimal blake3 digest of a file's content."""
     hasher = blake3()
@@ -67,14 +74,17 @@ class _Encoder:
             self._add_mapping(value)
         elif dataclasses.is_dataclass(value) and not isinstance(value, type):
             counted = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.metadata.get("key", True)}
-            self._tagged(b"d", f"{type(value).__module__}.{type(value).__qualname__}".encode())
-            self._add_mapping(counted)
+            self.add_fields(f"{type(value).__module__}.{type(value).__qualname__}", counted)
         else:
             for kind, encode in _ENCODERS.items():  # a subclass, such as a named tuple, counts as what it is
                 if isinstance(value, kind):
                     encode(self, value)
                     return
             raise TypeError(f"cannot digest a value of type {type(value).__module__}.{type(value).__qualname__}")
+
+    def add_fields(self, kind: str, fields: Mapping[str, Any]) -> None:
+        self._tagged(b"d", kind.encode())
+        self._add_mapping(fields)
 
     def _tagged(self, tag: bytes, content: bytes) -> None:
         self._pending += tag

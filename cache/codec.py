@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from ss_flow.cache.canonical import digest_of_fields
+
 CHUNK_BYTES = 4 << 20
 PLAIN_BYTES = 64 << 10
 """Smaller arrays are not compressed, and are written and read without loading Zarr."""
@@ -36,6 +38,10 @@ DTYPES = frozenset(
     + [f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64)]
 )
 """What arrays may hold."""
+
+
+class OtherFields(ValueError):
+    """What is stored has other fields than its type has now; says which."""
 
 
 def write(value: Any, folder: Path) -> None:
@@ -115,16 +121,34 @@ def read(folder: Path) -> Any:
     """Read what `write` wrote. Arrays come back read-only, since the store shares them between tasks.
 
     Raises ValueError when it is damaged, of a type that is not one of this package's dataclasses, or was written by
-    another format.
+    another format; OtherFields when the type has other fields by now, or a folder of an array is missing.
     """
     form, name, content = _header(folder)
     if form != FORMAT:
         raise ValueError(f"{folder}: object format {form}, this version reads format {FORMAT}")
     kind = type_named(name)
+    stored, due = _names(folder, content), {item.name for item in dataclasses.fields(kind)}
+    if stored != due:
+        changes = [f"has no field {one} any more" for one in sorted(stored - due)]
+        changes += [f"has the new field {one}" for one in sorted(due - stored)]
+        raise OtherFields(f"{kind.__name__} {', '.join(changes)}")
     hints = typing.get_type_hints(kind)
     try:
         values = {item.name: _field(folder, item.name, content, hints) for item in dataclasses.fields(kind)}
         return kind(**values)
+    except (OSError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError) as error:
+        raise ValueError(f"{folder}: damaged; {type(error).__name__}: {error}") from None
+
+
+def digest_as_stored(folder: Path) -> str:
+    """The digest of an object by the fields that are stored, whatever fields its type has now.
+
+    Raises ValueError when it is damaged.
+    """
+    _, name, content = _header(folder)
+    try:
+        fields = {one: _field(folder, one, content, {}) for one in _names(folder, content)}
+        return digest_of_fields(str(name).replace(":", "."), fields)
     except (OSError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError) as error:
         raise ValueError(f"{folder}: damaged; {type(error).__name__}: {error}") from None
 
@@ -146,9 +170,17 @@ def _header(folder: Path) -> tuple[Any, Any, Any]:
         raise ValueError(f"{folder}: not a stored object ({error})") from None
 
 
+def _names(folder: Path, content: Any) -> set[str]:
+    """The fields that are stored."""
+    try:
+        return {*content, *(entry.name for entry in os.scandir(folder) if entry.is_dir(follow_symlinks=False))}
+    except (OSError, TypeError) as error:
+        raise ValueError(f"{folder}: not a stored object ({error})") from None
+
+
 def _field(folder: Path, name: str, content: dict[str, Any], hints: dict[str, Any]) -> Any:
     if name in content:
-        return _restored(content[name], hints[name])
+        return _restored(content[name], hints.get(name))
     array = _read_array(folder / name)
     array.flags.writeable = False
     return array

@@ -22,6 +22,13 @@ class Gone(LookupError):
         return f"object {self.digest[:12]} {self.reason}"
 
 
+class OtherVersion(Gone):
+    """An object that is whole, but whose type has other fields in this version. It stays in the store."""
+
+    def __str__(self) -> str:
+        return f"object {self.digest[:12]} was stored by another version of this package: {self.reason}"
+
+
 @contextlib.contextmanager
 def writing(root: Path) -> Iterator[None]:
     """Within this, an OSError becomes the StoreFailure of the store in this folder."""

@@ -32,6 +32,7 @@ from typing import Any
 from ss_flow.cache.bucket import Bucket
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims, Seen
+from ss_flow.cache.codec import OtherFields
 from ss_flow.cache.errors import Gone, writing
 from ss_flow.cache.files import rename_folder, user_cache
 from ss_flow.cache.store import GRACE_SECONDS, MEMORY_BYTES, Action, Entry, Store, verified
@@ -136,6 +137,8 @@ class RemoteStore(Store):
         self._bucket.each(fetch, filter(_FILE.fullmatch, files))
         try:
             value = verified(place, object_digest)
+        except OtherFields as error:
+            raise self._other_version(object_digest, error) from None
         except ValueError as error:
             self.discard(object_digest)
             raise Gone(object_digest, f"was damaged ({error})") from None

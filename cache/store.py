@@ -17,6 +17,9 @@ and is never read. The action comes after all of its objects.
 *Power cut, failing disk, foreign hands.* Nothing is synced; everything is checked when it is read: an object whose
 content is not what its name says is taken out, and its maker runs again.
 
+*Another version.* An object whose type has got or lost fields since is whole: it stays, and OtherVersion is raised. No
+key of this version leads to it, since the definitions of types are code that keys depend on.
+
 *Concurrent writers.* Two processes that write the same object write the same bytes; the loser of the rename discards
 its copy. Readers never lock.
 
@@ -45,7 +48,7 @@ import numpy as np
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
-from ss_flow.cache.errors import Gone, writing
+from ss_flow.cache.errors import Gone, OtherVersion, writing
 from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder
 
 MEMORY_BYTES = 2 << 30
@@ -159,7 +162,8 @@ class Store:
     def get(self, object_digest: str) -> Any:
         """The stored value. Shared between callers: its arrays are read-only.
 
-        Raises Gone when the store holds no such object, or one that is damaged, which is then taken out.
+        Raises Gone when the store holds no such object, or one that is damaged, which is then taken out; OtherVersion
+        when its type has other fields by now.
         """
         with self._lock:
             if object_digest in self._recent:
@@ -178,9 +182,18 @@ class Store:
             raise Gone(object_digest, "is not in the store")
         try:
             return verified(self.object_path(object_digest), object_digest)
+        except codec.OtherFields as error:
+            raise self._other_version(object_digest, error) from None
         except ValueError as error:
             self.discard(object_digest)
             raise Gone(object_digest, f"was damaged ({error})") from None
+
+    def _other_version(self, object_digest: str, error: codec.OtherFields) -> OtherVersion:
+        """What to raise for an object of another version; names the step that made it, where one is recorded."""
+        recorded = (self.action(entry.name, whole=False) for entry in self.actions())
+        makers = (action.step for action in recorded if action and object_digest in action.outputs)
+        step = next(makers, None)
+        return OtherVersion(object_digest, f"{error}{f' (a result of {step})' if step else ''}")
 
     def restore(self, object_digest: str) -> None:
         """Restore what can be restored when someone else finds an object missing that this process counts on."""
@@ -348,8 +361,16 @@ def _action_of(record: dict[str, Any], key: str) -> Action:
 
 
 def verified(folder: Path, object_digest: str) -> Any:
-    """The object in a folder. Raises ValueError when it is damaged."""
-    value = codec.read(folder)
+    """The object in a folder.
+
+    Raises ValueError when it is damaged, OtherFields when it is whole but its type has other fields by now.
+    """
+    try:
+        value = codec.read(folder)
+    except codec.OtherFields as error:
+        if codec.digest_as_stored(folder) == object_digest:
+            raise
+        raise ValueError(f"{folder}: damaged; {error}") from None
     if digest(value) != object_digest:
         raise ValueError("its content is not what its name says")
     return value

@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 
 from ss_flow.cache.claims import Claims
-from ss_flow.cache.errors import Gone, StoreFailure
+from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
 from ss_flow.cache.store import Store
 from ss_flow.events import JsonLines, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
@@ -102,6 +102,7 @@ def run_flows(
     *,
     jobs: int = 0,
     memory_mb: int = 0,
+    gpus: int | None = None,
     executor: str = "threads",
     dry: bool = False,
     recorded: bool = True,
@@ -109,7 +110,8 @@ def run_flows(
     """Run several flows as one graph; what they share is computed once. Earlier flows go first.
 
     jobs: how many cores to use, 0 = all. memory_mb: how much memory tasks may declare together, 0 = what is free. Both
-    are this machine's, or those of the cluster that the executor speaks to.
+    are this machine's, or those of the cluster that the executor speaks to. gpus: how many of this machine's GPUs tasks
+    will use, None = one where the driver shows any.
     recorded: whether the run is kept among the store's runs; a question about a result need not be.
 
     Raises KeyError when `until` names no output, StoreFailure when the store cannot be used, ExecutorLost when whoever
@@ -123,7 +125,7 @@ def run_flows(
         stack.callback(run.close)
         workers = open_executor(executor, jobs or usable_cores(), store, run.progressed)
         try:
-            room = workers.capacity or _this_machine()
+            room = workers.capacity or _this_machine(gpus)
             capacity = replace(room, cores=jobs or room.cores, memory_mb=memory_mb or room.memory_mb)
             store.sweep_temporaries()
             claims.sweep()
@@ -136,12 +138,12 @@ def run_flows(
         return run.reports
 
 
-def _this_machine() -> Resources:
-    """What there is to use here."""
+def _this_machine(gpus: int | None) -> Resources:
+    """What there is to use here. gpus: None = one where the driver shows any."""
     return Resources(
         cores=usable_cores(),
         memory_mb=psutil.virtual_memory().available >> 20,
-        gpus=min(len(glob.glob("/dev/nvidia[0-9]*")), 1),  # tasks use the first one
+        gpus=min(len(glob.glob("/dev/nvidia[0-9]*")), 1) if gpus is None else gpus,  # tasks use the first one
     )
 
 
@@ -261,6 +263,8 @@ class _Run:
             reason = "though it was made anew; is the disk failing?" if maker else "and this run does not make it"
             raise StoreFailure(f"{gone}, {reason}; run its scene again.")
         self._healed.add(name)
+        if maker and isinstance(gone, OtherVersion):
+            self._store.discard(gone.digest)  # else its record would be found again
         self._store.restore(gone.digest)
 
     def progressed(self, key: str, done: int, total: int, note: str) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from typing import Any
 
 from ss_flow.keys import Components
@@ -25,7 +27,7 @@ def first_difference(before: Components, now: Components, items: Callable[[str],
         return f"parameter {name} {old} -> {new}"
     for name in _changed(before["code"], now["code"]):
         word = "changed" if name in before["code"] and name in now["code"] else "is new or gone"
-        return f"code of {name.removeprefix('ss_flow.')} {word}"
+        return f"{_what(name)} of {name.removeprefix('ss_flow.')} {word}"
     for name in _changed(before["packages"], now["packages"]):
         old, new = (_shown(side["packages"], name) for side in (before, now))
         return f"package {name} {old} -> {new}"
@@ -35,6 +37,12 @@ def first_difference(before: Components, now: Components, items: Callable[[str],
     for name in changed_inputs(before, now):
         return f"input {name} changed{items(name)}"
     return ""
+
+
+def _what(name: str) -> str:
+    """What a definition consists of: a dataclass, such as the type of a result, has fields first of all."""
+    module, _, attribute = name.rpartition(".")
+    return "fields or code" if is_dataclass(getattr(sys.modules.get(module), attribute, None)) else "code"
 
 
 def changed_inputs(before: Components, now: Components) -> list[str]:

@@ -54,7 +54,7 @@ def main(arguments: list[str]) -> int:
         _complain("interrupted; what was finished is kept, and the next run goes on from it.", style="yellow")
         return INTERRUPTED
     except Gone as error:
-        _complain(f"{error}; run the scene again, which computes anew what the store no longer holds.")
+        _complain(f"{error}; run the scene again, which computes it anew.")
         return FAILED
     except (StoreFailure, ExecutorLost) as error:
         _complain(str(error))

@@ -28,7 +28,9 @@ from ss_flow.graph import Flow, gather, nodes_by_step
 from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.models.catalogue import DISTANCES
+from ss_flow.tasks.models.onnx import lacks_cuda
 from ss_flow.tasks.semantics.query import query
 from ss_flow.units import parse_bytes
 
@@ -94,7 +96,18 @@ class RunOptions:
             raise InputError(f"--memory {error}") from None
         if self.memory is not None and memory_mb == 0:
             raise InputError(f"--memory {self.memory} is out of range; it must be 1 MiB or more.")
-        return {"jobs": self.jobs, "memory_mb": memory_mb, "executor": self.executor, "dry": self.dry_run}
+        return {
+            "jobs": self.jobs,
+            "memory_mb": memory_mb,
+            "gpus": usable_gpus(),
+            "executor": self.executor,
+            "dry": self.dry_run,
+        }
+
+
+def usable_gpus() -> int:
+    """1 where Gaussians or networks are computed on CUDA here, else 0, whatever the driver shows."""
+    return int(device_here() == "cuda" or lacks_cuda() is None)
 
 
 @dataclass(frozen=True)

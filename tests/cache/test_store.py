@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import time
@@ -12,10 +13,12 @@ from hypothesis.extra import numpy as hnp
 
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import digest
-from ss_flow.cache.errors import Gone, StoreFailure
+from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import GRACE_SECONDS, Action, Store
+from ss_flow.cache.verify import verify
+from ss_flow.tasks import artifacts
 from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, Metrics, PointCloud
 
 arrays = st.integers(0, 5).flatmap(lambda rows: hnp.arrays(np.float32, (rows, 3)))
@@ -207,6 +210,41 @@ def test_a_damaged_object_is_taken_out_and_never_served(store):
             else:  # a bit that says nothing: white space, or how a number is written
                 assert digest(value) == output
             shutil.rmtree(store.object_path(output), ignore_errors=True)
+
+
+def _changed_label_map(*fields: str) -> type:
+    """LabelMap as another version might have it."""
+    kind = dataclasses.make_dataclass("LabelMap", fields, frozen=True)
+    kind.__module__ = LabelMap.__module__
+    return kind
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        (("name", "ids", "scale"), "LabelMap has the new field scale"),
+        (("name",), "LabelMap has no field ids any more"),
+        (("name", "labels"), "LabelMap has no field ids any more, has the new field labels"),
+    ],
+)
+def test_an_object_whose_type_has_other_fields_by_now_stays_and_is_not_called_damaged(store, monkeypatch, fields, said):
+    output = store.put(LabelMap("x", np.eye(64, dtype=np.uint16)))
+    store.record(Action("ab" * 32, "split.look", (output,), False, {}, 1.5, 10.0))
+    with monkeypatch.context() as patch:
+        patch.setattr(artifacts, "LabelMap", _changed_label_map(*fields))
+        with pytest.raises(OtherVersion) as told:
+            Store(store.root).get(output)
+        assert said in str(told.value) and "split.look" in str(told.value) and "damaged" not in str(told.value)
+        assert verify(store).damaged == ()
+    assert Store(store.root).get(output).name == "x"
+
+
+def test_an_object_that_lost_a_field_on_the_disk_is_damaged(store):
+    output = store.put(LabelMap("x", np.eye(64, dtype=np.uint16)))
+    shutil.rmtree(store.object_path(output) / "ids")
+    with pytest.raises(Gone, match="was damaged"):
+        Store(store.root).get(output)
+    assert output not in store
 
 
 def test_an_action_that_is_not_of_its_key_or_not_json_is_none(store):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
+import shutil
 
 import cv2
 import numpy as np
@@ -12,6 +14,19 @@ from tiny_runs import run_tiny, ss_flow
 
 from ss_flow.cache.store import Store
 from ss_flow.runs import latest_runs
+from ss_flow.tasks import artifacts
+
+
+@pytest.fixture(scope="module")
+def tiny(tiny, tmp_path_factory):
+    """The run with a store that knows of no later one, as other tests leave some behind."""
+    store = tmp_path_factory.mktemp("inspect") / "store"
+    shutil.copytree(tiny.store, store)
+    *later, first = latest_runs(store / "roots/runs")
+    for run in later:
+        shutil.rmtree(run.folder)
+    assert first.scene == str(tiny.scene)
+    return dataclasses.replace(tiny, store=store)
 
 
 def test_status_counts_what_each_step_did(tiny):
@@ -155,3 +170,17 @@ def test_cache_show_draws_every_kind_of_result(what, tiny, tmp_path):
     image = cv2.imread(str(picture))
     assert min(image.shape[:2]) >= 50
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 1
+
+
+def test_a_result_whose_type_has_a_new_field_is_told_as_one_of_another_version(tiny, monkeypatch):
+    newer = dataclasses.make_dataclass("PointLabels", ["weight"], bases=(artifacts.PointLabels,), frozen=True)
+    newer.__module__ = artifacts.__name__
+    with monkeypatch.context() as patch:
+        patch.setattr(artifacts, "PointLabels", newer)
+        told = ss_flow("cache", "show", "propagate", "--cache", tiny.store)
+        assert told.code == 1 and told.err.count("\n") == 1 and "damaged" not in told.err
+        assert "PointLabels has the new field weight (a result of split." in told.err
+        assert "run the scene again" in told.err
+    assert ss_flow("cache", "show", "propagate", "--cache", tiny.store).out.startswith("PointLabels"), (
+        "it is still there"
+    )

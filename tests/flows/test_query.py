@@ -104,7 +104,7 @@ def test_a_result_that_is_gone_is_told_in_one_sentence_with_what_to_do(warm):
     shutil.rmtree(next((warm.store / "objects").rglob(described[0])) / "embedding")
     answer = ss_flow("query", warm.out, "white", "--cache", warm.store)
     assert answer.code == 1
-    assert "was damaged" in answer.err and "run the scene again, which computes anew" in answer.err
+    assert "was damaged" in answer.err and "run the scene again, which computes it anew" in answer.err
 
 
 def test_an_answer_never_takes_the_place_of_anything_else(tiny, tmp_path):

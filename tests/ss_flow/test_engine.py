@@ -7,9 +7,11 @@ import time
 import pytest
 import ss_flow_toy as toy
 
+from ss_flow import engine
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
+from ss_flow.explain import first_difference
 from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
@@ -415,3 +417,14 @@ def test_an_input_that_is_no_node_is_refused():
     flow = Flow("x")
     with flow.building(), pytest.raises(TypeError, match="must be a node"):
         gather([1.0])
+
+
+def test_a_gpu_counts_where_the_driver_shows_one_unless_tasks_are_said_to_use_none(monkeypatch):
+    monkeypatch.setattr(engine.glob, "glob", lambda pattern: ["/dev/nvidia0", "/dev/nvidia1"])
+    assert [engine._this_machine(gpus).gpus for gpus in (None, 0, 1)] == [1, 0, 1]
+
+
+def test_a_definition_that_has_fields_is_said_to_have_changed_in_fields_or_code():
+    parts = {"task": {}, "parameters": {}, "packages": {}, "environment": {}, "inputs": {}}
+    before, now = ({**parts, "code": {f"ss_flow_toy.{name}": d}} for name, d in (("Number", "a"), ("Number", "b")))
+    assert first_difference(before, now) == "fields or code of ss_flow_toy.Number changed"
