@@ -23,6 +23,8 @@ _TINT = 0.4
 """How far the colours of what is selected go towards that of the mark."""
 _WITHIN = (2, 98)
 """Percentiles of the centres that a box goes round, since a few Gaussians lie far off."""
+_GIZMO = 0.8
+"""Length of the gizmo's arrows, in diagonals of the largest box: they must stick out of what is moved."""
 _DIGITS = 6
 """Significant digits of a motion that the gizmo has led."""
 
@@ -67,8 +69,9 @@ class SceneNodes:
         held = [self._nodes[instance] for instance in instances]
         boxes = {i: (self._boxes[i], np.array(self._boxes[i].position)) for i in instances if i in self._boxes}
         sizes = [float(np.linalg.norm(box.dimensions)) for box, _ in boxes.values()]
+        # With depth: splats are drawn last, and paint over what has left none, even where they lie behind it.
         gizmo = self._server.scene.add_transform_controls(
-            "/gizmo", scale=0.6 * max(sizes, default=1.0), depth_test=False, position=center
+            "/gizmo", scale=_GIZMO * max(sizes, default=1.0), depth_test=True, position=center
         )
 
         @gizmo.on_update

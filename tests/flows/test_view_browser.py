@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from browser import Page, browser_page, needs_browser
@@ -22,13 +23,15 @@ from ss_flow.tasks.artifacts import EditedScene, Float64
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, project
 
-pytest.importorskip("viser", reason="needs the extra `view`")
+viser = pytest.importorskip("viser", reason="needs the extra `view`")
 from ss_flow.flows.view.viewer import Viewer
 
 pytestmark = [
     needs_browser,
     pytest.mark.skipif("SS_FLOW_TEST_BROWSER" not in os.environ, reason="takes minutes; set SS_FLOW_TEST_BROWSER"),
 ]
+_ARROW, _ARROW_BELOW_THE_MOUSE = (255, 44, 104), (229, 226, 127)
+"""Colours that viser's page draws the first arrow of a gizmo in, over white or a scene."""
 _LOOK = """
 window.buttons = text => [...document.querySelectorAll('button')].filter(b => b.innerText.trim() === text);
 window.field = label => {
@@ -77,7 +80,7 @@ class Hands:
         with self.viewer.panel.lock:  # what is being done is shown, too, before it is let go
             listed = [row.button.label for row in self.viewer.panel.objects.rows if row.instance is not None]
         drawn = self.page.evaluate("[...document.querySelectorAll('button')].map(b => b.innerText.trim())")
-        return [text for text in drawn if text in listed] == listed
+        return [text for text in drawn if " · " in text or text == "background"] == listed
 
     def fill(self, label: str, text: str) -> None:
         """Type into the field beside a label, in the place of what stands there."""
@@ -95,12 +98,37 @@ class Hands:
         self.mouse("mousePressed", place, modifiers)
         self.mouse("mouseReleased", place, modifiers)
 
-    def mouse(self, kind: str, place: Float64, modifiers: int = 0) -> None:
+    def mouse(self, kind: str, place: Float64, modifiers: int = 0, *, held: bool = True) -> None:
+        """held: whether the left button is down meanwhile."""
         x, y = (float(v) for v in place)
-        self.page.call(
-            "Input.dispatchMouseEvent",
-            type=kind, x=x, y=y, button="left", buttons=1, clickCount=1, modifiers=modifiers,
-        )  # fmt: skip
+        button = {"button": "left", "buttons": 1, "clickCount": 1} if held else {}
+        self.page.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, modifiers=modifiers, **button)
+
+    def drawn(self, places: Float64, color: tuple[int, int, int]) -> list[int]:
+        """At which of these places [N, 2] the page shows a colour."""
+        picture = cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+        shown = cv2.dilate((np.abs(picture.astype(int) - color).max(axis=-1) < 40).astype(np.uint8), np.ones((5, 5)))
+        return [i for i, (x, y) in enumerate(places.astype(int)) if shown[y, x]]
+
+    def drag(self, gizmo: viser.TransformControlsHandle) -> None:
+        """Drag the gizmo by its first arrow, by half of its length. Each step waits for what the page draws or tells of
+        the one before: a browser that draws on the processor may take seconds for a frame."""
+        told: list[str] = []
+        gizmo.on_update(lambda event: told.append(event.phase))
+        along = np.linspace(0.5, 1.5, 21)[:, None] * (gizmo.scale, 0, 0)
+        arrow = project(gizmo.position + along, self.camera())[0]
+        self.until(lambda: self.drawn(arrow[:10], _ARROW))
+        grip = self.drawn(arrow[:10], _ARROW)[-1]
+        self.mouse("mouseMoved", arrow[grip], held=False)
+        self.until(lambda: self.drawn(arrow[grip : grip + 1], _ARROW_BELOW_THE_MOUSE))
+        self.mouse("mousePressed", arrow[grip])
+        self.until(lambda: "start" in told)
+        for place in arrow[[grip + 3, grip + 7, grip + 10]]:
+            before = gizmo.position
+            self.mouse("mouseMoved", place)
+            self.until(lambda before=before: not np.array_equal(gizmo.position, before))
+        self.mouse("mouseReleased", arrow[grip + 10])
+        self.until(lambda: "end" in told)
 
     def camera(self) -> Camera:
         """What the browser shows the scene with, in its pixels."""
@@ -134,7 +162,7 @@ def hands(warm, tmp_path: Path) -> Iterator[Hands]:
     run = open_run(warm.out, StoreOptions(warm.store), ("scene", "cameras"))
     viewer = Viewer(run, tmp_path / "script.json", (), search_of(run), port=0)
     viewer.load_pictures()
-    with browser_page(1000, 600) as page:
+    with browser_page(900, 600) as page:
         page.open(viewer.address)
         page.wait_for("document.querySelector('canvas') !== null && document.querySelectorAll('button').length > 12")
         page.evaluate(_LOOK)
@@ -161,14 +189,7 @@ def test_every_operation_is_clicked_through_and_the_script_gives_the_scene_that_
 
     hands.press("Move", lambda: hands.viewer.panel.nodes.gizmo is not None)
     gizmo = hands.viewer.panel.nodes.gizmo
-    start, end = project(gizmo.position + gizmo.scale * np.array([[0.7, 0, 0], [1.6, 0, 0]]), hands.camera())[0]
-    time.sleep(3)  # the browser draws the gizmo
-    hands.mouse("mouseMoved", start)
-    hands.mouse("mousePressed", start)
-    for part in (0.3, 0.7, 1.0):
-        hands.mouse("mouseMoved", start + part * (end - start))
-        time.sleep(0.3)
-    hands.mouse("mouseReleased", end)
+    hands.drag(gizmo)
     hands.until(lambda: len(session.state.done) == 1)
     moved = session.state.done[0]["move"]
     assert abs(moved[0]) > 10 * max(abs(moved[1]), abs(moved[2]))  # along the red arrow
