@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -23,8 +24,11 @@ from ss_flow.tasks.artifacts import EditedScene, Float64
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, project
 
-viser = pytest.importorskip("viser", reason="needs the extra `view`")
+pytest.importorskip("viser", reason="needs the extra `view`")
 from ss_flow.flows.view.viewer import Viewer
+
+if TYPE_CHECKING:
+    import viser
 
 pytestmark = [
     needs_browser,
@@ -160,7 +164,7 @@ class Hands:
 def hands(warm, tmp_path: Path) -> Iterator[Hands]:
     """Somebody who has opened the viewer of the tiny run."""
     run = open_run(warm.out, StoreOptions(warm.store), ("scene", "cameras"))
-    viewer = Viewer(run, tmp_path / "script.json", (), search_of(run), port=0)
+    viewer = Viewer(run, tmp_path / "script.json", (), search_of(run), tmp_path / "hints.json", port=0)
     viewer.load_pictures()
     with browser_page(900, 600) as page:
         page.open(viewer.address)
@@ -248,6 +252,28 @@ def test_every_operation_is_clicked_through_and_the_script_gives_the_scene_that_
     scene = Store(warm.store).get(edited.document()["results"]["scene"])
     for field in fields(EditedScene):
         assert np.array_equal(getattr(session.scene(), field.name), getattr(scene, field.name)), field.name
+
+
+def test_points_are_picked_on_things_and_saved_for_a_run_that_goes_by_them(hands, tmp_path):
+    first, second = list(hands.seen())[:2]
+    correcting = hands.viewer.panel.correcting
+    hands.page.evaluate("field('Correct by clicks').click()")
+    hands.until(lambda: correcting.box.value)
+    hands.click(hands.pixel_of(first))
+    hands.page.wait_for("document.body.innerText.includes('1 point, not all saved; now on thing 1')")
+    hands.press("Next thing", lambda: correcting.corrections.thing == 2)
+    for count in (2, 3):
+        hands.click(hands.pixel_of(second))
+        hands.until(lambda count=count: len(correcting.corrections.picks) == count)
+    hands.press("Undo point", lambda: len(correcting.corrections.picks) == 2)
+    (tmp_path / "picked.png").write_bytes(hands.page.screenshot())
+    hands.press("Save hints", lambda: not correcting.corrections.unsaved)
+    hands.page.wait_for("document.body.innerText.includes('2 points in hints.json')")
+    assert json.loads((tmp_path / "hints.json").read_text()) == correcting.corrections.document()
+    names = {hands.session.state.objects.name(i) for i in (first, second)}
+    assert {name for things in correcting.corrections.document().values() for name in things} == names
+    assert not hands.session.selected and not hands.session.state.done
+    assert not [text for text in hands.page.complaints if not text.startswith("THREE.")]
 
 
 @pytest.mark.parametrize("kind", ["outlines", "photos", "masks", "depth"])
