@@ -2,7 +2,7 @@
 
     python tests/bench/bench_corrections.py [--preset fast] [--jobs 1]
 
-The vase and the table have one mask in all views, the sofa two, and Split's union of what touches is off, since it would
+The vase and the table have one mask in all views, the sofa two; Split's union of what touches is off, since it would
 mend the sofa. The clicks are made and saved as the viewer does it. Tells of both runs the processor seconds (of the
 whole command), the results that are computed, the instances that are trained, and what comes out, against the truth.
 """
