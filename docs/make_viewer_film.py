@@ -36,9 +36,10 @@ def steps(viewer: Viewer, page: Page) -> Iterator[str]:
     """Do one thing after the other, and tell each."""
     panel, session = viewer.panel, viewer.panel.session
     yield "the scene"
-    search(page, "orange")
+    search(page, "brown")
     yield "search"
-    chosen = next(i for i in session.state.objects.entries if "orange" in session.state.objects.name(i))
+    brown = [i for i in session.state.pieces if i and "brown" in session.state.objects.name(i)]
+    chosen = max(brown, key=lambda i: len(session.state.pieces[i].rows))
     panel._chosen((chosen,))
     yield "select what was found"
     session.isolate((chosen,))

@@ -23,7 +23,7 @@ _TINT = 0.4
 """How far the colours of what is selected go towards that of the mark."""
 _WITHIN = (2, 98)
 """Percentiles of the centres that a box goes round, since a few Gaussians lie far off."""
-_GIZMO = 0.8
+_GIZMO = 0.6
 """Length of the gizmo's arrows, in diagonals of the largest box: they must stick out of what is moved."""
 _DIGITS = 6
 """Significant digits of a motion that the gizmo has led."""
