@@ -36,29 +36,15 @@ def steps(viewer: Viewer, page: Page) -> Iterator[str]:
     """Do one thing after the other, and tell each."""
     panel, session = viewer.panel, viewer.panel.session
     yield "the scene"
-    search(page, "brown")
+    search(page, "orange")
     yield "search"
-    brown = [i for i in session.state.pieces if i and "brown" in session.state.objects.name(i)]
-    chosen = max(brown, key=lambda i: len(session.state.pieces[i].rows))
+    chosen = next(i for i in session.state.objects.entries if "orange" in session.state.objects.name(i))
     panel._chosen((chosen,))
     yield "select what was found"
     session.isolate((chosen,))
     panel.refresh()
     yield "isolate"
     session.show()
-    panel._attempt(None, panel._toggle_gizmo)
-    yield "the gizmo"
-    panel._attempt(None, panel._toggle_gizmo)
-    size = np.ptp(session.state.pieces[chosen].gaussians.means, axis=0)
-    up = viewer.server.initial_camera.up
-    panel._attempt(
-        None, lambda: session.do({"op": "transform", "instances": [chosen], "move": list(up * size.max() / 2)})
-    )
-    yield "moved"
-    panel._attempt(None, lambda: session.do({"op": "recolour", "instances": [chosen], "color": [40, 90, 220]}))
-    yield "recoloured"
-    panel._attempt(None, session.undo)
-    panel._attempt(None, session.undo)
     search(page, "")
     panel._chosen(())
     panel._colors.value = "objects"
