@@ -18,6 +18,7 @@ using parallel::Buffer;
 constexpr int kBandRows = 8;
 constexpr int64_t kChunk = 1024;  // Gaussians that are projected in one piece
 constexpr int kAhead = 8;         // so many entries ahead, splats are fetched into the cache
+constexpr int kStride = 4;        // blocks that get an entry at a time
 
 // What the blending reads: alpha = 2^(log2_opacity + dx (A dx + B dy) + C dy^2), d = pixel - mean; and the ellipse
 // where alpha reaches 1/255: half its width and height, the correlation of x and y, and sqrt(1 - correlation^2).
@@ -48,7 +49,7 @@ struct Band {
     Buffer<uint64_t> order, other; // depth and candidate
     Buffer<Splat> splats;          // by depth, ties by row
     Buffer<Span> spans;
-    Buffer<int64_t> first;         // [blocks + 1] into entries
+    Buffer<int64_t> first, end;    // [blocks] into entries
     Buffer<int32_t> entries;       // splats of each block, front to back
     Buffer<int32_t> used;          // [blocks] entries up to the one that made the block opaque
     Buffer<Sums> sums;
@@ -196,49 +197,61 @@ inline void fill(Band& band, Frame& frame) {
     sort(band);
     band.splats.room(band.count);
     const int64_t blocks = (int64_t)band.rows * frame.blocks_x;
-    int64_t* first = band.first.room(blocks + 2);
-    std::memset(first, 0, (blocks + 2) * sizeof *first);
-    int64_t* change = first + 1;
+    int64_t *first = band.first.room(blocks + kStride), *end = band.end.room(blocks + kStride);
+    std::memset(end, 0, (blocks + kStride) * sizeof *end);
     const int number = band.top / kBandRows;
     Span* spans = band.spans.room(band.count * kBandRows);
     int64_t num_spans = 0;
     const auto candidate_at = [&](int64_t k) { return (int64_t)(band.order[k] & 0xffffffffu); };
-    for (int64_t k = 0; k < band.count; ++k) {
-        // The order of depth jumps about in memory.
-        if (k + 12 < band.count) {
-            __builtin_prefetch(&frame.candidates[candidate_at(k + 12)]);
-            __builtin_prefetch(&frame.rows[candidate_at(k + 12)]);
+    for (int64_t begin = 0; begin < band.count; begin += 16) {
+        const int some = (int)std::min<int64_t>(16, band.count - begin);
+        int32_t block[16][16];
+        Range rows[16];
+        for (int i = 0; i < some; ++i) {
+            const int64_t k = begin + i, candidate = candidate_at(k);
+            if (k + 12 < band.count) {  // the order of depth jumps about in memory
+                __builtin_prefetch(&frame.candidates[candidate_at(k + 12)]);
+                __builtin_prefetch(&frame.rows[candidate_at(k + 12)]);
+            }
+            band.splats[k] = frame.candidates[candidate];
+            frame.places[frame.place_first[candidate] + number] = (int32_t)k;
+            columns(band.splats[k], band.top, frame.blocks_x, block[i]);
+            rows[i] = frame.rows[candidate];
         }
-        const int64_t candidate = candidate_at(k);
-        const Splat& p = band.splats[k] = frame.candidates[candidate];
-        frame.places[frame.place_first[candidate] + number] = (int32_t)k;
-        int32_t block[16];
-        columns(p, band.top, frame.blocks_x, block);
-        const Range rows = frame.rows[candidate];
-        const int end = std::min(rows.last - band.top + 1, band.rows);
-        for (int r = std::max(rows.first - band.top, 0); r < end; ++r) {
-            const int32_t length = block[8 + r] - block[r], from = r * frame.blocks_x + block[r];
-            if (length <= 0) continue;
-            spans[num_spans++] = {(int32_t)k, from, length};
-            ++change[from], --change[from + length];
+        // Apart: each of these branches that is mispredicted would hold up the vectors above.
+        for (int i = 0; i < some; ++i) {
+            const int past = std::min(rows[i].last - band.top + 1, band.rows);
+            for (int r = std::max(rows[i].first - band.top, 0); r < past; ++r) {
+                const int32_t length = block[i][8 + r] - block[i][r], from = r * frame.blocks_x + block[i][r];
+                if (length <= 0) continue;
+                spans[num_spans++] = {(int32_t)(begin + i), from, length};
+                ++end[from], --end[from + length];
+            }
         }
     }
-    // change holds differences: a running sum gives the counts, another the first entries.
+    // `end` holds differences of counts: a running sum gives the counts, another where each block begins. Each has a
+    // place to spare.
     int64_t count = 0, total = 0;
-    for (int64_t b = 0; b < blocks; ++b) {
-        count += change[b];
-        change[b] = total;
-        total += count;
+    for (int64_t b = 0; b < blocks + kStride; ++b) {
+        count += end[b];
+        first[b] = end[b] = total;
+        total += count + 1;
     }
     int32_t* entries = band.entries.room(total + kAhead);
-    std::memset(entries + total, 0, kAhead * sizeof *entries);
     for (int64_t k = 0; k < num_spans; ++k) {
         const Span span = spans[k];
-        int64_t* next = change + span.block;
-        for (int32_t b = 0; b < span.length; ++b) entries[next[b]++] = span.splat;
+        for (int32_t b = 0; b < span.length; b += kStride) {
+            int64_t* next = end + span.block + b;
+            // No branch for each block: what is written beyond the span, the block's next splat or the end replaces.
+            for (int j = 0; j < kStride; ++j) {
+                entries[next[j]] = span.splat;
+                next[j] += b + j < span.length;
+            }
+        }
     }
-    // Each change[b] has moved on to where the next block begins, which is what first[b + 1] should say.
-    first[0] = 0;
+    // What is fetched ahead may lie in the spare places.
+    for (int64_t b = 0; b < blocks; ++b) entries[end[b]] = 0;
+    std::memset(entries + end[blocks], 0, (total + kAhead - end[blocks]) * sizeof *entries);
 }
 
 inline void prepare(const Scene& s, Frame& frame) {

@@ -16,8 +16,6 @@ using lanes::where_less;
 
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
-// Far below the least that counts; keeps the product of many small factors off the slow denormal numbers.
-constexpr float kFloor = 1e-20f;
 
 alignas(64) constexpr float kColumn[16] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 alignas(64) constexpr float kRow[16] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
@@ -31,6 +29,11 @@ struct Block {
 
     template <class F>
     void pixels(F visit) const {
+        if (whole) {  // apart, since loops of known length become vector code
+            for (int r = 0; r < 4; ++r)
+                for (int c = 0; c < 4; ++c) visit(4 * r + c, (int64_t)(y + r) * width + x + c);
+            return;
+        }
         for (int r = 0; r < 4 && y + r < height; ++r)
             for (int c = 0; c < 4 && x + c < width; ++c) visit(4 * r + c, (int64_t)(y + r) * width + x + c);
     }
@@ -87,7 +90,8 @@ struct Touch {
         const V16 exponent = dx * (dx * p.A + dy * p.B) + (dy * dy * p.C + p.log2_opacity);
         Touch t;
         t.raw = lanes::exp2_lanes(exponent);
-        t.alpha = where_less(exponent, splat(projection::kLog2MinAlpha), splat(0), lanes::minimum(t.raw, splat(kMaxAlpha)));
+        t.alpha = where_less(exponent, splat(projection::kLog2MinAlpha), splat(0),
+                             lanes::minimum_of_positive(t.raw, splat(kMaxAlpha)));
         return t;
     }
 };
@@ -150,17 +154,17 @@ void forward(const Scene& s, const Frame& frame, Band& band, const Images& out) 
         if (kLabels == Labels::mismatch) ids = block.gather_ids(s.ids);
         I16 winner = lanes::splat_int(-1);
         const int32_t* entries = band.entries.data() + band.first[index];
-        const int count = (int)(band.first[index + 1] - band.first[index]);
+        const int count = (int)(band.end[index] - band.first[index]);
         int e = 0;
         while (e < count) {
             for (const int end = std::min(e + kAskEvery, count); e < end; ++e) {
                 __builtin_prefetch(&band.splats[entries[e + binning::kAhead]]);
                 const Splat& p = band.splats[entries[e]];
                 const Touch t = Touch::of(column, row, p);
-                // Transmittance only falls, so a pixel that is done stays done, whatever T does then.
+                // A pixel that is done lets nothing through any more, so it stays done.
                 const V16 after = T * (1.0f - t.alpha);
                 const V16 weight = where_less(after, splat(kMinTransmittance), splat(0), T * t.alpha);
-                T = lanes::maximum(after, splat(kFloor));
+                T = where_less(after, splat(kMinTransmittance), splat(0), after);
                 red = red + weight * p.color[0];
                 green = green + weight * p.color[1];
                 blue = blue + weight * p.color[2];
@@ -179,7 +183,7 @@ void forward(const Scene& s, const Frame& frame, Band& band, const Images& out) 
                     most = std::fmax(most, lanes::largest(weight));
                 }
             }
-            if (lanes::largest(T) < kMinTransmittance) break;
+            if (lanes::largest(T) == 0) break;
         }
         band.used[index] = e;
         const V16 rest = 1.0f - alpha;
@@ -306,7 +310,7 @@ void backward(const Scene& s, const Frame& frame, Band& band, const Images& imag
             const V16 through = 1.0f - t.alpha, after = T * through;
             const V16 counted = where_less(after, splat(kMinTransmittance), splat(0), t.alpha);
             const V16 weight = T * counted;
-            T = lanes::maximum(after, splat(kFloor));
+            T = where_less(after, splat(kMinTransmittance), splat(0), after);
             V16 value = g[0] * p.color[0] + g[1] * p.color[1] + g[2] * p.color[2] + (g_depth * p.z + g_alpha);
             if (kLabels == Labels::masks && p.label >= 0)
                 value = value + masks.at(p.label, [&] { return block.gather(grad.masks + p.label * pixels); });

@@ -96,7 +96,7 @@ INLINE Pair<X> where_equal(const Pair<H>& a, int32_t b, const Pair<X>& x, const 
 
 template <class V>
 struct Broadcast {
-    INLINE V of(float x) { return V{} + x; }
+    INLINE V of(float x) { return x - V{}; }  // 0 + x would be computed, since it makes 0 of -0
 };
 template <class H>
 struct Broadcast<Pair<H>> {
@@ -115,6 +115,17 @@ struct BroadcastInt<Pair<H>> {
 INLINE I16 splat_int(int32_t x) { return BroadcastInt<I16>::of(x); }
 
 INLINE V16 minimum(const V16& a, const V16& b) { return where_less(b, a, b, a); }
+// The same for numbers above zero, whose bits are in the same order: one instruction, where compilers do not take the
+// machine's own minimum of floats for fear of NaN.
+template <class F>
+INLINE F minimum_of_positive(const F& a, const F& b) {
+    typedef typename IntOf<F>::type I;
+    return (F)((I)a < (I)b ? (I)a : (I)b);
+}
+template <class H>
+INLINE Pair<H> minimum_of_positive(const Pair<H>& a, const Pair<H>& b) {
+    return {minimum_of_positive(a.lo, b.lo), minimum_of_positive(a.hi, b.hi)};
+}
 INLINE V16 maximum(const V16& a, const V16& b) { return where_less(a, b, b, a); }
 
 INLINE V16 clamp(const V16& x, float low, float high) { return minimum(maximum(x, splat(low)), splat(high)); }
@@ -140,17 +151,6 @@ struct Memory<Pair<H>> {
 };
 INLINE V16 load(const float* p) { return Memory<V16>::load(p); }
 INLINE void store(float* p, const V16& v) { Memory<V16>::store(p, v); }
-
-template <class F>
-INLINE float largest(const F& v) {
-    float most = v[0];
-    for (unsigned k = 1; k < sizeof(F) / sizeof(float); ++k) most = v[k] > most ? v[k] : most;
-    return most;
-}
-template <class H>
-INLINE float largest(const Pair<H>& v) {
-    return largest(where_less(v.lo, v.hi, v.hi, v.lo));
-}
 
 INLINE V16 square_root(const V16& x) {
     alignas(64) float lane[16];
@@ -238,6 +238,23 @@ template <int stride, int count, class V>
 INLINE void exchange_all(V (&v)[count]) {
     for (int k = 0; k < count; ++k)
         if (!(k & stride)) exchange<stride>(v[k], v[k + stride]);
+}
+
+// The largest lane: exchanged with itself, a vector's lanes meet those that are `stride` away.
+template <int stride, class F>
+INLINE F larger(const F& v) {
+    F a = v, b = v;
+    exchange<stride>(a, b);
+    return a < b ? b : a;
+}
+INLINE float largest(const f4& v) { return larger<1>(larger<2>(v))[0]; }
+INLINE float largest(const f8& v) { return larger<1>(larger<2>(larger<4>(v)))[0]; }
+#if defined(__AVX512F__)
+INLINE float largest(const f16& v) { return larger<1>(larger<2>(larger<4>(larger<8>(v))))[0]; }
+#endif
+template <class H>
+INLINE float largest(const Pair<H>& v) {
+    return largest(where_less(v.lo, v.hi, v.hi, v.lo));
 }
 
 // A square of as many vectors as each has lanes: rows become columns.
