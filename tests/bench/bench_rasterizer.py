@@ -2,8 +2,9 @@
 
     python tests/bench/bench_rasterizer.py [--scaling PNG]
 
-Times are the thread's own CPU time (medians), so that neighbours on the machine matter less; its load stands beside
-them. Efficiency is against the peak of the fused multiply-add units, measured in the same run.
+The scenes are a cloud of Gaussians all through the view, and the surfaces of a room. Times are the thread's own CPU
+time (medians), so that neighbours on the machine matter less; its load stands beside them. Efficiency is against the
+peak of the fused multiply-add units, measured in the same run.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.processor import INSTRUCTION_SETS, features
+from ss_flow.tasks.processor import CPUINFO, INSTRUCTION_SETS, features
 
 CASES = ((2_000, 160, 120, 0), (10_000, 320, 240, 0), (10_000, 320, 240, 3), (50_000, 640, 480, 0))
 FLAGS = {
@@ -44,7 +45,7 @@ FORWARD_FLOP, BACKWARD_FLOP = 528, 816
 """Floating-point operations for one Gaussian in one block of sixteen pixels."""
 
 
-def scene(n: int, degree: int, size: float = 0.05) -> tuple[np.ndarray, ...]:
+def scene(n: int, degree: int) -> tuple[np.ndarray, ...]:
     """Gaussians all through the view, smaller where there are more."""
     rng = np.random.default_rng(0)
     z = rng.uniform(2, 6, n)
@@ -52,11 +53,42 @@ def scene(n: int, degree: int, size: float = 0.05) -> tuple[np.ndarray, ...]:
     arrays = (
         means,
         rng.normal(size=(n, 4)),
-        np.log(size) + 0.4 * rng.normal(size=(n, 3)) - np.log(n / 2000) / 3,
+        np.log(0.05) + 0.4 * rng.normal(size=(n, 3)) - np.log(n / 2000) / 3,
         rng.normal(size=n),
         0.3 * rng.normal(size=(n, (degree + 1) ** 2, 3)),
     )
     return tuple(np.ascontiguousarray(a, np.float32) for a in arrays)
+
+
+def surfaces(n: int, degree: int) -> tuple[np.ndarray, ...]:
+    """Opaque discs on five walls of a room and on eight balls in it, half of them each, as close as they are wide."""
+    rng = np.random.default_rng(0)
+    low, high = np.array([-3.0, -2, 1]), np.array([3.0, 2, 6])
+    walls = np.array([(2, 1), (0, 0), (0, 1), (1, 0), (1, 1)])  # axis that the wall is across; 0 = low side, 1 = high
+    size = high - low
+    areas = size.prod() / size[walls[:, 0]]
+    axis, side = walls[rng.choice(5, n // 2, p=areas / areas.sum())].T
+    on_walls = low + size * rng.uniform(size=(n // 2, 3))
+    on_walls[np.arange(n // 2), axis] = np.where(side, high[axis], low[axis])
+    normals = np.eye(3)[axis] * np.where(side, -1, 1)[:, None]
+
+    centers, radii = rng.uniform((-2, -1, 3), (2, 1.5, 5), (8, 3)), rng.uniform(0.3, 0.7, 8)
+    ball = rng.choice(8, n - n // 2, p=radii**2 / (radii**2).sum())
+    outward = rng.normal(size=(len(ball), 3))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    means = np.concatenate([on_walls, centers[ball] + radii[ball, None] * outward])
+    normals = np.concatenate([normals, outward])
+
+    spacing = np.sqrt((areas.sum() + 4 * np.pi * (radii**2).sum()) / n)
+    z = np.array([0, 0, 1.0])
+    # The turn that takes z to the normal; where that is -z, half a turn about x.
+    turns = np.concatenate([1 + normals @ z[:, None], np.cross(z, normals)], axis=1)
+    turns[np.linalg.norm(turns, axis=1) < 1e-6] = (0, 1, 0, 0)
+    along = -0.5 + 0.3 * rng.normal(size=(n, 2))
+    log_scales = np.log(spacing) + np.column_stack([along, np.full(n, -2.5)])
+    arrays = (means, turns, log_scales, rng.normal(2, 1, n), 0.3 * rng.normal(size=(n, (degree + 1) ** 2, 3)))
+    mixed = rng.permutation(n)
+    return tuple(np.ascontiguousarray(a[mixed], np.float32) for a in arrays)
 
 
 def camera_of(width: int, height: int, shift: float = 0.0) -> Camera:
@@ -87,9 +119,9 @@ def fma_peak(name: str) -> float:
         return max(float(measure(20_000_000, 0.5, sink.ctypes.data)) for _ in range(5))
 
 
-def passes(n: int, width: int, height: int, degree: int, size: float = 0.05) -> tuple[float, float, int]:
+def passes(parameters: tuple[np.ndarray, ...], width: int, height: int, degree: int) -> tuple[float, float, int]:
     """Milliseconds forward and backward, and the entries of one scene."""
-    parameters, camera = scene(n, degree, size), camera_of(width, height)
+    camera = camera_of(width, height)
     settings = Settings((0.1, 0.2, 0.3), 0, degree, winners=False)
     workspace = Workspace()
     done = NativePass(parameters, None, camera, settings, workspace=workspace)
@@ -102,21 +134,31 @@ def passes(n: int, width: int, height: int, degree: int, size: float = 0.05) -> 
     return forward, backward, entries
 
 
+def processor() -> str:
+    """The processor's name, where the system tells."""
+    for line in CPUINFO.read_text().splitlines() if CPUINFO.exists() else ():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return "unknown processor"
+
+
 def rendering() -> None:
-    """The four sizes on each instruction set."""
+    """The four sizes of both scenes on each instruction set."""
+    print(f"\n{processor()}")
     for name in (n for n in FLAGS if INSTRUCTION_SETS[n] <= features()):
         chosen = native.library(name)
         native_pass.library = lambda chosen=chosen: chosen  # type: ignore[assignment]
         peak = fma_peak(name)
         print(f"\n{name}: {peak:.0f} GFLOP/s at the peak of one thread")
-        print("| Gaussians, image | forward ms | forward + backward ms | ns an entry | share of the peak |")
+        print("| scene, Gaussians, image | forward ms | forward + backward ms | ns an entry | share of the peak |")
         print("|---|---|---|---|---|")
-        for n, width, height, degree in CASES:
-            forward, backward, entries = passes(n, width, height, degree)
+        for made, (n, width, height, degree) in ((m, c) for m in (scene, surfaces) for c in CASES):
+            forward, backward, entries = passes(made(n, degree), width, height, degree)
             flops = ((FORWARD_FLOP, forward), (BACKWARD_FLOP, backward))
             shares = (100 * flop * entries / (1e6 * ms) / peak for flop, ms in flops)
+            kind = "surfaces" if made is surfaces else "cloud"
             print(
-                f"| {n // 1000}k, {width}x{height}, SH{degree} | {forward:.2f} | {forward + backward:.2f} "
+                f"| {kind}, {n // 1000}k, {width}x{height}, SH{degree} | {forward:.2f} | {forward + backward:.2f} "
                 f"| {1e6 * forward / entries:.1f}, {1e6 * backward / entries:.1f} | "
                 + ", ".join(f"{s:.0f} %" for s in shares)
                 + " |"
@@ -193,7 +235,7 @@ def scaling(path: Path) -> None:
     print("\n| Gaussians, image | entries | forward ms | backward ms |\n|---|---|---|---|")
     for width, height in sizes:
         for n in (1_000, 10_000, 100_000, 1_000_000):
-            forward, backward, entries = passes(n, width, height, 0)
+            forward, backward, entries = passes(scene(n, 0), width, height, 0)
             rows.append((width, n, entries, forward, backward))
             print(f"| {n // 1000}k, {width}x{height} | {entries} | {forward:.2f} | {backward:.2f} |", flush=True)
     table = np.array(rows, float)
