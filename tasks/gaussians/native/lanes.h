@@ -43,13 +43,17 @@ struct IntOf<f16> {
 };
 typedef f16 V16;
 typedef i16 I16;
+typedef f16 Register;
 #elif defined(__AVX__)
 typedef Pair<f8> V16;
 typedef Pair<i8> I16;
+typedef f8 Register;
 #else
 typedef Pair<Pair<f4>> V16;
 typedef Pair<Pair<i4>> I16;
+typedef f4 Register;
 #endif
+// Register: what one register of the machine holds.
 
 #define LANES_BINARY(op)                                               \
     template <class H>                                                 \

@@ -3,13 +3,17 @@
 
 #include <cmath>
 
+#include "lanes.h"
 #include "workspace.h"
 
 namespace {
 
+using namespace lanes;
+
 constexpr int kRadius = 5;  // an 11 x 11 window, sigma 1.5 (Wang et al. 2004)
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 constexpr int kPiece = 16;  // rows
+constexpr int kLanes = sizeof(Register) / sizeof(float);
 
 struct Window {
     float tap[kRadius + 1];
@@ -20,9 +24,11 @@ struct Window {
     }
 };
 
-// A line with room for the window beyond both ends, where it is zero.
+// A line of n with room for the window beyond both ends, where it is zero, and for a whole register.
 struct Line {
-    explicit Line(int n, int pad) : values(n + 2 * pad, 0.0f), middle(values.data() + pad) {}
+    Line(int n, int pad) : n(n), pad(pad), values(n + 2 * pad + kLanes, 0.0f), middle(values.data() + pad) {}
+    void end() { std::fill(middle + n, middle + n + pad, 0.0f); }
+    int n, pad;
     std::vector<float> values;
     float* middle;
 };
@@ -43,13 +49,18 @@ void each_tap(int y, int height, const Window& w, F visit) {
     for (int k = std::max(-kRadius, -y); k <= std::min(kRadius, height - 1 - y); ++k) visit(y + k, w.tap[std::abs(k)]);
 }
 
-// Down the columns around one row: the moments x, y, xx, yy, xy.
-void add_moments(int n, float tap, const float* __restrict x, const float* __restrict y, float* __restrict mx,
-                 float* __restrict my, float* __restrict mxx, float* __restrict myy, float* __restrict mxy) {
-    for (int i = 0; i < n; ++i) {
-        const float a = tap * x[i], b = tap * y[i];
-        mx[i] += a, my[i] += b, mxx[i] += a * x[i], myy[i] += b * y[i], mxy[i] += a * y[i];
+Register read(const float* at) { return Memory<Register>::load(at); }
+
+// Down the columns around row y of images of `height` rows of n: each line gets one of the sums that `add(at, tap, sums)`
+// adds to, for a register of elements from `at` on; what lies beyond the end of a row is read, and counts nowhere.
+template <int count, class F>
+void convolve_columns(int n, int y, int height, const Window& w, Line (&to)[count], F add) {
+    for (int i = 0; i < n; i += kLanes) {
+        Register sums[count] = {};
+        each_tap(y, height, w, [&](int row, float tap) { add((int64_t)row * n + i, tap, sums); });
+        for (int k = 0; k < count; ++k) Memory<Register>::store(to[k].middle + i, sums[k]);
     }
+    for (Line& line : to) line.end();
 }
 
 // Per pixel s = (a1 a2) / (b1 b2) from the blurred x, y, xx, yy, xy. mx, mxx, mxy become the gradients of
@@ -93,9 +104,10 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
         auto& loss = static_cast<Workspace*>(workspace)->loss;
         const int n = width * channels, pieces = (height + kPiece - 1) / kPiece;
         const int64_t size = (int64_t)n * height;
-        float *share = loss.share.room(size), *x = loss.x.room(size), *y = loss.y.room(size);
-        float *mean = loss.towards_mean.room(size), *square = loss.towards_square.room(size);
-        float* product = loss.towards_product.room(size);
+        const int64_t wide = size + kLanes;  // the last row is read in whole registers
+        float *share = loss.share.room(size), *x = loss.x.room(wide), *y = loss.y.room(wide);
+        float *mean = loss.towards_mean.room(wide), *square = loss.towards_square.room(wide);
+        float* product = loss.towards_product.room(wide);
         double* sums = loss.sums.room(2 * pieces);
         double total = 0;
         for (int64_t p = 0; p < (int64_t)width * height; ++p) total += weight[p];
@@ -129,21 +141,19 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
         if (ssim_weight > 0) {
             const Window w;
             parallel::each(threads, pieces, [&](int64_t piece) {
-                Line down(n, kRadius * channels);
-                std::vector<float> moments(5 * (size_t)n), blurred(5 * (size_t)n);
+                const int pad = kRadius * channels;
+                Line down[5] = {{n, pad}, {n, pad}, {n, pad}, {n, pad}, {n, pad}};
+                std::vector<float> blurred(5 * (size_t)n);
+                float* m[5];
+                for (int k = 0; k < 5; ++k) m[k] = blurred.data() + (size_t)k * n;
                 Sum ssim;
                 rows(piece, [&](int r, int64_t at) {
-                    float* m[5];
-                    for (int k = 0; k < 5; ++k) m[k] = moments.data() + (size_t)k * n;
-                    std::fill(moments.begin(), moments.end(), 0.0f);
-                    each_tap(r, height, w, [&](int row, float tap) {
-                        add_moments(n, tap, x + (int64_t)row * n, y + (int64_t)row * n, m[0], m[1], m[2], m[3], m[4]);
+                    convolve_columns(n, r, height, w, down, [&](int64_t from, float tap, Register(&sums)[5]) {
+                        const Register u = read(x + from), v = read(y + from), a = tap * u, b = tap * v;
+                        sums[0] = sums[0] + a, sums[1] = sums[1] + b;
+                        sums[2] = sums[2] + a * u, sums[3] = sums[3] + b * v, sums[4] = sums[4] + a * v;
                     });
-                    for (int k = 0; k < 5; ++k) {
-                        std::copy(m[k], m[k] + n, down.middle);
-                        convolve(n, channels, w, down.middle, blurred.data() + (size_t)k * n);
-                    }
-                    for (int k = 0; k < 5; ++k) m[k] = blurred.data() + (size_t)k * n;
+                    for (int k = 0; k < 5; ++k) convolve(n, channels, w, down[k].middle, m[k]);
                     compare(n, share + at, m[0], m[1], m[2], m[3], m[4], mean + at, square + at, product + at);
                     ssim.add(m[1], n);
                 });
@@ -151,19 +161,19 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
             });
             // The blur is symmetric, so it carries the gradient back as well.
             parallel::each(threads, pieces, [&](int64_t piece) {
-                Line down(n, kRadius * channels);
-                std::vector<float> blurred[3] = {std::vector<float>(n), std::vector<float>(n), std::vector<float>(n)};
-                const float* planes[3] = {mean, square, product};
+                const int pad = kRadius * channels;
+                Line down[3] = {{n, pad}, {n, pad}, {n, pad}};
+                std::vector<float> blurred(3 * (size_t)n);
+                float *m = blurred.data(), *s = m + n, *p = s + n;
                 rows(piece, [&](int r, int64_t at) {
-                    for (int k = 0; k < 3; ++k) {
-                        std::fill(down.middle, down.middle + n, 0.0f);
-                        each_tap(r, height, w, [&](int row, float tap) {
-                            const float* from = planes[k] + (int64_t)row * n;
-                            for (int i = 0; i < n; ++i) down.middle[i] += tap * from[i];
-                        });
-                        convolve(n, channels, w, down.middle, blurred[k].data());
-                    }
-                    const float *m = blurred[0].data(), *s = blurred[1].data(), *p = blurred[2].data();
+                    convolve_columns(n, r, height, w, down, [&](int64_t from, float tap, Register(&sums)[3]) {
+                        sums[0] = sums[0] + tap * read(mean + from);
+                        sums[1] = sums[1] + tap * read(square + from);
+                        sums[2] = sums[2] + tap * read(product + from);
+                    });
+                    convolve(n, channels, w, down[0].middle, m);
+                    convolve(n, channels, w, down[1].middle, s);
+                    convolve(n, channels, w, down[2].middle, p);
                     for (int i = 0; i < n; ++i) {
                         const float towards = m[i] + 2 * x[at + i] * s[i] + y[at + i] * p[i];
                         gradient[at + i] += share[at + i] > 0 ? ssim_weight * towards : 0;
