@@ -133,7 +133,8 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     if capture.corrections is not None:
         clicked: list[PointLabels] = []
         if segmenter is not None:
-            clicked = [_clicked(capture, capture.corrections, embeddings, points, seen, segmenter, params)[1]]
+            of_clicks = _clicked(capture, capture.corrections, embeddings, points, seen, segmenter, params, apart=True)
+            clicked = [of_clicks[1]]
         joined, labels = labels, correct(points, seen, capture.corrections, pieces, labels, clicked)
         contained = params.segment.contained
         shown = each(
@@ -208,15 +209,20 @@ def _clicked(
     seen: tuple[Visibility, ...],
     segmenter: Model,
     params: SplitParams,
+    *,
+    apart: bool = False,
 ) -> tuple[tuple[PromptedMasks, ...], PointLabels]:
-    """The masks that clicks ask for in their own views, and the points labelled by what was clicked."""
+    """The masks that clicks ask for in their own views, and the points labelled by what was clicked.
+
+    apart: whether no clicked object is part of another.
+    """
     clicked = each(
         capture.frames,
         embeddings,
         clicks,
         names=capture.names,
         build=lambda frame, embedding, own: hints.clicked(
-            EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter
+            EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter, apart=apart
         ),
     )
     erosion, tau_label = params.observe.erosion, params.propagate.tau_label

@@ -7,6 +7,8 @@ prompted at points spread over it. No order of views enters.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ss_flow.running import progress
@@ -21,6 +23,7 @@ from ss_flow.tasks.artifacts import (
     Visibility,
 )
 from ss_flow.tasks.masks.erosion import ErosionParams
+from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView, paint_labels
 from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.models.catalogue import Model
@@ -35,16 +38,25 @@ _MOST = 0.5
 
 
 @task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=network_identity)
-def clicked(photo: EmbeddedPhoto, clicks: Clicks, *, speckle: float, model: Model) -> PromptedMasks:
+def clicked(
+    photo: EmbeddedPhoto, clicks: Clicks, *, speckle: float, model: Model, apart: bool = False
+) -> PromptedMasks:
     """One mask for each object that was clicked in a view, none in a view without clicks.
 
-    clicks: those of the photo. speckle: as in `RepromptParams`. Raises InputError when the model cannot be opened.
+    clicks: those of the photo. speckle: as in `RepromptParams`. apart: whether no object is part of another: then
+    points on one are outside of the others, and what two masks hold is in neither.
+    Raises InputError when the model cannot be opened.
     """
     prompts = {}
     for label in np.unique(clicks.label).tolist():
-        of_object = clicks.label == label
-        prompts[label] = Prompt(clicks.points[of_object], clicks.inside[of_object])
-    return prompt(photo, prompts, model, speckle)
+        own = clicks.label == label
+        used = own | ((clicks.inside == 1) & apart)
+        prompts[label] = Prompt(clicks.points[used], np.where(own, clicks.inside, 0)[used].astype(np.int32))
+    found = prompt(photo, prompts, model, speckle)
+    if not apart:
+        return found
+    masks = found.dense()
+    return replace(found, packed=pack_masks(masks & (masks.sum(axis=0) < 2)))
 
 
 @task()

@@ -334,7 +334,7 @@ def test_a_model_that_is_not_there_is_refused_with_one_sentence(arguments, expec
 
 
 def test_an_encoder_whose_packages_are_not_installed_is_refused(room, tmp_path, monkeypatch):
-    monkeypatch.setattr(catalogue, "_in_package", lambda file: None)
+    monkeypatch.setattr(catalogue, "in_package", lambda file: None)
     asked = (
         "--set",
         "semantics.encoder=imagenet-class-names",
@@ -347,7 +347,7 @@ def test_an_encoder_whose_packages_are_not_installed_is_refused(room, tmp_path, 
 
 
 def test_models_verify_says_when_there_is_nothing_to_verify(monkeypatch):
-    monkeypatch.setattr(catalogue, "_in_package", lambda file: None)
+    monkeypatch.setattr(catalogue, "in_package", lambda file: None)
     assert ss_flow("models", "verify").out == "no weights are on this machine\n"
 
 

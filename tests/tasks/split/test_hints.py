@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import box_scene
@@ -102,6 +103,33 @@ def test_without_any_mask_no_point_is_labelled():
 def test_a_view_without_clicks_opens_no_model():
     found = hints.clicked(EmbeddedPhoto(box_scene.frames()[0], NOTHING), no_clicks(), speckle=0.05, model=ABSENT)
     assert found.dense().shape == (0, HEIGHT, WIDTH) and len(found.label) == 0
+
+
+def test_objects_that_lie_apart_tell_each_others_masks_where_they_end(monkeypatch):
+    """Points on one are outside of the other, and what both masks hold belongs to neither."""
+    asked = []
+
+    class Scripted:
+        def __init__(self, model: Model) -> None: ...
+
+        def predict_prompt(self, embedding, points, inside) -> tuple[np.ndarray, float]:
+            asked.append({tuple(place): int(i) for place, i in zip(points.tolist(), inside, strict=True)})
+            answer = np.zeros((HEIGHT, WIDTH), bool)
+            answer[:, slice(0, 50) if len(asked) % 2 else slice(40, 90)] = True
+            return answer, 0.9
+
+    monkeypatch.setattr(importlib.import_module("ss_flow.tasks.split.reprompt"), "Sam", Scripted)
+    places = np.array([[10.0, 20], [70, 20], [80, 20]])
+    clicks = Clicks("0", np.array([5, 7, 7], np.int32), places, np.array([1, 1, 0], np.int32))
+    photo = EmbeddedPhoto(box_scene.frames()[0], NOTHING)
+    nested = hints.clicked(photo, clicks, speckle=0.0, model=ABSENT).dense()
+    assert asked == [{(10, 20): 1}, {(70, 20): 1, (80, 20): 0}]
+    asked.clear()
+    apart = hints.clicked(photo, clicks, speckle=0.0, model=ABSENT, apart=True).dense()
+    assert asked == [{(10, 20): 1, (70, 20): 0}, {(10, 20): 0, (70, 20): 1, (80, 20): 0}]
+    both = nested.all(axis=0)
+    assert both.any()
+    np.testing.assert_array_equal(apart, nested & ~both)
 
 
 def spread_in(seen: Visibility, own: PromptedMasks, label: np.ndarray, model=ABSENT, embedding=NOTHING):
