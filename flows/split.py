@@ -131,11 +131,11 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     shown = masks
     nested = find_parts(observed, masks, pieces, params=params.parts)
     if capture.corrections is not None:
-        clicked: list[PointLabels] = []
+        by_clicks: list[PointLabels] = []
         if segmenter is not None:
-            of_clicks = _clicked(capture, capture.corrections, embeddings, points, seen, segmenter, params, apart=True)
-            clicked = [of_clicks[1]]
-        joined, labels = labels, correct(points, seen, capture.corrections, pieces, labels, clicked)
+            clicked = _clicked(capture, capture.corrections, embeddings, segmenter, params, apart=True)
+            by_clicks = [_labelled(points, seen, clicked, params)]
+        joined, labels = labels, correct(points, seen, capture.corrections, pieces, labels, by_clicks)
         contained = params.segment.contained
         shown = each(
             seen,
@@ -181,7 +181,8 @@ def _masks_of_hints(
         raise InputError(
             "hints need a segmenter to be prompted with, and there is none; `ss-flow models list` names some."
         )
-    clicked, hinted = _clicked(capture, clicks, embeddings, points, seen, segmenter, params)
+    clicked = _clicked(capture, clicks, embeddings, segmenter, params)
+    hinted = _labelled(points, seen, clicked, params)
     masks = each(
         capture.frames,
         embeddings,
@@ -205,18 +206,13 @@ def _clicked(
     capture: Capture,
     clicks: tuple[Clicks, ...],
     embeddings: tuple[Embedding, ...],
-    points: PointCloud,
-    seen: tuple[Visibility, ...],
     segmenter: Model,
     params: SplitParams,
     *,
     apart: bool = False,
-) -> tuple[tuple[PromptedMasks, ...], PointLabels]:
-    """The masks that clicks ask for in their own views, and the points labelled by what was clicked.
-
-    apart: whether no clicked object is part of another.
-    """
-    clicked = each(
+) -> tuple[PromptedMasks, ...]:
+    """The masks that clicks ask for in their own views. apart: whether no clicked object is part of another."""
+    return each(
         capture.frames,
         embeddings,
         clicks,
@@ -225,5 +221,10 @@ def _clicked(
             EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter, apart=apart
         ),
     )
-    erosion, tau_label = params.observe.erosion, params.propagate.tau_label
-    return clicked, hints.label(points, seen, clicked, erosion=erosion, tau_label=tau_label)
+
+
+def _labelled(
+    points: PointCloud, seen: tuple[Visibility, ...], clicked: tuple[PromptedMasks, ...], params: SplitParams
+) -> PointLabels:
+    """The points by what was clicked."""
+    return hints.label(points, seen, clicked, erosion=params.observe.erosion, tau_label=params.propagate.tau_label)

@@ -111,21 +111,18 @@ class Why:
     """Where results are kept."""
 
     def run(self) -> int:
+        runs = runs_to_ask(self.store.existing_store(), self.scene)
+        for run in runs:
+            nodes = _tried(run)
+            if asked := named(run, nodes, self.step):
+                break
+        else:
+            known = ", ".join(sorted({n["step"] for n in _tried(runs[0])}))
+            raise InputError(f"the latest run of {runs[0].scene} has no step {self.step!r}; it has {known}.")
         out = console(json=False)
-        latest, *earlier = runs_to_ask(self.store.existing_store(), self.scene)
-        nodes = _tried(latest)
-        asked = named(latest, nodes, self.step)
-        if not asked:
-            known = sorted({n["step"] for n in nodes})
-            for run in earlier:
-                nodes = _tried(run)
-                if asked := named(run, nodes, self.step):
-                    started = time.strftime("%F %T", time.localtime(run.header["started"]))
-                    out.print(escape(f"the latest run has no such step; in that of {run.scene}, started {started}:"))
-                    break
-            else:
-                names = ", ".join(known)
-                raise InputError(f"the latest run of {latest.scene} has no step {self.step!r}; it has {names}.")
+        if run is not runs[0]:
+            started = time.strftime("%F %T", time.localtime(run.header["started"]))
+            out.print(escape(f"the latest run has no such step; in that of {run.scene}, started {started}:"))
         computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
         if not computed:
             out.print(f"{asked[0]['step']}: reused; nothing that it depends on changed")
@@ -174,9 +171,11 @@ def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
     The very last run may have stopped before the step (`--until`, an interrupt), or be an edit, which has other steps.
     Raises InputError when there is no run.
     """
-    latest = latest_run(store, scene)
-    every = list(latest_runs(store.runs, latest.scene if scene else None))
-    return sorted(every, key=lambda run: run.scene != latest.scene)
+    runs = list(latest_runs(store.runs, str(scene.resolve()) if scene else None))
+    if not runs:
+        about = f" of {scene}" if scene else ""
+        raise InputError(f"the store {store.location} knows no run{about}; `ss-flow run SCENE` makes one.")
+    return sorted(runs, key=lambda run: run.scene != runs[0].scene)
 
 
 def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:
@@ -297,9 +296,4 @@ def results_named(store: Store, scene: Path | None, what: str) -> tuple[Run | No
 
 def latest_run(store: Store, scene: Path | None) -> Run:
     """The latest run of a scene, or of any. Raises InputError when there is none."""
-    wanted = str(scene.resolve()) if scene else None
-    run = next(latest_runs(store.runs, wanted), None)
-    if run is None:
-        about = f" of {scene}" if scene else ""
-        raise InputError(f"the store {store.location} knows no run{about}; `ss-flow run SCENE` makes one.")
-    return run
+    return runs_to_ask(store, scene)[0]

@@ -29,16 +29,12 @@ class Picker:
         self._scene: EditedScene | None = joined(shown) if shown else None
         self._sigma = np.exp(self._scene.log_scales.max(axis=1)) if self._scene is not None else np.zeros(0)
 
-    def instance_at(self, pixel: Camera) -> int | None:
-        """The instance of the Gaussian with the largest weight in a picture's pixel; None where nothing is.
+    def met(self, pixel: Camera) -> tuple[int, Float64] | None:
+        """The instance of the Gaussian with the largest weight in a picture's pixel, and the place [3] on the ray,
+        world, that is as deep as the middle of this Gaussian; None where nothing is.
 
         pixel: the picture's camera, cropped to the one pixel: what is drawn in it does not depend on the others.
         """
-        met = self.met(pixel)
-        return None if met is None else met[0]
-
-    def met(self, pixel: Camera) -> tuple[int, Float64] | None:
-        """The same, and the place [3] on the ray, world, that is as deep as the middle of this Gaussian."""
         if self._scene is None:
             return None
         near = some_rows(self._scene, self._rows_near(pixel))

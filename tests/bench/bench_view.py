@@ -121,10 +121,10 @@ def _clicks(panel: Panel, eye: np.ndarray, middle: np.ndarray, side: float) -> d
         begun, busy = time.perf_counter(), time.process_time()
         pixel = pixel_met(eye, target - eye, wxyz, 500.0, (1280, 800))
         assert pixel is not None
-        found = panel.pick().instance_at(pixel)
+        found = panel.pick().met(pixel)
         seconds.append(time.perf_counter() - begun)
         processor.append(time.process_time() - busy)
-        met.add(found)
+        met.add(found and found[0])
     first = next(i for i in met if i)
     begun = time.perf_counter()
     session.select(first)
