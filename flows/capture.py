@@ -8,7 +8,7 @@ from typing import Any
 from ss_flow.errors import InputError
 from ss_flow.flows.depths import Beside, all_of, depth_source, measured, without_sensor
 from ss_flow.flows.params import CaptureParams
-from ss_flow.flows.poses import poses, refined_poses
+from ss_flow.flows.poses import fitting_poses, poses, refined_poses
 from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import (
     Cameras,
@@ -84,6 +84,8 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     Raises InputError when the depth that the parameters ask for cannot be had.
     """
     frames = _frames(scene, reference, params)
+    source = depth_source(scene, params)
+    sensed = measured(scene, reference, frames) if source == "sensor" else None
     if scene.poses is not None and scene.lenses is not None:
         cameras = ingest.cameras(
             frames,
@@ -93,9 +95,11 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
             metric=scene.metric,
             sparse=reference(scene.sparse) if scene.sparse else None,
         )
-        if params.refine_poses:
+        if params.refine_poses == "always":
             cameras = refined_poses(frames, cameras, params)
-    elif params.refine_poses:
+        elif params.refine_poses == "auto" and scene.given_scene is None:  # which lies where the given poses have it
+            cameras = fitting_poses(frames, cameras, sensed, params)
+    elif params.refine_poses == "always":
         raise InputError(f"{scene.root} has no poses that could be refined; leave --refine-poses out.")
     else:
         cameras = poses(frames, params.sfm, scene.names or None)
@@ -116,9 +120,9 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     given: Gaussians | None = None
     if scene.given_scene is not None:
         given = given_scene(frames, cameras, file=reference(scene.given_scene), params=params.given)
-    source, placing = depth_source(scene, params), None
-    if source == "sensor":
-        depths = presumed = measured(scene, reference, frames)
+    placing = None
+    if sensed is not None:
+        depths = presumed = sensed
         calibrates = params.calibrate == "depth"
         placing = registration(frames, cameras, depths, advise=not calibrates, params=params.registration)
         if calibrates:

@@ -12,6 +12,7 @@ from ss_flow.tasks.capture.given_scene import GivenSceneParams
 from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.neighbors import NeighborParams
+from ss_flow.tasks.capture.pose_fit import PoseFitParams
 from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.refine_poses import RefinePosesParams
 from ss_flow.tasks.capture.registration import RegistrationParams
@@ -52,13 +53,15 @@ class CaptureParams:
     ("rendered"), else several views (mvs)."""
     calibrate: Literal["none", "depth"] = "none"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
-    refine_poses: bool = False
-    """Whether poses that come with the capture are first refined by bundle adjustment."""
+    refine_poses: Literal["auto", "always", "never"] = "auto"
+    """Whether poses that come with the capture are first refined by bundle adjustment; "auto" does so where photos do
+    not fit the given ones, and uses what it finds where photos then fit better and measured depth no worse."""
     monodepth: str = "auto"
     """The network for depth=mono: a name of the catalogue, or "auto"."""
     ingest: IngestParams = field(default_factory=IngestParams)
     video: VideoParams = field(default_factory=VideoParams)
     sfm: SfmParams = field(default_factory=SfmParams)
+    pose_fit: PoseFitParams = field(default_factory=PoseFitParams)
     refine: RefinePosesParams = field(default_factory=RefinePosesParams)
     neighbors: NeighborParams = field(default_factory=NeighborParams)
     sweep: SweepParams = field(default_factory=SweepParams)

@@ -1,5 +1,5 @@
 """Photos without poses -> cameras: features a photo, matches with its partners, mapping, and once more for what is left
-out."""
+out. Photos with poses that do not fit them -> better ones."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import replace
 
 from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import INDEX, each, expand, gather, pick
-from ss_flow.tasks.artifacts import Cameras, Frame
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
 from ss_flow.tasks.capture.features import Features, features
 from ss_flow.tasks.capture.matches import Matches, match
 from ss_flow.tasks.capture.pairs import Look, look, partners
+from ss_flow.tasks.capture.pose_fit import PoseFit, PosePairs, better_poses, pose_fit, pose_pairs
 from ss_flow.tasks.capture.refine_poses import refined_cameras
 from ss_flow.tasks.capture.sfm import SfmParams, Unregistered, accepted, sfm, unregistered
 
@@ -37,7 +38,36 @@ def refined_poses(frames: tuple[Frame, ...], cameras: Cameras, params: CapturePa
     """Add the nodes that refine the poses of the frames, which came with the capture."""
     found = each(frames, build=lambda frame: features(frame, params=params.sfm.features))
     looks = each(found, build=lambda photo: look(photo, count=params.sfm.pairs.look_features))
-    return refined_cameras(found, cameras, matched(found, looks, params.sfm, None), params=params.refine)
+    insist = params.refine_poses == "always"
+    return refined_cameras(found, cameras, matched(found, looks, params.sfm, None), params=params.refine, insist=insist)
+
+
+def fitting_poses(
+    frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...] | None, params: CaptureParams
+) -> Cameras:
+    """Add the nodes that look at a few pairs of photos, and refine the given poses where these do not fit them.
+
+    depths: what a sensor measured, if one did; it has a say in which poses are better.
+    """
+    pairs = pose_pairs(cameras)
+
+    def compare(chosen: PosePairs) -> Cameras:
+        rows = chosen.view.tolist()
+        photos = each(pick(frames, rows), build=lambda frame: features(frame, params=params.sfm.features))
+        matches = gather([match(photos[a], pick(photos, [b])) for a, b in chosen.pair.tolist()])
+        known = gather([]) if depths is None else pick(depths, rows)
+        before = pose_fit(cameras, pairs, photos, matches, known)
+
+        def decide(fit: PoseFit) -> Cameras:
+            if not fit.distance > params.pose_fit.least_distance:
+                return cameras
+            refined = refined_poses(frames, cameras, params)
+            after = pose_fit(refined, pairs, photos, matches, known)
+            return better_poses(cameras, refined, before, after, params=params.pose_fit)
+
+        return expand(before, decide)
+
+    return expand(pairs, compare)
 
 
 def matched(

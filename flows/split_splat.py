@@ -34,6 +34,8 @@ LEADS_TO = {
     "rendered": "describe",
 }
 """Steps of which only other results tell what nodes there are: the result that all of these lead to."""
+LEADS_TO_CAMERAS = frozenset({"features", "look", "match", "partners", "pose_fit", "refined_cameras", "better_poses"})
+"""The same of steps that in some captures are known beforehand."""
 
 
 def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, params: Params) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model, 
 from ss_flow.flows.deliver import deliver, run_document, weight_free
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
-from ss_flow.flows.split_splat import LEADS_TO, split_splat
+from ss_flow.flows.split_splat import LEADS_TO, LEADS_TO_CAMERAS, split_splat
 from ss_flow.graph import Flow, gather, nodes_by_step
 from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.scene import open_scene
@@ -157,7 +157,7 @@ def prepare(
         extra: Capture | None = None
         if held_out.is_dir():
             # Of these views only the photos count.
-            plain = replace(params.capture, depth="auto", calibrate="none", refine_poses=False)
+            plain = replace(params.capture, depth="auto", calibrate="none", refine_poses="never")
             extra = capture(open_scene(held_out), reference, plain, networks.monodepth)
         results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
         if text is not None:
@@ -188,6 +188,8 @@ def _until(step: str, results: Mapping[str, Any]) -> Any:
         return results[LEADS_TO[step]]
     known = nodes_by_step(results.values())
     found = [node for name, nodes in known.items() if name.rpartition(".")[2] == step for node in nodes]
+    if not found and step in LEADS_TO_CAMERAS:
+        return results["cameras"]
     if not found:
         steps = sorted({name.rpartition(".")[2] for name in known} - results.keys())
         raise InputError(f"--until {step!r} names no step; there are {', '.join([*results, *steps])}.")

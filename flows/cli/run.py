@@ -49,7 +49,8 @@ class Run:
     calibrate: Literal["none", "depth"] = "none"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
     refine_poses: bool = False
-    """Refine the poses that come with the capture by bundle adjustment before anything else."""
+    """Refine the poses that come with the capture by bundle adjustment before anything else, also where photos and
+    depth do not tell that this is better."""
     undistorted: bool = False
     """Also write the photos and cameras that the run worked with, without distortion, as a COLMAP workspace."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
@@ -60,7 +61,7 @@ class Run:
         if self.calibrate != "none":
             params = settings.apply(params, [f"capture.calibrate={self.calibrate}"])
         if self.refine_poses:
-            params = settings.apply(params, ["capture.refine_poses=true"])
+            params = settings.apply(params, ["capture.refine_poses=always"])
         out = self.out or Path("ss-flow-out") / self.capture.resolve().stem
         scene = open_scene(self.capture, self.masks, self.hints, self.correct)
         if self.scene is not None:

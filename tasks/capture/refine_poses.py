@@ -43,6 +43,7 @@ def refined_cameras(
     matches: tuple[Matches, ...],
     *,
     params: RefinePosesParams = RefinePosesParams(),
+    insist: bool = True,
     seed: int = 0,
 ) -> Cameras:
     """The cameras with poses under which the photos' common points agree best.
@@ -51,7 +52,8 @@ def refined_cameras(
     smaller errors count. Photos tell neither the scale nor the place of the world: the result is brought onto the given
     cameras by the best similarity. How far the poses moved, and the median reprojection error of the same points
     before and after, is told as a warning. Sparse points are those of the last round.
-    Raises InputError when the photos have too little in common.
+    insist: whether it is an error when the photos have too little in common; else the given cameras are returned.
+    Raises InputError then.
     """
     pycolmap = load_pycolmap()
 
@@ -81,10 +83,13 @@ def refined_cameras(
         mapper.complete_and_merge_tracks(triangulating)
         mapper.filter_points(filtering)
         if model.num_points3D() < _LEAST_POINTS:
-            raise InputError(
-                f"the poses cannot be refined: only {model.num_points3D()} points are seen in common as the given "
-                "poses would have it; leave --refine-poses out, or give the photos without poses."
-            )
+            seen = f"only {model.num_points3D()} points are seen in common as the given poses would have it"
+            if insist:
+                raise InputError(
+                    f"the poses cannot be refined: {seen}; leave --refine-poses out, or give the photos without poses."
+                )
+            warn(f"The given poses were not refined: {seen}.")
+            return cameras
         _adjust(pycolmap, model, poses=True, intrinsics=params.intrinsics)
         mapper.filter_points(filtering)
         if error <= params.last_error:

@@ -1,4 +1,5 @@
-"""A capture with poses that are not exact: --refine-poses brings them back, before anything else, and says so."""
+"""A capture with poses that are not exact: they are brought back before anything else where photos and depth tell that
+this is better, or where it is asked for, and the run says so."""
 
 from __future__ import annotations
 
@@ -47,19 +48,61 @@ def turned(poses, true):
     return np.median(angles)
 
 
+def warnings_of(called):
+    return [text for node in called.document()["nodes"] for text in node["warnings"]]
+
+
+UNTIL = ("--until", "cameras")
+NEVER = ("--set", "capture.refine_poses=never")
+
+
 def test_jittered_poses_of_a_room_come_back_and_the_run_says_how_far_they_moved(scenes, tmp_path):
     store = tmp_path / "store"
-    until = ["--until", "cameras"]
-    true, given = (poses(run_tiny(scene, store, *until), store) for scene in scenes)
-    called = run_tiny(scenes[1], store, *until, "--refine-poses")
+    true, given = (poses(run_tiny(scene, store, *UNTIL, *NEVER), store) for scene in scenes)
+    called = run_tiny(scenes[1], store, *UNTIL, "--refine-poses")
     refined = poses(called, store)
     assert turned(given, true) > 0.8
     assert turned(refined, true) < turned(given, true) / 3
-    (told,) = [text for node in called.document()["nodes"] for text in node["warnings"]]
+    (told,) = warnings_of(called)
     assert told.startswith("The given poses of 12 of 12 views were refined: they moved by 0.0")
     assert told in called.err
-    same = run_tiny(scenes[1], store, *until, "--set", "capture.refine_poses=true")
+    same = run_tiny(scenes[1], store, *UNTIL, "--set", "capture.refine_poses=always")
     assert (same.computed(), same.results()) == ({}, called.results())
+    alone = run_tiny(scenes[1], store, *UNTIL)
+    assert alone.results() == called.results()
+    assert "not exact, so refined ones are used" in warnings_of(alone)[-1]
+    for step in ("features", "match", "refined_cameras", "better_poses"):
+        assert run_tiny(scenes[1], store, "--until", step).computed() == {}
+
+
+def test_poses_that_fit_their_photos_stay_without_a_word(scenes, tmp_path):
+    store = tmp_path / "store"
+    called = run_tiny(scenes[0], store, *UNTIL)
+    assert called.computed()["capture.pose_fit"] == 1
+    assert "capture.refined_cameras" not in called.computed()
+    assert warnings_of(called) == []
+    assert called.results() == run_tiny(scenes[0], store, *UNTIL, *NEVER).results()
+
+
+def test_refined_poses_that_gain_too_little_are_not_used(scenes, tmp_path):
+    store = tmp_path / "store"
+    called = run_tiny(scenes[1], store, *UNTIL, "--set", "capture.pose_fit.gain=1")
+    assert "refined ones fit no better" in warnings_of(called)[-1]
+    assert called.results() == run_tiny(scenes[1], store, *UNTIL, *NEVER).results()
+
+
+def test_where_photos_have_nothing_in_common_the_given_poses_stay(scenes, tmp_path):
+    import shutil
+
+    import cv2
+
+    capture, store = tmp_path / "plain", tmp_path / "store"
+    shutil.copytree(scenes[1], capture)
+    for photo in (capture / "color").iterdir():
+        cv2.imwrite(str(photo), np.full((240, 320, 3), 128, np.uint8))
+    called = run_tiny(capture, store, *UNTIL)
+    assert called.code == 0
+    assert called.results() == run_tiny(capture, store, *UNTIL, *NEVER).results()
 
 
 def test_photos_without_poses_have_none_to_refine(scenes, tmp_path):
@@ -70,6 +113,9 @@ def test_photos_without_poses_have_none_to_refine(scenes, tmp_path):
     assert "has no poses that could be refined" in called.err
 
 
-@pytest.mark.parametrize("name", ["default", "paper", "reference", "fast", "thorough"])
-def test_no_preset_refines_poses(name):
-    assert preset(Params(), name).capture.refine_poses is False
+@pytest.mark.parametrize(
+    ("name", "when"),
+    [("default", "auto"), ("fast", "auto"), ("thorough", "auto"), ("paper", "never"), ("reference", "never")],
+)
+def test_the_papers_presets_take_poses_as_they_are(name, when):
+    assert preset(Params(), name).capture.refine_poses == when

@@ -164,7 +164,8 @@ def test_until_stops_there_and_writes_no_output(tiny, tmp_path):
     called = run_tiny(tiny.scene, tmp_path / "store", "--until", "dense", out=tmp_path / "out")
     assert called.code == 0
     steps = {n["step"] for n in called.document()["nodes"]}
-    assert steps == {"capture.ingest", "capture.cameras", "capture.sensor_depth", "capture.unit", "split.dense"}
+    of_poses = {"capture.cameras", "capture.pose_pairs", "capture.pose_fit"}
+    assert steps == {"capture.ingest", *of_poses, "capture.sensor_depth", "capture.unit", "split.dense"}
     assert not (tmp_path / "out").exists()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Frame
@@ -79,3 +81,17 @@ def views(eyes, width=160, height=120, focal=150.0, target=(0.0, 0.0, 3.5)):
         metric=True,
     )
     return frames, artifact, [depth for _, depth in rendered]
+
+
+def jittered(cameras, distance, degrees, seed=0):
+    """The cameras with poses that are off by so much on (quadratic) average."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    poses = cameras.world_to_camera.copy()
+    for pose in poses:
+        off = np.eye(4)
+        off[:3, :3] = cv2.Rodrigues(np.radians(rng.normal(0, degrees / np.sqrt(3), 3)))[0]
+        off[:3, 3] = rng.normal(0, distance / np.sqrt(3), 3)
+        pose[:] = off @ pose
+    return replace(cameras, world_to_camera=poses)

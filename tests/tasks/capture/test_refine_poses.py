@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from generated_views import views
+from generated_views import jittered, views
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.features import Features, features
@@ -19,19 +19,6 @@ def scene():
     frames, cameras, _ = views(EYES, width=320, height=240, focal=300.0)
     photos = [features(frame) for frame in frames]
     return photos, cameras, tuple(match(photo, photos[:row]) for row, photo in enumerate(photos))
-
-
-def jittered(cameras, distance, degrees, seed=0):
-    import cv2
-
-    rng = np.random.default_rng(seed)
-    poses = cameras.world_to_camera.copy()
-    for pose in poses:
-        off = np.eye(4)
-        off[:3, :3] = cv2.Rodrigues(np.radians(rng.normal(0, degrees / np.sqrt(3), 3)))[0]
-        off[:3, 3] = rng.normal(0, distance / np.sqrt(3), 3)
-        pose[:] = off @ pose
-    return replace(cameras, world_to_camera=poses)
 
 
 def relative_errors(cameras, true):
