@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ss_flow.flows.cli.context import StoreOptions
-from ss_flow.flows.cli.finished import open_run
+from ss_flow.flows.cli.context import StoreOptions, open_run
 from ss_flow.flows.demo import RECIPE
 from ss_flow.flows.generated import RoomParams, generate
 from ss_flow.flows.generated.layout import furnish
@@ -54,7 +53,7 @@ def main() -> None:
     parser.add_argument("demo", type=Path)
     demo = parser.parse_args().demo
     run = open_run(demo / "result", StoreOptions(), ("scene", "cameras"))
-    scene, cameras = run.load("scene"), run.load("cameras")
+    scene, cameras = run.results.one("scene"), run.results.one("cameras")
     params = RoomParams(**json.loads((demo / "scene" / RECIPE).read_text())["room"])
     room = generate(params)
     things: dict[int, tuple[np.ndarray, np.ndarray]] = {}

@@ -104,7 +104,10 @@ def _empty(instance_id: int) -> TriangleMesh:
 
 
 def _framed(own: Gaussians, camera: Camera) -> Camera | None:
-    """A view that the instance fills; None where most of it is behind the camera."""
+    """The part of a view that the instance fills; None where most of it is behind the camera, or none in the picture.
+
+    No photo trained what would lie beside the picture; Gaussians near the camera may hang there as large as a wall.
+    """
     if not len(own):
         return None
     uv, depth = project(own.means, camera)
@@ -115,9 +118,10 @@ def _framed(own: Gaussians, camera: Camera) -> Camera | None:
     border = 0.08 * max(float((high - low).max()), 1.0)
     scale = _PICTURE / (float((high - low).max()) + 2 * border)
     larger = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    x0, y0 = np.floor((low - border) * scale).astype(int).tolist()
-    x1, y1 = np.ceil((high + border) * scale).astype(int).tolist()
-    return larger.cropped(x0, y0, x1, y1)
+    size = larger.width, larger.height
+    x0, y0 = np.floor((low - border) * scale).astype(int).clip(0, size).tolist()
+    x1, y1 = np.ceil((high + border) * scale).astype(int).clip(0, size).tolist()
+    return larger.cropped(x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
 
 def _fuse(o3d: Any, volume: Any, seen: Rendering, view: Camera) -> Float32:
