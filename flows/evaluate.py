@@ -214,7 +214,13 @@ def lerf_2d(nodes: Nodes, scene: LabelledScene) -> dict[str, Metrics]:
 def _found(nodes: Nodes, scene: LabelledScene) -> tuple[Similarity, ...]:
     """How well the text of each category fits each instance."""
     return tuple(
-        similarity(nodes["describe"], text=text, prompt=scene.query.prompt, encoder=scene.encoder)
+        similarity(
+            nodes["describe"],
+            text=text,
+            prompt=scene.query.prompt,
+            encoder=scene.encoder,
+            tau_view=scene.query.tau_view,
+        )
         for text in scene.texts.values()
     )
 

@@ -427,6 +427,8 @@ class Descriptors:
     """[V] visible area of the instance in each of them, in pixels."""
     encoder: str
     """Name of the text-image encoder."""
+    vectors: Float32
+    """[V, D] of unit length, what the encoder says of each view."""
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,9 @@ class Query:
     """How much further than the best an instance may be and still match; the run's own value when left out."""
     top_k: OptionalCount = None
     """Take the best so many that the text fits, in the place of those near the best (--tau-corr)."""
+    tau_view: OptionalNumber = None
+    """Cosine distance above which views of an object show different sides of it, each of which the text may mean; 0
+    takes their mean alone; the run's own value when left out."""
     background: bool = False
     """Rank the background too, as if it were an object."""
     parts: bool = False
@@ -112,6 +115,10 @@ class Query:
             params = replace(params, tau_corr=self.tau_corr)
         if not 0 < params.tau_corr <= 2:
             raise InputError(f"--tau-corr {params.tau_corr} is out of range; it must be above 0 and at most 2.")
+        if self.tau_view is not None:
+            params = replace(params, tau_view=self.tau_view)
+        if not 0 <= params.tau_view <= 2:
+            raise InputError(f"--tau-view {params.tau_view} is out of range; it must be 0 to 2.")
         if self.top_k is not None:
             if self.top_k < 1 or self.tau_corr is not None:
                 raise InputError("--top-k takes a whole number from 1 on, and takes the place of --tau-corr.")

@@ -18,6 +18,7 @@ from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.ranges import Count, Fraction, Natural, Positive
 from ss_flow.tasks.semantics.encoders import encoder_of
+from ss_flow.tasks.semantics.sides import mean_direction
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def describe(
     encoder: Model | None = None,
     params: DescribeParams = DescribeParams(),
 ) -> Descriptors:
-    """The mean of an instance's pictures, or of a part's, as unit vectors, brought back to unit length.
+    """The mean of an instance's pictures, or of a part's, as unit vectors, brought back to unit length; and each of them.
 
     frames: at least those with a mask of the instance. encoder: None for colour words.
     Returns zeros and no views when no mask covers `min_area` of its image.
@@ -80,13 +81,11 @@ def describe(
         else:
             vectors.append(model.encode_images([crop(image, mask, params)])[0])
         progress(done + 1, len(chosen), frame.name)
+    of_views = np.array(vectors, np.float32).reshape(len(chosen), model.dimension)
     weights = (area[chosen] if params.weighted else np.ones(len(chosen))).astype(np.float32)
-    total = np.einsum("v,vd->d", weights, np.array(vectors, np.float32).reshape(len(chosen), model.dimension))
-    length = np.linalg.norm(total)
-    embedding = (total / length if length > 0 else total).astype(np.float32)
-    return Descriptors(
-        instance.instance_id, embedding, tuple(instance.views[row] for row in chosen), weights, model.name
-    )
+    embedding = mean_direction(of_views, weights)
+    views = tuple(instance.views[row] for row in chosen)
+    return Descriptors(instance.instance_id, embedding, views, weights, model.name, of_views)
 
 
 @task(resources=Resources(cores=1, memory_mb=1200), environment=network_identity)

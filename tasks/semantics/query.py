@@ -13,8 +13,9 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Descriptors, Float32, Int32, PartDescriptors, UInt8
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
-from ss_flow.tasks.ranges import Count, Fraction, Positive
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative, Positive
 from ss_flow.tasks.semantics.encoders import encoder_of
+from ss_flow.tasks.semantics.sides import sides
 
 _TEMPERATURE = 10.0
 _HALF = 0.5
@@ -33,6 +34,9 @@ class QueryParams:
     min_relevancy: Fraction = 0.5
     """Relevancy above which a text fits an instance: above 0.5 it fits better than every negative of the encoder; 0
     leaves out the test, as in the paper. Colour words keep to 0.5."""
+    tau_view: NonNegative = 0.0
+    """Cosine distance above which two views of an object show different sides of it, as the cover and the back of a
+    book; a text then fits as well as it fits the mean or the side that it fits best. 0 takes the mean alone."""
     prompt: str = "{text}"
     """What the encoder reads, with the text in the place of {text}; "an image of a {text}" in the code of the paper's
     authors."""
@@ -114,7 +118,8 @@ def query(
     background: bool = False,
 ) -> QueryResult:
     """Rank the instances against a text; in a flow, two nodes. See `similarity` and `chosen`."""
-    found = similarity(descriptors, text=text, prompt=params.prompt, encoder=encoder, background=background)
+    reading = {"prompt": params.prompt, "tau_view": params.tau_view}
+    found = similarity(descriptors, text=text, encoder=encoder, background=background, **reading)
     return chosen(found, params=params)
 
 
@@ -126,6 +131,7 @@ def similarity(
     prompt: str = QueryParams.prompt,
     encoder: Model | None = None,
     background: bool = False,
+    tau_view: NonNegative = QueryParams.tau_view,
 ) -> Similarity:
     """How well a text fits each instance.
 
@@ -136,6 +142,9 @@ def similarity(
 
     With colour words the negatives are the other colours, so a text fits the objects of which its colour is the most
     common.
+
+    With `tau_view` above 0 an object has several `sides`, and fits a term as its best side does; a term that is not
+    meant counts for all of them, whichever side it fits.
 
     background: whether the background (id 0) is ranked too. It is no object: a text that fits it best, "wall" or
     "grey", would otherwise leave the objects further than tau_corr behind.
@@ -154,16 +163,25 @@ def similarity(
             "encoder."
         )
     ranked = [d for d in descriptors if background or d.instance_id != 0]
-    vectors = np.array([d.embedding for d in ranked], np.float32).reshape(len(ranked), model.dimension)
-    seen = np.linalg.norm(vectors, axis=1) > 0
+    seen = np.array([d.embedding.any() for d in ranked], bool)
+    looks = [sides(d, tau_view) for d in ranked]
+    vectors = np.concatenate([np.zeros((0, model.dimension), np.float32), *looks])
+    owner = np.repeat(np.arange(len(looks)), [len(each) for each in looks])
+    first = np.searchsorted(owner, np.arange(len(looks)))
 
     def cosines(phrases: tuple[str, ...]) -> Float32:
         words = model.encode_texts([prompt.replace("{text}", phrase) for phrase in phrases])
-        return np.einsum("ld,td->lt", vectors, words)
+        return np.einsum("sd,td->st", vectors, words)
 
-    fits = [cosines((term, *model.negatives(term), *(unwanted if wanted else ()))) for term in wanted or unwanted]
-    scores = np.stack([found[:, 0] for found in fits], axis=1)
-    relevancies = np.stack([relevancy_of(found[:, 0], found[:, 1:]) for found in fits], axis=1)
+    def best(of_sides: Float32) -> Float32:
+        return np.maximum.reduceat(of_sides, first) if len(first) else of_sides
+
+    refused = best(cosines(unwanted))[owner] if wanted and unwanted else vectors[:, :0]
+    fits = [cosines((term, *model.negatives(term))) for term in wanted or unwanted]
+    scores = np.stack([best(found[:, 0]) for found in fits], axis=1)
+    against = [np.concatenate([found[:, 1:], refused], axis=1) for found in fits]
+    shares = [relevancy_of(found[:, 0], others) for found, others in zip(fits, against, strict=True)]
+    relevancies = np.stack([best(share) for share in shares], axis=1)
     score, relevancy = (
         (scores.min(axis=1), relevancies.min(axis=1))
         if wanted

@@ -145,8 +145,10 @@ def test_gaussians_are_rendered():
 def test_cameras_descriptors_metrics_and_answers_have_pictures():
     embedding = np.zeros(len(TERMS), np.float32)
     embedding[TERMS.index("red")] = 1
-    described = Descriptors(1, embedding, np.zeros(1, np.int32), np.ones(1, np.float32), "colour words")
-    other = Descriptors(1, np.ones(4, np.float32) / 2, np.zeros(1, np.int32), np.ones(1, np.float32), "clip")
+    described, other = (
+        Descriptors(1, vector, ("0",), np.ones(1, np.float32), encoder, vector[None])
+        for vector, encoder in ((embedding, "colour words"), (np.ones(4, np.float32) / 2, "clip"))
+    )
     assert has_color(draw(described), (255, 0, 0))
     for value in (CAMERAS, other, Metrics({"miou": 0.5}), query((described,), text="red")):
         picture = draw(value, points=CLOUD)

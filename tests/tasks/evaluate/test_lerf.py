@@ -61,8 +61,9 @@ def _both() -> Gaussians:
 
 
 SCENE = _both()
+TERM_VECTORS = np.eye(11, dtype=np.float32)
 DESCRIPTORS = tuple(
-    Descriptors(i, np.eye(11, dtype=np.float32)[term], NAMES, np.ones(2, np.float32), "colour words")
+    Descriptors(i, TERM_VECTORS[term], NAMES, np.ones(2, np.float32), "colour words", TERM_VECTORS[[term, term]])
     for i, term in ((1, 2), (2, 5))
 )
 """Red, and blue, of the eleven terms."""

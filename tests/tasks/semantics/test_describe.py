@@ -159,3 +159,12 @@ def test_a_photo_that_was_stored_as_jpeg_is_read_as_rgb():
     data = cv2.imencode(".jpg", image[..., ::-1])[1].ravel()
     jpeg = Frame("view0", W, H, data, np.zeros(0, np.uint8), W, H)
     assert TERMS[describe((jpeg,), instance).embedding.argmax()] == "blue"
+
+
+def test_the_vector_of_each_view_is_kept():
+    frames, instance = scene((square(10, 10, 60), RED), (square(10, 10, 30), BLUE))
+    found = describe(frames, instance)
+    red, blue = (describe(*scene((square(10, 10, side), colour))).vectors for side, colour in ((60, RED), (30, BLUE)))
+    np.testing.assert_array_equal(found.vectors, np.concatenate([red, blue]))
+    total = (found.weights[:, None] * found.vectors).sum(axis=0)
+    np.testing.assert_allclose(found.embedding, total / np.linalg.norm(total), atol=1e-6)

@@ -7,8 +7,8 @@ from ss_flow.tasks.semantics.name import InstanceNames, given_names, name
 
 
 def descriptor(instance_id: int, embedding, encoder: str) -> Descriptors:
-    nothing = np.zeros(0, np.int32)
-    return Descriptors(instance_id, np.asarray(embedding, np.float32), nothing, nothing.astype(np.float32), encoder)
+    vector = np.asarray(embedding, np.float32)
+    return Descriptors(instance_id, vector, (), np.zeros(0, np.float32), encoder, np.zeros((0, len(vector)), np.float32))
 
 
 def test_colour_words_name_objects_by_their_colour():

@@ -12,7 +12,7 @@ from ss_flow.tasks.semantics.query import QueryParams, chosen, query, similarity
 
 def descriptor(instance_id: int, embedding, encoder: str = "colour words") -> Descriptors:
     vector = np.asarray(embedding, np.float32)
-    return Descriptors(instance_id, vector, np.zeros(1, np.int32), np.ones(1, np.float32), encoder)
+    return Descriptors(instance_id, vector, ("0",), np.ones(1, np.float32), encoder, vector[None])
 
 
 def coloured(instance_id: int, **share: float) -> Descriptors:
