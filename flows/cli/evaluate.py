@@ -143,12 +143,14 @@ class Evaluate:
             "object_psnr": float(np.mean(views.psnr)),
             "object_ssim": float(np.mean(views.ssim)),
             "band_psnr": views.band_psnr,
+            "band_ssim": views.band_ssim,
         }
         each = {"instance": views.instance, "views": views.views, "psnr": views.psnr, "ssim": views.ssim}
         if perception is None:
             warnings.append("LPIPS was not measured: no network for it is here; `ss-flow doctor` tells how to get one.")
         else:
             means |= {"lpips": views.whole_lpips, "object_lpips": float(np.mean(views.lpips))}
+            means["band_lpips"] = views.band_lpips
             each["lpips"] = views.lpips
         if len(taken.residual):
             means |= {"residual": float(np.mean(taken.residual)), "worst_residual": float(np.max(taken.residual))}

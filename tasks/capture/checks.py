@@ -8,9 +8,10 @@ is changed.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.running import progress, warn
 from ss_flow.task import task
@@ -27,8 +28,18 @@ _MOST_PIXELS, _LEAST_PIXELS = 4000, 200
 """So many pixels of a view are carried, evenly chosen, and so many must be met in the neighbour."""
 _OCCLUDED = 0.25
 """Relative difference of depth beyond which something else stands in front."""
-_SCALES = np.exp(np.arange(-0.7, 0.701, 0.05))
+_NEAR = np.exp(0.05 * np.arange(-14, 15))
 """Factors on the depth that are tried."""
+_NOW = len(_NEAR) // 2
+"""The one in the middle, 1."""
+_FAR = np.exp(0.25 * np.arange(-29, 30))
+"""Those that are tried, and then the near ones around the best, where none of the near ones makes depth fit: as with
+millimetres taken for metres."""
+_ENDLESS = 1e6
+"""A factor by which depth fits as well as without any motion of the camera between two views. What fits hardly better
+says nothing of scale."""
+_FAR_PAIRS = 40
+"""So many pairs of views are enough to find a far one."""
 _TIED = 1 / 3
 """Weight of an exposure of 1 against a factor between neighbours: errors of many factors must not add up over a walk.
 Slow changes are told as less than they are."""
@@ -60,36 +71,39 @@ def checks(
 ) -> CaptureChecks:
     """Compare each view with its two nearest neighbours, and warn of what does not fit.
 
-    Neighbours are the views whose cameras are nearest and look alike. Told of are duplicates, principal points far from
-    the middle, depth of another scale, poses that disagree with depth (all, or single ones), photos that show something
-    else than their neighbours, and exposures that change. All lists are in the order of the frames.
+    Neighbours are the views whose cameras are nearest and look the same way. Told of are duplicates, principal points
+    far from the middle, depth of another scale, poses that disagree with depth (all, or single ones), and, by the scale
+    that fits, photos that show something else than their neighbours, and exposures that change. All lists are in the
+    order of the frames.
     """
-    small = [_grey(frame) for frame in frames]
-    sized = [camera_of(cameras, view).scaled(*image.shape[::-1]) for view, image in enumerate(small)]
-    maps = [_resized(depth.depth, image.shape) for depth, image in zip(depths, small, strict=True)]
-    clouds = [_cloud(camera, depth) for camera, depth in zip(sized, maps, strict=True)]
+    views = [_view(frame, camera_of(cameras, row), depths[row]) for row, frame in enumerate(frames)]
+    pairs: list[tuple[int, int]] = []
+    near: list[Float64] = []
+    for row, frame in enumerate(frames):
+        for other in _neighbours(cameras, row):
+            pairs.append((row, other))
+            near.append(_errors(views[row], views[other], _NEAR))
+        progress(row + 1, len(frames), frame.name)
+    scale = _scale([(views[row], views[other]) for row, other in pairs], near, params)
     error, likeness, gains = np.full(len(frames), np.nan), np.full(len(frames), np.nan), []
-    by_scale = np.zeros((0, len(_SCALES)))
-    for view, frame in enumerate(frames):
-        met = []
-        for other in _neighbours(cameras, view):
-            found = _carried(clouds[view], sized, (view, other), small, maps[other])
-            if found is not None:
-                errors, alike, gain = found
-                met.append((errors, alike))
-                gains.append((view, other, gain))
-        if met:
-            table = np.array([errors for errors, _ in met])
-            by_scale = np.concatenate([by_scale, table])
-            error[view] = np.median(table[:, len(_SCALES) // 2])
-            likeness[view] = max(alike for _, alike in met)
-        progress(view + 1, len(frames), frame.name)
-    exposure = _exposures(len(frames), gains)
-    found_scale = _scale(by_scale, params)
-    names = tuple(frame.name for frame in frames)
-    result = CaptureChecks(names, error, likeness, exposure, found_scale, _duplicates(names, small))
+    now: dict[int, list[float]] = {}
+    for (row, other), errors in zip(pairs, near, strict=True):
+        if np.isfinite(errors[_NOW]):
+            now.setdefault(row, []).append(errors[_NOW])
+            error[row] = np.median(now[row])
+        alike = _alike(views[row], views[other], scale)
+        if alike is not None:
+            likeness[row] = np.fmax(likeness[row], alike[0])
+            gains.append((row, other, alike[1]))
+    names, exposure = tuple(frame.name for frame in frames), _exposures(len(frames), gains)
+    duplicates = _duplicates(names, [view.grey for view in views])
+    result = CaptureChecks(names, error, likeness, exposure, scale, duplicates)
     for text in _told(result, cameras, params):
         warn(text)
+    if pairs and scale == 1 and not np.isfinite(error).any():
+        warn(
+            "No view's depth is met in the views beside it: poses, intrinsics and depth disagree, or nothing overlaps."
+        )
     return result
 
 
@@ -109,18 +123,19 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterab
             f"{names[worst]} at ({cx:.0f}, {cy:.0f}) of {width} x {height} pixels; are its intrinsics exchanged?"
         )
     known = found.depth_error[np.isfinite(found.depth_error)]
-    if not len(known):
-        return
-    usual = float(np.median(known))
+    usual = float(np.median(known)) if len(known) else None
     if found.depth_scale != 1:
+        now = "hardly any of it is met now" if usual is None else f"median {usual:.1%} now"
         yield (
-            f"Depth fits the poses {found.depth_scale:.2f} times as large: neighbours' depth then differs clearly less "
-            f"than now (median {usual:.1%}); is its unit right?"
+            f"Depth fits the poses {found.depth_scale:.3g} times as large: neighbours' depth then differs clearly less "
+            f"({now}); is its unit right?"
         )
-    elif usual > params.max_depth_error:
+    elif usual is not None and usual > params.max_depth_error:
         yield f"Depth carried from view to view differs by {usual:.1%} (median): poses, intrinsics and depth disagree."
+    if np.isnan(found.likeness).all():
+        return
     with np.errstate(invalid="ignore"):
-        odd = found.depth_error > max(params.max_view_error * usual, 0.01)
+        odd = found.depth_error > max(params.max_view_error * (usual or 0), 0.01)
         strange = found.likeness < np.nanmedian(found.likeness) - params.min_likeness
     if strange.any():
         worst = int(np.nanargmin(found.likeness))
@@ -128,7 +143,7 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterab
             f"{strange.sum()} photos do not show what their neighbours do (correlation {found.likeness[worst]:.2f}, "
             f"usually {np.nanmedian(found.likeness):.2f}): {first_of(names[strange].tolist())}; turned, or elsewhere?"
         )
-    if (odd & ~strange).any():
+    if found.depth_scale == 1 and (odd & ~strange).any():
         worst = int(np.nanargmax(np.where(odd & ~strange, found.depth_error, np.nan)))
         yield (
             f"The poses of {(odd & ~strange).sum()} views do not fit their depth (difference to neighbours "
@@ -142,28 +157,32 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterab
         )
 
 
-def _grey(frame: Frame) -> Float32:
+@dataclass(frozen=True)
+class _View:
+    """One view at a size that is quick to compare."""
+
+    grey: Float32
     """[h, w] 0..255, linear enough to compare."""
+    depth: Float32
+    """[h, w] 0 where unknown."""
+    camera: Camera
+    points: Float64
+    """[n, 3] some pixels with depth, in the camera's frame."""
+    pixels: NDArray[np.intp]
+    """[n] which they are, in the flat image."""
+
+
+def _view(frame: Frame, camera: Camera, depth: DepthMap) -> _View:
     import cv2
 
-    image = cv2.cvtColor(decode_rgb(frame), cv2.COLOR_RGB2GRAY)
-    return cv2.resize(image, size_within(_SIDE, frame.width, frame.height), interpolation=cv2.INTER_AREA).astype(
-        np.float32
-    )
-
-
-def _resized(depth: Float32, shape: tuple[int, ...]) -> Float32:
-    import cv2
-
-    return np.asarray(cv2.resize(depth, shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
-
-
-def _cloud(camera: Camera, depth: Float32) -> tuple[Float64, np.ndarray]:
-    """[n, 3] some pixels with depth in the camera's frame, and their flat indices."""
-    at_home = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, np.eye(4))
-    known = np.flatnonzero(depth > 0)
+    size = size_within(_SIDE, frame.width, frame.height)
+    grey = cv2.resize(cv2.cvtColor(decode_rgb(frame), cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    small = np.asarray(cv2.resize(depth.depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+    sized = camera.scaled(*size)
+    known = np.flatnonzero(small > 0)
     known = known[:: -(-len(known) // _MOST_PIXELS) or 1]
-    return backproject(depth, at_home)[known], known
+    points = backproject(small, replace(sized, world_to_camera=np.eye(4)))[known]
+    return _View(grey.astype(np.float32), small, sized, points, known)
 
 
 def _neighbours(cameras: Cameras, view: int) -> list[int]:
@@ -177,54 +196,68 @@ def _neighbours(cameras: Cameras, view: int) -> list[int]:
     return [int(other) for other in nearest if np.isfinite(distance[other])]
 
 
-def _carried(
-    cloud: tuple[Float64, np.ndarray],
-    cameras: Sequence[Camera],
-    pair: tuple[int, int],
-    small: Sequence[Float32],
-    depth: Float32,
-) -> tuple[Float64, float, float] | None:
-    """A view carried into a neighbour: the median relative difference of depth for each scale, the correlation of their
-    grey values, and the factor between these; None where they share too little.
+def _errors(view: _View, other: _View, scales: Float64) -> Float64:
+    """[S] the median relative difference of a view's depth, carried to another one, and that one's, for each factor on
+    both; NaN where they share too little."""
+    errors = np.full(len(scales), np.nan)
+    home = _from(view, other)
+    for row, scale in enumerate(scales):
+        _, u, v, z = pixels_in_view(view.points * scale, home)
+        measured = other.depth[v, u]
+        if (measured > 0).sum() >= _LEAST_PIXELS:
+            errors[row] = np.median(_difference(z, scale * measured)[measured > 0])
+    return errors
 
-    depth: of the neighbour.
+
+def _alike(view: _View, other: _View, scale: float) -> tuple[float, float] | None:
+    """How a view's grey values go with another's where both show the same: the correlation, and the factor between
+    them; None where they share too little.
+
+    scale: a factor on the depth of both.
     """
-    view, other = pair
-    points, pixels = cloud
-    relative = cameras[other].world_to_camera @ np.linalg.inv(cameras[view].world_to_camera)
-    at_home = cameras[other]
-    home = Camera(at_home.width, at_home.height, at_home.fx, at_home.fy, at_home.cx, at_home.cy, relative)
-    errors = np.full(len(_SCALES), np.nan)
-    seen: tuple[float, float] | None = None
-    for row, scale in enumerate(_SCALES):
-        rows, u, v, z = pixels_in_view(points * scale, home)
-        measured = depth[v, u] * scale
-        known = measured > 0
-        if known.sum() < _LEAST_PIXELS:
-            continue
-        difference = np.abs(z[known] / measured[known] - 1)
-        errors[row] = np.median(np.minimum(difference, _OCCLUDED))
-        if row == len(_SCALES) // 2:
-            visible = known.copy()
-            visible[known] = difference < _OCCLUDED
-            a, b = small[view].ravel()[pixels[rows[visible]]], small[other][v[visible], u[visible]]
-            if len(a) >= _LEAST_PIXELS and a.std() > 1 and b.std() > 1:
-                seen = float(np.corrcoef(a, b)[0, 1]), float(np.median((b + 1) / (a + 1)))
-    if seen is None:
+    rows, u, v, z = pixels_in_view(view.points * scale, _from(view, other))
+    measured = other.depth[v, u]
+    visible = (measured > 0) & (_difference(z, scale * measured) < _OCCLUDED)
+    a, b = view.grey.ravel()[view.pixels[rows[visible]]], other.grey[v[visible], u[visible]]
+    if len(a) < _LEAST_PIXELS or a.std() <= 1 or b.std() <= 1:
         return None
-    return errors, *seen
+    return float(np.corrcoef(a, b)[0, 1]), float(np.median((b + 1) / (a + 1)))
 
 
-def _scale(by_scale: Float64, params: CheckParams) -> float:
-    """The factor on the depth that makes neighbours agree best, 1 where it is hardly better than none."""
-    enough = 2 * np.isfinite(by_scale).sum(axis=0) >= max(len(by_scale), 1)
-    if not enough[len(_SCALES) // 2]:
-        return 1.0
-    curve = np.full(len(_SCALES), np.inf)
-    curve[enough] = np.nanmedian(by_scale[:, enough], axis=0)
-    best, now = int(curve.argmin()), curve[len(_SCALES) // 2]
-    clear = curve[best] < (1 - params.min_scale_gain) * now and now > 0.01 and abs(np.log(_SCALES[best])) > 0.07
-    return float(_SCALES[best]) if clear else 1.0
+def _from(view: _View, other: _View) -> Camera:
+    """The other's camera, as seen in the frame of the first."""
+    camera = other.camera
+    relative = camera.world_to_camera @ np.linalg.inv(view.camera.world_to_camera)
+    return replace(camera, world_to_camera=relative)
+
+
+def _difference(carried: Float64, measured: Float64) -> Float64:
+    """Relative, 0 to that of an occlusion, which also stands where nothing was measured."""
+    return np.minimum(np.abs(carried - measured) / np.maximum(measured, 1e-12), _OCCLUDED)
+
+
+def _scale(pairs: Sequence[tuple[_View, _View]], near: Sequence[Float64], params: CheckParams) -> float:
+    """The factor on the depth that makes neighbours agree best, 1 where it is hardly better than none.
+
+    near: of each pair, the errors for the near factors.
+    """
+    curve = _curve(near)
+    best, now = int(curve.argmin()), curve[_NOW]
+    if curve[best] > params.max_depth_error:
+        some = pairs[:: -(-len(pairs) // _FAR_PAIRS) or 1]
+        around = _FAR[_curve([_errors(*pair, _FAR) for pair in some]).argmin()] * _NEAR
+        far = _curve([_errors(*pair, around) for pair in some])
+        parallax = _curve([_errors(*pair, np.array([_ENDLESS])) for pair in some])[0]
+        if far.min() <= min(params.max_depth_error, parallax / 2):
+            return float(around[far.argmin()])
+    clear = curve[best] < (1 - params.min_scale_gain) * now and now > 0.01 and abs(np.log(_NEAR[best])) > 0.07
+    return float(_NEAR[best]) if clear else 1.0
+
+
+def _curve(errors: Sequence[Float64]) -> Float64:
+    """[S] the median over the pairs that are met at any scale; where one is not met, it differs most."""
+    met = [np.nan_to_num(one, nan=_OCCLUDED) for one in errors if np.isfinite(one).any()]
+    return np.median(met, axis=0) if met else np.full(len(_NEAR), _OCCLUDED)
 
 
 def _exposures(count: int, gains: Sequence[tuple[int, int, float]]) -> Float64:

@@ -46,7 +46,10 @@ class ObjectViews:
     whole_ssim: float
     whole_lpips: float
     band_psnr: float
-    """dB within 5 pixels of the borders of true instances."""
+    """dB within 5 pixels of the borders of true instances; NaN where there is no border, as the next two."""
+    band_ssim: float
+    band_lpips: float
+    """NaN without a network for it, too."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def object_views(
         whole.append(_compared(image, photo, valid, differences))
         band = border_band(ids.ids) & valid
         if band.any():
-            bands.append(psnr(image, photo, band))
+            bands.append(_compared(image, photo, band, differences))
         for instance in np.unique(ids.ids[valid & (ids.ids > 0)]).tolist():
             inside = _box(ids.ids == instance) & valid
             boxes[instance].append(_compared(image, photo, inside, differences))
@@ -96,17 +99,14 @@ def object_views(
     if not boxes:
         raise InputError("The annotated views show no instance; at least one is needed to compare objects.")
     means = np.array([np.mean(boxes[i], axis=0) for i in sorted(boxes)])
-    whole_psnr, whole_ssim, whole_lpips = np.mean(whole, axis=0).tolist()
     return ObjectViews(
         np.array(sorted(boxes), np.int32),
         np.array([len(boxes[i]) for i in sorted(boxes)], np.int32),
         means[:, 0],
         means[:, 1],
         means[:, 2],
-        whole_psnr,
-        whole_ssim,
-        whole_lpips,
-        float(np.mean(bands)) if bands else float("nan"),
+        *np.mean(whole, axis=0).tolist(),
+        *np.mean(bands or [[np.nan] * 3], axis=0).tolist(),
     )
 
 

@@ -128,6 +128,7 @@ def test_objects_are_compared_one_by_one(tiny):
     taken = document["objects"]["instances taken out"]
     assert taken and all(0 <= row["residual"] < 0.2 for row in taken)
     assert found["worst_residual"] == max(row["residual"] for row in taken)
+    assert 5 < found["band_psnr"] < 100 and 0 < found["band_ssim"] < 1
 
 
 @pytest.fixture
@@ -156,7 +157,7 @@ def test_lpips_of_objects_is_told_where_its_network_is(tiny, lpips_here):
     document = answer.document()
     found, rows = document["metrics"]["training views"], document["objects"]["true objects"]
     assert document["warnings"] == [] and found["lpips"] > 0
-    assert found["object_lpips"] == pytest.approx(np.mean([row["lpips"] for row in rows]))
+    assert found["object_lpips"] == pytest.approx(np.mean([row["lpips"] for row in rows])) and found["band_lpips"] > 0
     assert "object_lpips" in ss_flow("eval", tiny.out, "--protocol", "objects", "--cache", tiny.store).out
 
 

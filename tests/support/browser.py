@@ -43,6 +43,8 @@ class Page:
         """Errors and warnings of its console, and what it failed to load or run."""
         self.requests: list[str] = []
         """The addresses that it asked for."""
+        self.patience = 120.0
+        """Seconds that an answer may take."""
         Thread(target=self._listen, daemon=True).start()
         for domain in ("Runtime", "Log", "Network", "Page"):
             self.call(f"{domain}.enable")
@@ -66,14 +68,14 @@ class Page:
         elif method == "Network.requestWillBeSent":
             self.requests.append(told["request"]["url"])
 
-    def call(self, method: str, *, timeout: float = 120, **parameters: Any) -> dict[str, Any]:
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """A method of the protocol. Raises TimeoutError when the browser does not answer."""
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         try:
-            answer = self._answers.get(timeout=timeout)
+            answer = self._answers.get(timeout=self.patience)
         except Empty:
-            raise TimeoutError(f"{method}: no answer in {timeout} s") from None
+            raise TimeoutError(f"{method}: no answer in {self.patience} s") from None
         assert answer["id"] == number and "error" not in answer, answer
         return dict(answer["result"])
 

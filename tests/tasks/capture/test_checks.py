@@ -61,16 +61,29 @@ def test_jitter_of_all_poses_is_told_with_its_size(room: Room) -> None:
     assert "poses, intrinsics and depth disagree" in said and f"{np.nanmedian(found.depth_error):.1%}" in said
 
 
+def test_cameras_in_wrong_places_are_not_taken_for_a_scale(room: Room) -> None:
+    heard, found = _checked(room, cameras=_jittered(room, 0.0, 0.3, range(len(room))))
+    assert any("poses, intrinsics and depth disagree" in said for said in heard) and found.depth_scale == 1
+
+
 def test_a_single_wrong_pose_is_named(room: Room) -> None:
     (said,), found = _checked(room, cameras=_jittered(room, 6.0, 0.2, [5]))
     assert "do not fit their depth" in said and "0005" in said
     assert int(np.nanargmax(found.depth_error)) in (4, 5, 6)
 
 
-@pytest.mark.parametrize("factor", [0.75, 1.3])
+@pytest.mark.parametrize("factor", [0.75, 1.3, 0.2, 5, 0.1, 0.3048, 1000])
 def test_depth_of_a_wrong_scale_is_told_with_the_right_one(room: Room, factor: float) -> None:
     (said,), found = _checked(room, depth=room.depth * np.float32(factor))
     assert "is its unit right?" in said and found.depth_scale == pytest.approx(1 / factor, rel=0.06)
+    assert np.nanmin(found.likeness) > 0.8, "photos are compared by the depth that fits"
+
+
+def test_poses_the_wrong_way_round_are_told(room: Room) -> None:
+    heard, _ = _checked(
+        room, cameras=replace(room.cameras, world_to_camera=np.linalg.inv(room.cameras.world_to_camera))
+    )
+    assert any("poses, intrinsics and depth disagree" in said for said in heard)
 
 
 def test_duplicates_are_counted_and_named(room: Room) -> None:

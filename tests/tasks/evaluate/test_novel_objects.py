@@ -72,14 +72,19 @@ def test_lpips_of_an_object_is_that_of_its_box(tmp_path) -> None:
     assert without.psnr.tolist() == found.psnr.tolist()
 
 
-def test_the_band_is_five_pixels_on_either_side_of_a_border() -> None:
-    band = border_band(TRUTH.ids)
+def test_the_band_is_five_pixels_on_either_side_of_a_border(tmp_path) -> None:
+    band, model = border_band(TRUTH.ids), narrow_lpips(tmp_path)
     assert band[24, 3:13].all() and not band[24, 2] and not band[24, 13:19].any()
+    clean = object_views((_frame(SEEN),), CAMERAS, SCENE, (TRUTH,), perception=model)
+    assert (clean.band_psnr, clean.band_ssim, clean.band_lpips) == (100, pytest.approx(1), 0)
     photo = SEEN.copy()
     photo[24, 16] = 255 - photo[24, 16]  # in the middle of the first object
-    assert object_views((_frame(photo),), CAMERAS, SCENE, (TRUTH,)).band_psnr == 100
+    found = object_views((_frame(photo),), CAMERAS, SCENE, (TRUTH,))
+    assert found.band_psnr == 100 > found.whole_psnr and np.isnan(found.band_lpips)
+    photo = SEEN.copy()
     photo[24, 8] = 255 - photo[24, 8]
-    assert object_views((_frame(photo),), CAMERAS, SCENE, (TRUTH,)).band_psnr < 60
+    found = object_views((_frame(photo),), CAMERAS, SCENE, (TRUTH,), perception=model)
+    assert found.band_psnr < 60 and found.band_ssim < found.whole_ssim < 1 and found.band_lpips > found.whole_lpips > 0
 
 
 def test_pixels_that_are_not_valid_do_not_count() -> None:
