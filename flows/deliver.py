@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.files import write_atomically
@@ -23,6 +23,9 @@ from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_masks, write_scene
 from ss_flow.tasks.deliver.ply import write_cloud
+
+if TYPE_CHECKING:
+    from ss_flow.tasks.deliver.report import Comparison
 
 STATUS_EXIT = {"ok": 0, "degraded": 3, "failed": 1}
 METRICS = {
@@ -160,8 +163,17 @@ def photo_lenses(frames: Sequence[Frame], cameras: Cameras, scene_files: SceneFi
     return [photo_lens(frame, stated.get(frame.name), cameras) for frame in frames]
 
 
-def write_report(file: Path, results: Results, document: dict[str, Any], instances: dict[str, Any]) -> None:
-    """Write report.html, whole or not at all. instances: the document of instances.json."""
+def write_report(
+    file: Path,
+    results: Results,
+    document: dict[str, Any],
+    instances: dict[str, Any],
+    comparison: Comparison | None = None,
+) -> None:
+    """Write report.html, whole or not at all.
+
+    instances: the document of instances.json. comparison: with another run.
+    """
     from ss_flow.tasks.deliver.report import Insight, Votes, report_html
     from ss_flow.tasks.deliver.suspects import suspects
 
@@ -175,7 +187,8 @@ def write_report(file: Path, results: Results, document: dict[str, Any], instanc
     votes = Votes.of(results.one("propagate"), document["params"]["split.propagate.tau_label"])
     insight = Insight(results.all("thumbnails"), doubtful, votes)
     pictures = results.all("report_pictures")
-    write_atomically(file, report_html(document, pictures=pictures, instances=instances, insight=insight))
+    page = report_html(document, pictures=pictures, instances=instances, insight=insight, comparison=comparison)
+    write_atomically(file, page)
 
 
 def _content_of(folder: Path) -> str | None:

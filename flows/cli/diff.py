@@ -42,23 +42,28 @@ class Diff:
     """Print one JSON document."""
 
     def run(self) -> int:
-        first, second = read_run(self.first), read_run(self.second)
-        views = _views_of_both(self.first, self.second)
-        matched = correspondence(_id_images(views)) if views else None
-        document = {
-            "runs": [str(self.first), str(self.second)],
-            "scenes": [first["scene"], second["scene"]],
-            "params": _changed(first["params"], second["params"]),
-            "models": _changed(first["models"], second["models"]),
-            "metrics": _both(_flat(first["metrics"]), _flat(second["metrics"])),
-            "steps": _steps(first["nodes"], second["nodes"]),
-            "instances": None if matched is None else _instances(matched, len(views)),
-        }
+        document = difference(self.first, self.second)
         if self.json:
             print(json.dumps(document, indent=1))
         else:
             _tell(document, console(json=False))
         return 0
+
+
+def difference(one: Path, other: Path) -> dict[str, Any]:
+    """What two output folders of runs differ in. Raises InputError where one is none, or is damaged."""
+    first, second = read_run(one), read_run(other)
+    views = _views_of_both(one, other)
+    matched = correspondence(_id_images(views)) if views else None
+    return {
+        "runs": [str(one), str(other)],
+        "scenes": [first["scene"], second["scene"]],
+        "params": _changed(first["params"], second["params"]),
+        "models": _changed(first["models"], second["models"]),
+        "metrics": _both(_flat(first["metrics"]), _flat(second["metrics"])),
+        "steps": _steps(first["nodes"], second["nodes"]),
+        "instances": None if matched is None else _instances(matched, len(views)),
+    }
 
 
 def _changed(first: dict[str, Any], second: dict[str, Any]) -> dict[str, list[Any]]:
@@ -143,14 +148,18 @@ def _tell(document: dict[str, Any], out: Console) -> None:
         return
     what = f"mean IoU over {found['views']} views; an object without a partner counts 0"
     out.print(f"objects: agreement {found['agreement']:.3f} ({what})")
-    for line in _lines(found)[:_SHOWN]:
+    lines = changes(found)
+    for line in lines[:_SHOWN]:
         out.print(f"  {line}")
-    if (more := len(_lines(found)) - _SHOWN) > 0:
+    if (more := len(lines) - _SHOWN) > 0:
         out.print(f"  and {more} more; --json lists them all")
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
-    """What a reader should know of the objects, the gravest first."""
+def changes(found: dict[str, Any]) -> list[str]:
+    """What a reader should know of the objects, the gravest first.
+
+    found: "instances" of a `difference`.
+    """
 
     def listed(ids: list[int]) -> str:
         return ", ".join(str(i) for i in ids)

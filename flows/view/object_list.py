@@ -37,7 +37,10 @@ class _Row:
 
 
 class ObjectList:
-    """Objects page by page, the largest first, or those first that a text means."""
+    """Objects page by page, the largest first, or those first that a text means.
+
+    Its parts are viser's: `text`, `tau`, `answer`, `rows`, and `turn`, the buttons below them.
+    """
 
     def __init__(
         self, gui: viser.GuiApi, session: Session, search: Search | None, choose: Callable[[tuple[int, ...]], None]
@@ -48,9 +51,9 @@ class ObjectList:
         self._found: QueryResult | None = None
         self._page = 0
         self._lock = threading.RLock()
-        self._text = gui.add_text("Search", "", hint="What to look for, such as: red mug, not the lamp")
+        self.text = gui.add_text("Search", "", hint="What to look for, such as: red mug, not the lamp")
         tau = search.params.tau_corr if search is not None else 0.02
-        self._tau = gui.add_slider(
+        self.tau = gui.add_slider(
             "tau_corr",
             min=0.001,
             max=max(0.3, tau),
@@ -58,13 +61,13 @@ class ObjectList:
             initial_value=tau,
             hint="How much further than the best an object may be and still match",
         )
-        self._answer = gui.add_markdown("" if search is not None else "This run has no descriptors to search.")
-        self._text.disabled = self._tau.disabled = search is None
+        self.answer = gui.add_markdown("" if search is not None else "This run has no descriptors to search.")
+        self.text.disabled = self.tau.disabled = search is None
         self.rows = [_Row(gui.add_button(" ")) for _ in range(_ROWS)]
-        self._turn = gui.add_button_group("Page", ("Before", "Next", "Select matches"))
-        self._text.on_update(lambda _: self._ask())
-        self._tau.on_update(lambda _: self._ask())
-        self._turn.on_click(self._turned)
+        self.turn = gui.add_button_group("Page", ("Before", "Next", "Select matches"))
+        self.text.on_update(lambda _: self._ask())
+        self.tau.on_update(lambda _: self._ask())
+        self.turn.on_click(self._turned)
         for row in self.rows:
             self._on_click(row)
 
@@ -89,7 +92,7 @@ class ObjectList:
             for row, instance in zip(self.rows, [*listed, *[None] * (_ROWS - len(listed))], strict=True):
                 self._fill(row, instance)
             first = self._page * _ROWS
-            self._turn.label = f"{first + 1}-{first + len(listed)} of {len(order)}" if order else "none"
+            self.turn.label = f"{first + 1}-{first + len(listed)} of {len(order)}" if order else "none"
 
     def _order(self) -> list[int]:
         """The ids to list, those that are asked for first."""
@@ -134,7 +137,7 @@ class ObjectList:
     def _ask(self) -> None:
         """Search anew. Letters that came meanwhile are answered at once, by who comes last."""
         with self._lock:
-            text, tau = self._text.value.strip(), float(self._tau.value)
+            text, tau = self.text.value.strip(), float(self.tau.value)
             self._page, self._found = 0, None
             answer = ""
             if text and self._search is not None and tau > 0:
@@ -144,7 +147,7 @@ class ObjectList:
                     answer = f"{matches} match" if self._found.accepted else "Nothing in the scene matches."
                 except InputError as error:
                     answer = str(error)
-            self._answer.content = answer
+            self.answer.content = answer
             self.show()
 
     def _turned(self, event: Any) -> None:

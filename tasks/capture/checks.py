@@ -126,9 +126,10 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterab
     usual = float(np.median(known)) if len(known) else None
     if found.depth_scale != 1:
         now = "hardly any of it is met now" if usual is None else f"median {usual:.1%} now"
+        factor = float(f"{found.depth_scale:.2g}")  # the steps in which it was searched tell no more digits
         yield (
-            f"Depth fits the poses {found.depth_scale:.3g} times as large: neighbours' depth then differs clearly less "
-            f"({now}); is its unit right?"
+            f"Depth fits the poses {factor:g} times as large: neighbours' depth then differs clearly less ({now}); is "
+            "its unit right?"
         )
     elif usual is not None and usual > params.max_depth_error:
         yield f"Depth carried from view to view differs by {usual:.1%} (median): poses, intrinsics and depth disagree."

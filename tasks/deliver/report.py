@@ -88,12 +88,29 @@ class Insight:
     votes: Votes
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """How a run differs from another one; in each pair the other's value comes first."""
+
+    name: str
+    """Of the other."""
+    changed: Mapping[str, Sequence[Any]]
+    """Parameters and networks that are not the same."""
+    metrics: Mapping[str, Sequence[float | None]]
+    """By "stage.name"; None where one was not measured."""
+    agreement: float | None
+    """Mean IoU of the objects of both, one without a partner counting 0; None where no view is in both."""
+    objects: Sequence[str]
+    """What became of objects, in words; "the first" is the other run."""
+
+
 def report_html(
     run: Mapping[str, Any],
     *,
     pictures: Sequence[Picture],
     instances: Mapping[str, Any] | None = None,
     insight: Insight | None = None,
+    comparison: Comparison | None = None,
 ) -> str:
     """The report of a run.
 
@@ -137,6 +154,8 @@ def report_html(
         suspects=insight.suspects if insight else (),
         votes=insight.votes if insight else None,
         timeline=timeline(nodes),
+        comparison=comparison,
+        differences=_differences(comparison.metrics if comparison else {}),
     )
 
 
@@ -190,6 +209,18 @@ def _metrics(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
         else:
             loose.append((_words(stage), _figure(stage, values)))
     return groups + ([{"stage": "Measured", "figures": loose}] if loose else [])
+
+
+def _differences(metrics: Mapping[str, Sequence[float | None]]) -> list[tuple[str, str, str, str]]:
+    """A row a figure that both have or one lacks: what it is, the other's, this one's, and the difference."""
+    rows = []
+    for name, (other, own) in metrics.items():
+        stage, _, metric = name.partition(".")
+        difference = "" if own is None or other is None else f"{own - other:+.3f}"
+        when = _STAGES.get(stage) or _words(stage)
+        what = f"{_words(metric)} ({when[:1].lower()}{when[1:]})"
+        rows.append((what, _figure(metric, other), _figure(metric, own), difference))
+    return rows
 
 
 def _words(name: str) -> str:

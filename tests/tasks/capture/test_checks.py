@@ -76,6 +76,7 @@ def test_a_single_wrong_pose_is_named(room: Room) -> None:
 def test_depth_of_a_wrong_scale_is_told_with_the_right_one(room: Room, factor: float) -> None:
     (said,), found = _checked(room, depth=room.depth * np.float32(factor))
     assert "is its unit right?" in said and found.depth_scale == pytest.approx(1 / factor, rel=0.06)
+    assert f" {float(f'{found.depth_scale:.2g}'):g} times as large" in said
     assert np.nanmin(found.likeness) > 0.8, "photos are compared by the depth that fits"
 
 

@@ -1,0 +1,70 @@
+"""The viewer's search box and its slider."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_runs import ss_flow
+
+pytest.importorskip("viser", reason="needs the extra `view`")
+from ss_flow.flows.cli.context import StoreOptions, open_run
+from ss_flow.flows.cli.view import search_of
+from ss_flow.flows.view.object_list import ObjectList
+from ss_flow.flows.view.viewer import Viewer
+from ss_flow.tasks.semantics.query import QueryParams, QueryResult, Similarity, chosen
+
+
+@pytest.fixture
+def viewer(tiny, tmp_path: Path) -> Iterator[Viewer]:
+    run = open_run(tiny.out, StoreOptions(tiny.store), ("scene", "cameras"))
+    viewer = Viewer(run, tmp_path / "script.json", (), search_of(run), port=0)
+    yield viewer
+    viewer.close()
+
+
+def _listed(objects: ObjectList) -> list[int]:
+    return [row.instance for row in objects.rows if row.instance is not None]
+
+
+def test_what_is_typed_is_answered_as_by_the_command(viewer: Viewer, tiny) -> None:
+    objects = viewer.panel.objects
+    for text in ("red", "green, not red"):
+        objects.text.value = text
+        found = ss_flow("query", tiny.out, text, "--json", "--cache", tiny.store).document()
+        ranked = [entry["id"] for entry in found["instances"]]
+        assert _listed(objects) == ranked
+        matches = sum(entry["matched"] for entry in found["instances"])
+        assert objects.answer.content == (f"{matches} match" if found["accepted"] else "Nothing in the scene matches.")
+    objects.text.value = ", not"
+    assert "nothing follows" in objects.answer.content or "empty" in objects.answer.content
+
+
+class _Scored:
+    """Answers with given scores, as a network's are: matters of degree."""
+
+    params = QueryParams()
+
+    def __init__(self, ids: list[int]) -> None:
+        self._ids = np.array(ids, np.int32)
+
+    def __call__(self, text: str, tau_corr: float) -> QueryResult:
+        score = np.float32(0.3) - np.float32(0.03) * np.arange(len(self._ids), dtype=np.float32)
+        none = np.zeros(len(score), np.int32)
+        found = Similarity(text, "network", False, self._ids, score, np.ones(len(score), np.float32), none)
+        return chosen(found, params=replace(self.params, tau_corr=tau_corr))
+
+
+def test_the_slider_lets_more_of_them_match(viewer: Viewer) -> None:
+    ids = sorted(viewer.panel.session.state.objects.entries)
+    picked: list[tuple[int, ...]] = []
+    objects = ObjectList(viewer.server.gui, viewer.panel.session, _Scored(ids), picked.append)
+    objects.text.value = "mug"
+    for tau, matches in ((0.02, 1), (0.05, 2), (0.3, len(ids))):
+        objects.tau.value = tau
+        assert objects.answer.content == f"{matches} match" and _listed(objects)[: len(ids)] == ids
+        objects.turn.value = "Select matches"
+        assert picked[-1] == tuple(ids[:matches])
