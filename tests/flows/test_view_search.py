@@ -37,8 +37,8 @@ def test_what_is_typed_is_answered_as_by_the_command(viewer: Viewer, tiny) -> No
         found = ss_flow("query", tiny.out, text, "--json", "--cache", tiny.store).document()
         ranked = [entry["id"] for entry in found["instances"]]
         assert _listed(objects) == ranked
-        matches = sum(entry["matched"] for entry in found["instances"])
-        assert objects.answer.content == (f"{matches} match" if found["accepted"] else "Nothing in the scene matches.")
+        matches = sum(bool(entry["matched"]) for entry in found["instances"])
+        assert objects.answer.content == (f"{matches} match" if matches else "Nothing in the scene matches.")
     objects.text.value = ", not"
     assert "nothing follows" in objects.answer.content or "empty" in objects.answer.content
 
