@@ -43,6 +43,8 @@ WIDTH = 380
 GAP, QUALITY = 6, 70
 WRONG_FOCAL = 1.12
 """A depth sensor's focal length over that of its camera, where the capture says that they are the same."""
+WRONG_SCALE = 1.3
+"""Depth over what it should be."""
 ROOM = RoomParams(objects=8, width=256, height=192, held_out=0)
 CEILING = 1.9
 """Height above which points hide what is below, metres."""
@@ -50,9 +52,9 @@ TURN = 75.0
 """Degrees between where photos were taken from and where the room is looked at, at last."""
 
 
-def results(capture: Path, settings_: Sequence[str], store: Store, *names: str) -> dict[str, Any]:
+def results(capture: Path, assignments: Sequence[str], store: Store, *names: str) -> dict[str, Any]:
     """Some results of a run."""
-    params = settings.apply(settings.preset(Params(), "fast"), settings_)
+    params = settings.apply(settings.preset(Params(), "fast"), assignments)
     run = prepare(open_scene(capture), params, RunOptions(), file_digests(store))
 
     def build() -> dict[str, Any]:
@@ -123,10 +125,10 @@ def poses(store: Store) -> list[UInt8]:
         pose[:] = shaken @ pose
     jittered = replace(room, cameras=replace(room.cameras, world_to_camera=moved))
     pictures = []
-    for one in (room, jittered, replace(room, depth=1.3 * room.depth)):
+    camera = orbit_camera(room.points[room.points[:, 2] < CEILING], elevation_deg=50)
+    for one, scale in ((room, 1.0), (jittered, 1.0), (replace(room, depth=WRONG_SCALE * room.depth), WRONG_SCALE)):
         cloud = of_room(one, store, "dense")["dense"]
-        below = cloud.points[:, 2] < CEILING * (1.3 if one.depth is not room.depth else 1)
-        camera = orbit_camera(room.points[room.points[:, 2] < CEILING], elevation_deg=50, width=960, height=720)
+        below = cloud.points[:, 2] < CEILING * scale
         pictures.append(draw_points(cloud.points[below], cloud.colors[below], camera, cloud.spacing))
     return pictures
 
@@ -167,6 +169,9 @@ def drawn(scene: Gaussians, camera: Camera) -> UInt8:
     return to_8bit(render(scene, camera).rgb)
 
 
+IN_ROOMS = {"poses": poses, "fog": fog, "side": side}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("granularity", "depth", *IN_ROOMS))
@@ -178,8 +183,6 @@ def main() -> None:
     store = open_store(args.cache)
     save(IN_ROOMS[args.what](store) if args.what in IN_ROOMS else of_capture(args, store), args.file)
 
-
-IN_ROOMS = {"poses": poses, "fog": fog, "side": side}
 
 if __name__ == "__main__":
     main()

@@ -212,14 +212,15 @@ def _metrics(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _differences(metrics: Mapping[str, Sequence[float | None]]) -> list[tuple[str, str, str, str]]:
-    """A row a figure that both have or one lacks: what it is, the other's, this one's, and the difference."""
+    """A row a figure that is told differently: what it is, the other's, this one's, and the difference."""
     rows = []
     for name, (other, own) in metrics.items():
         stage, _, metric = name.partition(".")
-        difference = "" if own is None or other is None else f"{own - other:+.3f}"
-        when = _STAGES.get(stage) or _words(stage)
-        what = f"{_words(metric)} ({when[:1].lower()}{when[1:]})"
-        rows.append((what, _figure(metric, other), _figure(metric, own), difference))
+        told = _figure(metric, other), _figure(metric, own)
+        if told[0] != told[1]:
+            when = _STAGES.get(stage) or _words(stage)
+            difference = "" if own is None or other is None else f"{own - other:+.3f}"
+            rows.append((f"{_words(metric)} ({when[:1].lower()}{when[1:]})", *told, difference))
     return rows
 
 

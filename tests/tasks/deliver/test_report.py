@@ -8,7 +8,7 @@ import pytest
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, PointLabels
 from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, compressed, decompressed
-from ss_flow.tasks.deliver.report import Insight, Votes, report_html
+from ss_flow.tasks.deliver.report import Comparison, Insight, Votes, report_html
 from ss_flow.tasks.deliver.report_pictures import report_pictures
 from ss_flow.tasks.deliver.timeline import timeline
 from ss_flow.tasks.geometry.images import encode_png
@@ -187,6 +187,18 @@ def test_stages_stand_side_by_side():
     metrics = {"split": {"miou": 0.5, "pq": 0.25}, "refined": {"miou": 0.625}, "splat": {"miou": 0.75, "pq": 0.125}}
     text = Page(report_html({"metrics": metrics}, pictures=())).text
     assert "After Split Refined masks After Splat mIoU 0.500 0.625 0.750 PQ 0.250 0.125" in text
+
+
+def test_of_another_run_only_what_differs_is_told():
+    metrics = {"split.miou": [0.5, 0.5], "splat.miou": [0.5, 0.625], "novel_view.psnr": [None, 27.3]}
+    found = Comparison("before", {"a.b": [1, None]}, metrics, 0.75, ("3 of the first is in pieces: 4, 5",))
+    text = Page(report_html({}, pictures=(), comparison=found)).text
+    assert "Compared with before What was asked for before Here a.b 1 – " in text
+    assert "Measured before Here Difference mIoU (after Splat) 0.500 0.625 +0.125 PSNR (novel views) – 27.30 dB" in text
+    assert "1 of 3 figures are the same in both. The objects of both agree with a mean IoU of 0.750;" in text
+    assert "1 changes; before is the first 3 of the first is in pieces: 4, 5" in text
+    nothing = Page(report_html({}, pictures=(), comparison=Comparison("x", {}, {}, None, ()))).text
+    assert "were not compared" in nothing and "Measured" not in nothing
 
 
 def test_the_timeline_places_what_was_computed_and_leaves_out_the_cache():
