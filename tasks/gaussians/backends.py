@@ -73,7 +73,7 @@ class Backend(Protocol):
         """The same as a NumPy array."""
 
     def target(self, target: Target, num_labels: int) -> Any:
-        """A view as `descent` and `shown` take it."""
+        """A view as `descent` and `strongest` take it."""
 
     def descent(
         self, values: Values, labels: Array | None, target: Any, settings: Settings, weights: Weights
@@ -86,8 +86,8 @@ class Backend(Protocol):
     def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
         """One step down the gradients, in place; first, second: Adam's moments (Kingma and Ba 2015, Alg. 1)."""
 
-    def shown(self, values: Values, target: Any, sh_degree: int) -> tuple[Float32, Array]:
-        """A view over black, [h, w, 3] on the host, and [N] the largest weight of each Gaussian in it."""
+    def strongest(self, values: Values, target: Any) -> Array:
+        """[N] the largest weight of each Gaussian in a view."""
 
 
 class NativeBackend:
@@ -140,11 +140,13 @@ class NativeBackend:
         means = values["means"]
         means[:] = before + step.rates["means"][:, None] * (means - before)
 
-    def shown(self, values: Values, target: Target, sh_degree: int) -> tuple[Float32, Float32]:
-        settings = Settings((0.0, 0.0, 0.0), 0, sh_degree, winners=True)
-        rendered = NativePass(_arrays(values), None, target.camera, settings, threads=self._threads)
+    def strongest(self, values: Values, target: Target) -> Float32:
+        settings = Settings((0.0, 0.0, 0.0), 0, 0, winners=True)
+        rendered = NativePass(
+            _arrays(values), None, target.camera, settings, workspace=self._workspace, threads=self._threads
+        )
         assert rendered.strongest is not None
-        return rendered.rgb, rendered.strongest
+        return rendered.strongest
 
 
 def _arrays(values: Values) -> tuple[Float32, Float32, Float32, Float32, Float32]:

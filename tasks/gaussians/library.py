@@ -191,6 +191,12 @@ class Workspace:
             self._free(self.handle)
 
 
+_START = ctypes.c_char * 0
+
+
 def address(array: NDArray[np.float32] | NDArray[np.int32] | None) -> int | None:
     """Where a C-contiguous array lies, None for None."""
-    return None if array is None else array.ctypes.data
+    if array is None:
+        return None
+    # A step of training asks fifty times, and NumPy's own answer takes three times as long.
+    return ctypes.addressof(_START.from_buffer(array)) if array.flags.writeable else array.ctypes.data

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.optim.adam import adam
 
-from ss_flow.tasks.artifacts import Float32
 from ss_flow.tasks.gaussians.backends import EPSILON, AdamStep, Descent, Values
 from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.gaussians.objective import Target, Weights
@@ -157,10 +156,9 @@ class TorchBackend:
             if not single:
                 torch.lerp(before, value, rate, out=value)
 
-    def shown(self, values: Values, target: _Target, sh_degree: int) -> tuple[Float32, Tensor]:
+    def strongest(self, values: Values, target: _Target) -> Tensor:
         with torch.no_grad():
-            out = self._draw(values, target, None, Settings((0.0, 0.0, 0.0), 0, sh_degree, winners=True))
-        return out.rgb.cpu().numpy(), out.max_contribution
+            return self._draw(values, target, None, Settings((0.0, 0.0, 0.0), 0, 0, winners=True)).max_contribution
 
     def _draw(self, values: Values, target: _Target, channels: Tensor | None, settings: Settings) -> Rendered:
         gaussians, means = GaussianTensors(**values), values["means"]

@@ -91,8 +91,6 @@ class TrainResult:
     """What training gives."""
 
     gaussians: Gaussians
-    psnr: float
-    """dB over the inside pixels of all views, before a black background; 100 at most."""
     iterations: int
     loss: Float32
     """[iterations] of each step."""
@@ -247,23 +245,16 @@ class _Training:
             self._control.restore(state)
 
     def finish(self) -> TrainResult:
-        """Drop what shows nowhere; the PSNR of what stays."""
+        """Drop what is faint and what shows nowhere."""
         parameters, params, xp = self.parameters, self._params, self._backend.xp
         losses = self.losses()
         parameters.keep(parameters.opacities() >= params.prune_opacity)
-        strongest = xp.zeros_like(parameters.values["opacity_logits"])
-        error, count = 0.0, 0
-        for target, there in zip(self._targets, self._there, strict=True):
-            rgb, weights = self._backend.shown(parameters.values, there, self._last_degree)
-            strongest = xp.maximum(strongest, weights)
-            inside = target.inside > 0
-            off = np.clip(rgb[inside], 0, 1) - target.image[inside]
-            error += float(np.square(off, dtype=np.float64).sum())
-            count += 3 * int(inside.sum())
         if params.prune_contribution > 0:
+            strongest = xp.zeros_like(parameters.values["opacity_logits"])
+            for there in self._there:
+                strongest = xp.maximum(strongest, self._backend.strongest(parameters.values, there))
             parameters.keep(strongest >= params.prune_contribution)
-        psnr = float(-10 * np.log10(max(error / max(count, 1), 1e-10))) if count else 0.0
-        return TrainResult(parameters.to_gaussians(self._initial), psnr, self.step, losses)
+        return TrainResult(parameters.to_gaussians(self._initial), self.step, losses)
 
 
 def _control(params: TrainParams, record: GradientRecord, extent: float) -> AdaptiveControl | None:

@@ -13,9 +13,8 @@ from ss_flow.tasks.artifacts import Bool, ColourTransform, DepthMap, Float32, Fl
 from ss_flow.tasks.geometry.cameras import Camera, pixels_in_view
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, transformed
+from ss_flow.tasks.geometry.images import decode_valid, shared_rgb, transformed
 from ss_flow.tasks.geometry.visibility import VisibilityParams, surface_points
-from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 from ss_flow.tasks.ranges import Count, Natural
 
 NONE_OF_MINE, IGNORED = -2, -1
@@ -117,9 +116,9 @@ def propagated_depth(points: Float32, camera: Camera, spacing: float) -> Float32
     rows, column, row, z = pixels_in_view(points, camera)
     if not len(rows):
         return np.zeros((camera.height, camera.width), np.float32)
-    front = nearest_per_pixel(row * camera.width + column, z, camera.height * camera.width)
     far = np.float32(np.finfo(np.float32).max)
-    own = np.where(front >= 0, z[front], far).astype(np.float32).reshape(camera.height, camera.width)
+    own = np.full((camera.height, camera.width), far)
+    np.minimum.at(own, (row, column), z.astype(np.float32))
     distance = float(np.median(z))
     reach = int(np.clip(np.ceil(spacing * camera.fx / distance), 1, _MAX_REACH_PX))
     window = (2 * reach + 1, 2 * reach + 1)
@@ -255,7 +254,7 @@ def _crop(
     camera = crop_camera(full, channels >= 0 if masks else np.zeros(channels.shape, bool), points, crop)
     column, row = _pixels_of_crop(full, camera)
     x0, y0, width, height = _box(full, camera)
-    photo = decode_rgb(frame)[y0 : y0 + height, x0 : x0 + width]
+    photo = shared_rgb(frame)[y0 : y0 + height, x0 : x0 + width]
     if photo.shape[:2] != (camera.height, camera.width):
         photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     image = photo.astype(np.float32) / np.float32(255)

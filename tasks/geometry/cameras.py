@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, Int32
 
@@ -100,11 +101,14 @@ def project(points: Float32 | Float64, camera: Camera) -> tuple[Float64, Float64
 
     points: [N, 3] world. Returns uv: [N, 2] image points in pixels (meaningless where z <= 0), z: [N] depth.
     """
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    z = local[:, 2]
+    # One row a coordinate: operations on short rows of two or three numbers take several times as long.
+    local = camera.world_to_camera[:3, :3] @ points.T.astype(np.float64) + camera.world_to_camera[:3, 3:]
+    uv, z = local[:2], local[2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        uv = local[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    return uv, z
+        uv /= z
+        uv *= [[camera.fx], [camera.fy]]
+        uv += [[camera.cx], [camera.cy]]
+    return uv.T, z
 
 
 def pixels_in_view(points: Float32 | Float64, camera: Camera) -> tuple[Int32, Int32, Int32, Float64]:
@@ -114,11 +118,12 @@ def pixels_in_view(points: Float32 | Float64, camera: Camera) -> tuple[Int32, In
     and z-depths.
     """
     uv, z = project(points, camera)
+    u, v = uv.T
     with np.errstate(invalid="ignore"):
-        inside = (z > 0) & (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     rows = np.flatnonzero(inside).astype(np.int32)
-    column, row = np.floor(uv[rows]).astype(np.int32).T
-    return rows, column, row, z[rows]
+    # What is not negative is cut off to its floor.
+    return rows, u[rows].astype(np.int32), v[rows].astype(np.int32), z[rows]
 
 
 def backproject(depth: Float32, camera: Camera) -> Float64:
@@ -127,7 +132,12 @@ def backproject(depth: Float32, camera: Camera) -> Float64:
     depth: [H, W] z-depth in world units at the camera's own size (see `Camera.scaled`); unknown depth (0) gives the
     camera's centre.
     """
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    local = (rays * depth[..., None]).reshape(-1, 3) - camera.world_to_camera[:3, 3]
-    return local @ camera.world_to_camera[:3, :3]
+    row, column = np.mgrid[: camera.height, : camera.width]
+    return surface_of_pixels(column.ravel(), row.ravel(), depth.ravel(), camera)
+
+
+def surface_of_pixels(column: NDArray[np.integer], row: NDArray[np.integer], depth: Float32, camera: Camera) -> Float64:
+    """World points of some pixels, at their centres: [M, 3]. column, row, depth: [M], z-depth in world units."""
+    rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(depth))])
+    local = (rays * depth).T - camera.world_to_camera[:3, 3]
+    return np.asarray(local @ camera.world_to_camera[:3, :3])

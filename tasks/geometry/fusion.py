@@ -59,6 +59,8 @@ def sum_by_voxel(parts: list[VoxelSums], voxel: float) -> VoxelSums:
 def depth_at(depth: DepthMap, column: Int32, row: Int32, width: int, height: int) -> Float32:
     """Depth at pixels of a frame of the given size, nearest neighbour: [M], 0 where unknown."""
     h, w = depth.depth.shape
+    if (h, w) == (height, width):
+        return depth.depth[row, column]
     y = ((row + 0.5) * (h / height)).astype(np.intp)
     x = ((column + 0.5) * (w / width)).astype(np.intp)
     return depth.depth[y, x]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
+
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, ColourTransform, DepthMap, Float32, Frame, UInt8
@@ -12,7 +15,39 @@ def decode_rgb(frame: Frame) -> UInt8:
     import cv2
 
     bgr: UInt8 = cv2.imdecode(frame.encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return np.ascontiguousarray(bgr[..., ::-1])
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+
+
+def shared_rgb(frame: Frame) -> UInt8:
+    """The same, read-only; for the many small steps of one scene, which cut their parts out of the same photos."""
+    return _decoded.of(frame)
+
+
+class _Decoded:
+    """The photos that were decoded last, up to a number of bytes, for all threads of a process."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most_bytes = most_bytes
+        self._lock = threading.Lock()
+        # With the encoded bytes, or another array might come to have the id of one that is gone.
+        self._photos: OrderedDict[int, tuple[UInt8, UInt8]] = OrderedDict()
+
+    def of(self, frame: Frame) -> UInt8:
+        name = id(frame.encoded)
+        with self._lock:
+            if name in self._photos:
+                self._photos.move_to_end(name)
+                return self._photos[name][1]
+        photo = decode_rgb(frame)
+        photo.flags.writeable = False
+        with self._lock:
+            self._photos[name] = frame.encoded, photo
+            while sum(kept.nbytes for _, kept in self._photos.values()) > self._most_bytes:
+                self._photos.popitem(last=False)
+        return photo
+
+
+_decoded = _Decoded(256 << 20)
 
 
 def transformed(image: Float32, colours: ColourTransform) -> Float32:

@@ -114,7 +114,7 @@ def shares(pixels: UInt8) -> Float64:
         raise ValueError("no pixel to name the colour of")
     step = -(-len(pixels) // _MOST_PIXELS)
     lab = _lab(pixels[::step])
-    nearest = np.stack([_squared_distance(lab, shades).min(axis=1) for shades in _shades_lab()], axis=1)
+    nearest = np.stack([nearest_shade(lab, shades) for shades in _shades_lab()], axis=1)
     exponent = (nearest.min(axis=1, keepdims=True) - nearest) / (2 * _SPREAD**2)
     membership = np.exp(exponent)
     return (membership / membership.sum(axis=1, keepdims=True)).mean(axis=0)
@@ -134,5 +134,16 @@ def _lab(pixels: UInt8) -> Float64:
     return cv2.cvtColor(pixels[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0].astype(np.float64)
 
 
-def _squared_distance(a: Float64, b: Float64) -> Float64:
-    return ((a[:, None] - b[None]) ** 2).sum(axis=2)
+def nearest_shade(lab: Float64, shades: Float64) -> Float64:
+    """[n] the squared distance of each pixel [n, 3] to the nearest of shades [m, 3].
+
+    Shade by shade, one row a channel: sums over rows of three numbers take six times as long.
+    """
+    light, red, yellow = np.ascontiguousarray(lab.T)
+    nearest = np.full(len(lab), np.inf)
+    for shade in shades:
+        distance = (light - shade[0]) ** 2
+        distance += (red - shade[1]) ** 2
+        distance += (yellow - shade[2]) ** 2
+        np.minimum(nearest, distance, out=nearest)
+    return nearest

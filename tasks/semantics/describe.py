@@ -11,7 +11,7 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, PartDescriptors, PartMasks, UInt8
-from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.geometry.images import shared_rgb
 from ss_flow.tasks.masks.erosion import ErosionParams, erode
 from ss_flow.tasks.masks.packing import bounds
 from ss_flow.tasks.models.catalogue import Model
@@ -74,7 +74,7 @@ def describe(
                 f"{instance.instance_id} are {instance.width} x {instance.height}; both must have one size."
             )
         mask = erode(masks[row], params.erosion)
-        image = decode_rgb(frame)
+        image = shared_rgb(frame)
         if model.sees_masks:
             x0, y0, x1, y1 = bounds(mask)
             vectors.append(model.encode_images([image[y0:y1, x0:x1]], [mask[y0:y1, x0:x1]])[0])

@@ -9,10 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, InstanceMasks, Int32, UInt8
-from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE, SceneViews, sample_depth
-from ss_flow.tasks.geometry.cameras import backproject
+from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE, SceneViews
+from ss_flow.tasks.geometry.cameras import surface_of_pixels
 from ss_flow.tasks.geometry.clustering import dbscan, nearest_spacing
-from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.geometry.fusion import depth_at
+from ss_flow.tasks.geometry.images import shared_rgb
+from ss_flow.tasks.geometry.sampling import first_of_each_cube
+from ss_flow.tasks.masks.packing import bounds
+
+_Rows = NDArray[np.intp]
 
 REACH = 8
 """Pixels of the photo on either side of a mask's border in which the other views are asked."""
@@ -41,13 +46,11 @@ def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator
         channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
         y, x = np.nonzero(_border(mask))
         if len(y):
-            points = _points(scene, view, y, x)
-            known = ~np.isnan(points[:, 0])
-            votes, held = _votes(scene, points[known], others)
-            own = mask[y[known], x[known]]
-            same = np.where(own, held, votes - held) + 1
+            y, x, points = _surface(scene, view, y, x)
+            votes, held = _votes(scene, points, others)
+            same = np.where(mask[y, x], held, votes - held) + 1
             doubtful = (votes >= 2) & (same < share * (votes + 1))
-            channels[y[known][doubtful], x[known][doubtful]] = IGNORED
+            channels[y[doubtful], x[doubtful]] = IGNORED
         yield channels
 
 
@@ -68,23 +71,19 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     found: list[tuple[Float32, UInt8, Float32]] = []
     for view, mask, others in _views(scene, instance):
         y, x = np.nonzero(mask[::STRIDE, ::STRIDE])
-        if not len(y):
-            continue
-        points = _points(scene, view, STRIDE * y, STRIDE * x)
-        known = np.flatnonzero(~np.isnan(points[:, 0]))
-        distance, _ = tree.query(points[known], distance_upper_bound=BEYOND * spacing, workers=1)
-        far = known[np.isinf(distance)]
+        y, x, points = _surface(scene, view, STRIDE * y, STRIDE * x)
+        distance, _ = tree.query(points, distance_upper_bound=BEYOND * spacing, workers=1)
+        far = np.flatnonzero(np.isinf(distance))
         votes, held = _votes(scene, points[far], others)
         joins = (held + 1 >= LEAST_VIEWS) & (held + 1 >= share * (votes + 1))
         if joins.any():
             rows = far[joins]
-            colors = decode_rgb(scene.frames[view])[STRIDE * y[rows], STRIDE * x[rows]]
+            colors = shared_rgb(scene.frames[view])[y[rows], x[rows]]
             found.append((points[rows], colors, ((held + 1) / (votes + 1))[joins].astype(np.float32)))
     if not found:
         return instance
     points, colors, confidence = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    cell = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
-    first = np.sort(np.unique(cell, axis=0, return_index=True)[1])
+    first = first_of_each_cube(points, spacing)
     together = dbscan(np.concatenate([instance.points, points[first]]), CONNECTED * spacing, 1)
     own, added = np.split(together, [len(instance.points)])
     first = first[np.isin(added, own)]
@@ -110,18 +109,23 @@ def _border(mask: Bool) -> Bool:
     """[H, W] the pixels within reach of a mask's border."""
     import cv2
 
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH + 1, 2 * REACH + 1))
-    image = mask.astype(np.uint8)
-    return np.asarray(cv2.dilate(image, disc) > cv2.erode(image, disc, borderValue=1))
+    border = np.zeros_like(mask)
+    if mask.any():
+        x0, y0, x1, y1 = bounds(mask)
+        box = (slice(max(y0 - REACH, 0), y1 + REACH), slice(max(x0 - REACH, 0), x1 + REACH))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH + 1, 2 * REACH + 1))
+        image = mask[box].astype(np.uint8)
+        border[box] = cv2.dilate(image, disc) > cv2.erode(image, disc, borderValue=1)
+    return border
 
 
-def _points(scene: SceneViews, view: int, row: NDArray[np.intp], column: NDArray[np.intp]) -> Float32:
-    """[N, 3] the surface points of pixels, world; NaN where no depth is known."""
+def _surface(scene: SceneViews, view: int, row: _Rows, column: _Rows) -> tuple[_Rows, _Rows, Float32]:
+    """Those of some pixels of a view whose depth is known, rows and columns, and their surface points [N, 3], world."""
     camera = scene.cameras[view]
-    box = camera.cropped(int(column.min()), int(row.min()), int(column.max()) + 1, int(row.max()) + 1)
-    depth = sample_depth(scene.depths[view], camera, box)
-    points = backproject(np.where(depth > 0, depth, np.nan), box).reshape(*depth.shape, 3)
-    return points[row - row.min(), column - column.min()].astype(np.float32)
+    depth = depth_at(scene.depths[view], column, row, camera.width, camera.height)
+    known = depth > 0
+    points = surface_of_pixels(column[known], row[known], depth[known], camera)
+    return row[known], column[known], points.astype(np.float32)
 
 
 def _votes(scene: SceneViews, points: Float32, others: list[tuple[int, Bool]]) -> tuple[Int32, Int32]:

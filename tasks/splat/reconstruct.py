@@ -26,6 +26,7 @@ from ss_flow.tasks.gaussians.views import (
     group_view,
 )
 from ss_flow.tasks.geometry.cameras import camera_extent
+from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import dilated
@@ -182,9 +183,9 @@ def thin(points: Float32, limit: int) -> Int32:
     # A surface as large as the box's diagonal squared would fill 64 times too many cells: the loop ends from above.
     side = float(np.linalg.norm(points.max(axis=0) - low)) / (8 * np.sqrt(limit))
     while True:
-        _, rows = np.unique(np.floor((points - low) / side).astype(np.int32), axis=0, return_index=True)
+        rows = first_of_each_cube(points, side)
         if len(rows) <= limit:
-            return np.sort(rows).astype(np.int32)
+            return rows
         side *= 1.02 * np.sqrt(len(rows) / limit)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import inspect
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gsplat_on_the_cpu
 import numpy as np
@@ -33,13 +33,6 @@ from ss_flow.tasks.geometry.cameras import Camera
 
 NATIVE = NativeBackend(1)
 CUDA = pytest.param("cuda", marks=pytest.mark.skipif(device_here() != "cuda", reason="no CUDA with gsplat here"))
-
-
-@dataclass
-class Looking:
-    """As much of a target as it takes to be drawn."""
-
-    camera: Camera
 
 
 @pytest.fixture
@@ -127,15 +120,14 @@ def test_a_view_without_a_pixel_that_counts_pulls_nowhere(backend):
         assert all(not one.host(found.gradients[name]).any() for name in PARAMETERS)
 
 
-def test_every_backend_shows_a_view_and_what_weighs_most(backend):
+def test_every_backend_tells_what_weighs_most_in_a_view(backend):
     values, _, target = example(5, Objective(), with_labels=False)
-    expected, heaviest = NATIVE.shown(values, target, 1)
-    found, weights = backend.shown(put(backend, values), backend.target(target, 0), 1)
+    ours = NATIVE.strongest(values, target)
+    theirs = backend.host(backend.strongest(put(backend, values), backend.target(target, 0)))
+    off = np.abs(theirs - ours)
     # What is next to nothing counts or does not, by rounding.
-    for theirs, ours in ((found, expected), (backend.host(weights), heaviest)):
-        off = np.abs(theirs - ours)
-        assert off.max() < 1 / 255 and np.quantile(off, 0.98) <= tolerance(backend)
-    assert (heaviest > 0.05).sum() > 30
+    assert off.max() < 1 / 255 and np.quantile(off, 0.98) <= tolerance(backend)
+    assert (ours > 0.05).sum() > 30
 
 
 @pytest.mark.parametrize("which", ["native", "torch"])
@@ -301,9 +293,7 @@ def trained(backend, params: TrainParams, seed: int = 1):
         pose = np.eye(4)
         pose[0, 3] = x
         camera = Camera(46, 33, 40.0, 40.0, 23.0, 16.5, pose)
-        image = NATIVE.shown({n: np.ascontiguousarray(getattr(made, n)) for n in PARAMETERS}, Looking(camera), 0)[
-            0
-        ].clip(0, 1)
+        image = render(made, camera).rgb.clip(0, 1)
         inside = image.sum(axis=2) > 0.2
         views.append(TrainView(camera, image, inside, ~inside, np.zeros(inside.shape, np.float32)))
     first = select(made, np.arange(60))
@@ -315,7 +305,6 @@ def test_a_training_is_the_same_on_every_backend(backend):
     ours, theirs = trained(NATIVE, params), trained(backend, params)
     np.testing.assert_allclose(theirs.loss, ours.loss, rtol=10 * tolerance(backend))
     assert len(ours.gaussians) == len(theirs.gaussians)
-    assert theirs.psnr == pytest.approx(ours.psnr, abs=200 * tolerance(backend))
 
 
 def test_a_training_that_densifies_is_the_same_until_rounding_parts_them(backend):

@@ -75,7 +75,7 @@ def asked_by(task: str, small: SmallScene, monkeypatch: pytest.MonkeyPatch) -> A
 
     def listening(initial, views, *, params, extent, seed, label_ids=()):
         heard.append(Asked(initial, list(views), params, extent, tuple(label_ids)))
-        return TrainResult(initial, 0.0, 0, np.zeros(0, np.float32))
+        return TrainResult(initial, 0, np.zeros(0, np.float32))
 
     monkeypatch.setattr(reconstruct, "train", listening)
     monkeypatch.setattr(merge, "train", listening)

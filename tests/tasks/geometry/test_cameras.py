@@ -1,11 +1,56 @@
-"""Where the borders of a photo are, whatever part of it a camera shows."""
+"""Where points fall in a camera's image, and where the borders of its photo are."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view, project, surface_of_pixels
+
+
+def turned() -> Camera:
+    """Turned by a fifth of a right angle about y, and off the origin."""
+    angle = 0.1 * np.pi
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    pose[:3, 3] = 0.1, -0.2, 2.0
+    return Camera(40, 30, 33.0, 35.0, 19.0, 16.0, pose)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_points_fall_where_the_pinhole_formula_says(kind):
+    camera = turned()
+    points = np.random.default_rng(0).normal(size=(300, 3)).astype(kind) * 2
+    expected = []
+    for number, point in enumerate(points.astype(np.float64)):
+        x, y, z = camera.world_to_camera[:3] @ [*point, 1]
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        if z > 0 and 0 <= u < 40 and 0 <= v < 30:
+            expected.append((number, int(u), int(v), z))
+    rows, column, row, z = pixels_in_view(points, camera)
+    assert 30 < len(rows) < 200 and {a.dtype for a in (rows, column, row)} == {np.dtype(np.int32)}
+    assert list(zip(rows, column, row, strict=True)) == [e[:3] for e in expected]
+    np.testing.assert_allclose(z, [e[3] for e in expected])
+    uv, depth = project(points, camera)
+    assert uv.shape == (300, 2)
+    np.testing.assert_array_equal(np.floor(uv[rows]).astype(int).T, [column, row])
+    np.testing.assert_array_equal(depth[rows], z)
+    assert [len(a) for a in pixels_in_view(points[:0], camera)] == [0, 0, 0, 0]
+
+
+def test_the_surface_of_pixels_falls_on_their_centres():
+    camera = turned()
+    rng = np.random.default_rng(1)
+    column, row, depth = rng.integers(0, 40, 50), rng.integers(0, 30, 50), rng.uniform(1, 5, 50).astype(np.float32)
+    uv, z = project(surface_of_pixels(column, row, depth, camera), camera)
+    np.testing.assert_allclose(uv, np.stack([column, row], axis=-1) + 0.5)
+    np.testing.assert_allclose(z, depth)
+    image = np.zeros((30, 40), np.float32)
+    image[row, column] = depth
+    world = backproject(image, camera).reshape(30, 40, 3)
+    kept = image[row, column] == depth
+    np.testing.assert_array_equal(world[row, column][kept], surface_of_pixels(column, row, depth, camera)[kept])
+    np.testing.assert_allclose(world[image == 0], np.broadcast_to(camera.center, world[image == 0].shape))
 
 
 def test_borders_are_the_slopes_of_the_rays_through_them():

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ss_flow.tasks.geometry.sampling import greedy_farthest
+from ss_flow.tasks.geometry.sampling import first_of_each_cube, greedy_farthest
 
 
 def test_the_first_point_is_closest_to_the_mean_and_the_next_farthest_from_it():
@@ -38,3 +38,13 @@ def test_prompts_are_distinct_and_as_many_as_asked_for(seed, count, asked, drop_
     points = np.random.default_rng(seed).random((count, 2))
     chosen = greedy_farthest(points, asked, drop_hull=drop_hull)
     assert len(chosen) == len(set(chosen.tolist())) == min(asked, count)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 1000), st.integers(1, 200), st.sampled_from((0.05, 0.3, 2.0)))
+def test_one_point_stays_for_each_cube_the_first(seed, count, side):
+    points = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
+    first: dict[tuple[int, ...], int] = {}
+    for row, place in enumerate((points - points.min(axis=0)) / side):
+        first.setdefault(tuple(np.floor(place).astype(int).tolist()), row)
+    assert first_of_each_cube(points, side).tolist() == sorted(first.values())

@@ -6,7 +6,7 @@ from hypothesis.extra.numpy import arrays
 from matplotlib.colors import CSS4_COLORS, to_rgb
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.models.colour_words import TERMS, ColourWords, colours_in, shares
+from ss_flow.tasks.models.colour_words import TERMS, ColourWords, colours_in, nearest_shade, shares
 
 ENCODER = ColourWords()
 
@@ -49,6 +49,13 @@ def test_most_css_colours_with_a_basic_term_in_their_name_get_that_term():
 def test_shares_are_a_distribution(pixels):
     p = shares(pixels)
     assert (p >= 0).all() and p.sum() == pytest.approx(1)
+
+
+def test_the_distance_is_that_to_the_nearest_shade():
+    rng = np.random.default_rng(0)
+    pixels, shades = rng.normal(size=(200, 3)), rng.normal(size=(7, 3))
+    expected = [min(float(((pixel - shade) ** 2).sum()) for shade in shades) for pixel in pixels]
+    assert nearest_shade(pixels, shades).tolist() == pytest.approx(expected)
 
 
 def test_half_a_picture_gives_half_the_share():
