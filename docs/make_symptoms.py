@@ -69,10 +69,10 @@ def results(capture: Path, assignments: Sequence[str], store: Store, *names: str
 
 
 def of_room(room: Room, store: Store, *names: str) -> dict[str, Any]:
-    """Some results of a room with its own masks, photographed as it stands here."""
+    """Some results of a room with its own masks, photographed as it stands here, with its poses as they are."""
     with tempfile.TemporaryDirectory() as folder:
         write_scene(room, Path(folder, "room"), masks="truth")
-        return results(Path(folder, "room"), (), store, *names)
+        return results(Path(folder, "room"), ("capture.refine_poses=never",), store, *names)
 
 
 def photo_of(frame: Frame) -> UInt8:
