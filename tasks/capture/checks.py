@@ -232,7 +232,7 @@ def _from(view: _View, other: _View) -> Camera:
     return replace(camera, world_to_camera=relative)
 
 
-def _difference(carried: Float64, measured: Float64) -> Float64:
+def _difference(carried: Float64, measured: NDArray[np.floating]) -> Float64:
     """Relative, 0 to that of an occlusion, which also stands where nothing was measured."""
     return np.minimum(np.abs(carried - measured) / np.maximum(measured, 1e-12), _OCCLUDED)
 

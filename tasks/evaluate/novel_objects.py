@@ -106,7 +106,7 @@ def object_views(
         means[:, 1],
         means[:, 2],
         *np.mean(whole, axis=0).tolist(),
-        *np.mean(bands or [[np.nan] * 3], axis=0).tolist(),
+        *np.mean(bands or [(np.nan, np.nan, np.nan)], axis=0).tolist(),
     )
 
 
