@@ -198,5 +198,7 @@ def address(array: NDArray[np.float32] | NDArray[np.int32] | None) -> int | None
     """Where a C-contiguous array lies, None for None."""
     if array is None:
         return None
+    if not array.flags.writeable:
+        return array.ctypes.data
     # A step of training asks fifty times, and NumPy's own answer takes three times as long.
-    return ctypes.addressof(_START.from_buffer(array)) if array.flags.writeable else array.ctypes.data
+    return ctypes.addressof(_START.from_buffer(array))  # type: ignore[arg-type]

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Int32
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
@@ -56,7 +57,9 @@ def sum_by_voxel(parts: list[VoxelSums], voxel: float) -> VoxelSums:
     )
 
 
-def depth_at(depth: DepthMap, column: Int32, row: Int32, width: int, height: int) -> Float32:
+def depth_at(
+    depth: DepthMap, column: NDArray[np.integer], row: NDArray[np.integer], width: int, height: int
+) -> Float32:
     """Depth at pixels of a frame of the given size, nearest neighbour: [M], 0 where unknown."""
     h, w = depth.depth.shape
     if (h, w) == (height, width):
