@@ -12,7 +12,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Gaussians, Int32, UInt8
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import Rendering, render
-from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view, project
+from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, looking, pixels_in_view, project
 from ss_flow.tasks.geometry.open3d import load_open3d
 
 _CELLS = 128
@@ -23,6 +23,8 @@ _SOLID = 0.5
 """Alpha from which a pixel has a depth."""
 _PICTURE = 320
 """Longest side of a rendering, pixels."""
+_WIDEST = 1.5
+"""Slope of the outermost rays of a rendering; what lies further out is left to other views."""
 _MARGIN = 0.06
 _STRAY = 0.005
 """Share of the Gaussians at each end of each axis that may lie outside the box."""
@@ -57,7 +59,7 @@ def mesh(own: Gaussians, cameras: Cameras, *, instance_id: int, holes: Literal["
     through (Kutulakos and Seitz 2000), within the instance's box, and so gives a solid whose far side is a guess.
     Colours are those that the views see, averaged.
     """
-    views = [view for view in (_framed(own, camera) for camera in cameras_by_view(cameras)) if view is not None]
+    views = [view for view in (_turned(own, camera) for camera in cameras_by_view(cameras)) if view is not None]
     if not views:
         warn(f"instance {instance_id} has no Gaussian that an input view sees; its mesh is empty")
         return _empty(instance_id)
@@ -103,25 +105,30 @@ def _empty(instance_id: int) -> TriangleMesh:
     )
 
 
-def _framed(own: Gaussians, camera: Camera) -> Camera | None:
-    """The part of a view that the instance fills; None where most of it is behind the camera, or none in the picture.
+def _turned(own: Gaussians, camera: Camera) -> Camera | None:
+    """A view from the same place, turned towards the instance and filled by it; None where most of it lies beside.
 
-    No photo trained what would lie beside the picture; Gaussians near the camera may hang there as large as a wall.
+    Turned, since far off its axis a view of the photo's own direction would shear the Gaussians and hang patches into
+    the air (`Camera.borders`).
     """
     if not len(own):
         return None
-    uv, depth = project(own.means, camera)
+    middle = np.median(own.means.astype(np.float64), axis=0)
+    away = middle - camera.center
+    distance = float(np.linalg.norm(away))
+    if not distance or (camera.world_to_camera[2, :3] @ own.means.T + camera.world_to_camera[2, 3] > 0).mean() < 0.5:
+        return None
+    pose = looking(camera.center, away / distance, -camera.world_to_camera[1, :3])
+    uv, depth = project(own.means, Camera(1, 1, 1, 1, 0, 0, pose))
     before = depth > 0
     if before.mean() < 0.5:
         return None
-    low, high = np.quantile(uv[before], (_STRAY, 1 - _STRAY), axis=0)
-    border = 0.08 * max(float((high - low).max()), 1.0)
-    scale = _PICTURE / (float((high - low).max()) + 2 * border)
-    larger = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    size = larger.width, larger.height
-    x0, y0 = np.floor((low - border) * scale).astype(int).clip(0, size).tolist()
-    x1, y1 = np.ceil((high + border) * scale).astype(int).clip(0, size).tolist()
-    return larger.cropped(x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+    low, high = np.quantile(uv[before], (_STRAY, 1 - _STRAY), axis=0).clip(-_WIDEST, _WIDEST)
+    side = max(float((high - low).max()), 1e-6)
+    border = 0.08 * side
+    scale = _PICTURE / (side + 2 * border)
+    width, height = np.ceil((high - low + 2 * border) * scale).astype(int).tolist()
+    return Camera(width, height, scale, scale, *((border - low) * scale).tolist(), pose)
 
 
 def _fuse(o3d: Any, volume: Any, seen: Rendering, view: Camera) -> Float32:
