@@ -53,7 +53,7 @@ def describe(
     encoder: Model | None = None,
     params: DescribeParams = DescribeParams(),
 ) -> Descriptors:
-    """The mean of an instance's pictures, or of a part's, as unit vectors, brought back to unit length; and each of them.
+    """An instance's pictures, or a part's, as unit vectors, and their mean, brought back to unit length.
 
     frames: at least those with a mask of the instance. encoder: None for colour words.
     Returns zeros and no views when no mask covers `min_area` of its image.

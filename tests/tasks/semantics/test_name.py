@@ -8,7 +8,8 @@ from ss_flow.tasks.semantics.name import InstanceNames, given_names, name
 
 def descriptor(instance_id: int, embedding, encoder: str) -> Descriptors:
     vector = np.asarray(embedding, np.float32)
-    return Descriptors(instance_id, vector, (), np.zeros(0, np.float32), encoder, np.zeros((0, len(vector)), np.float32))
+    no_views = np.zeros(0, np.float32), encoder, np.zeros((0, len(vector)), np.float32)
+    return Descriptors(instance_id, vector, (), *no_views)
 
 
 def test_colour_words_name_objects_by_their_colour():
