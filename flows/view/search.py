@@ -20,6 +20,11 @@ class Search:
     def __call__(self, text: str, tau_corr: float) -> QueryResult:
         """The instances, the best first. Raises InputError for a text that asks for nothing."""
         if self._last is None or self._last.text != text:  # while the slider moves the text stays
-            reading = {"prompt": self.params.prompt, "tau_view": self.params.tau_view}
-            self._last = similarity(self._descriptors, text=text, encoder=self._encoder, **reading)
+            self._last = similarity(
+                self._descriptors,
+                text=text,
+                prompt=self.params.prompt,
+                encoder=self._encoder,
+                tau_view=self.params.tau_view,
+            )
         return chosen(self._last, params=replace(self.params, tau_corr=tau_corr))

@@ -118,8 +118,14 @@ def query(
     background: bool = False,
 ) -> QueryResult:
     """Rank the instances against a text; in a flow, two nodes. See `similarity` and `chosen`."""
-    reading = {"prompt": params.prompt, "tau_view": params.tau_view}
-    found = similarity(descriptors, text=text, encoder=encoder, background=background, **reading)
+    found = similarity(
+        descriptors,
+        text=text,
+        prompt=params.prompt,
+        encoder=encoder,
+        background=background,
+        tau_view=params.tau_view,
+    )
     return chosen(found, params=params)
 
 
