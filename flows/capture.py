@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ss_flow.errors import InputError
-from ss_flow.flows.depths import Beside, all_of, depth_source, measured, without_sensor
+from ss_flow.flows.depths import Beside, all_of, depth_source, fitting_depth, measured, without_sensor
 from ss_flow.flows.params import CaptureParams
 from ss_flow.flows.poses import fitting_poses, poses, refined_poses
 from ss_flow.task import Reference
@@ -30,7 +30,7 @@ from ss_flow.tasks.capture.colours import colours
 from ss_flow.tasks.capture.given_scene import given_scene
 from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
-from ss_flow.tasks.capture.registration import calibrated, registration
+from ss_flow.tasks.capture.registration import registration
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.sfm import registered
 from ss_flow.tasks.gaussians.views import Views
@@ -122,11 +122,9 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         given = given_scene(frames, cameras, file=reference(scene.given_scene), params=params.given)
     placing = None
     if sensed is not None:
-        depths = presumed = sensed
-        calibrates = params.calibrate == "depth"
-        placing = registration(frames, cameras, depths, advise=not calibrates, params=params.registration)
-        if calibrates:
-            depths = presumed = calibrated(frames, cameras, depths, placing)
+        advise = params.calibrate == "none"
+        placing = registration(frames, cameras, sensed, advise=advise, params=params.registration)
+        depths = presumed = fitting_depth(frames, cameras, sensed, placing, params)
     elif params.calibrate == "depth":
         raise InputError(
             f"{scene.root} is to be run with depth that no sensor measured (capture.depth={source}), and only a "

@@ -12,12 +12,13 @@ from ss_flow.errors import InputError
 from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import INDEX, each, expand, pick
 from ss_flow.task import FileRef, Reference
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, Registration
 from ss_flow.tasks.capture import depth as steps
 from ss_flow.tasks.capture import recordings, sensor_depth, views
 from ss_flow.tasks.capture.given_scene import rendered_depth
 from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.neighbors import Neighbors, neighbors
+from ss_flow.tasks.capture.registration import calibrated
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.stereo import stereo
 from ss_flow.tasks.geometry.cameras import Camera
@@ -51,6 +52,21 @@ def measured(scene: SceneFiles, reference: Reference, frames: tuple[Frame, ...])
         metric=scene.metric,
         lenses=scene.lenses,
         depth_lens=scene.depth_lens,
+    )
+
+
+def fitting_depth(
+    frames: tuple[Frame, ...], cameras: Cameras, depths: Depths, placing: Registration, params: CaptureParams
+) -> Depths:
+    """The sensor's depth, moved to where its photos show it, as far as the parameters say."""
+    if params.calibrate == "none":
+        return depths
+    if params.calibrate == "depth":
+        return calibrated(frames, cameras, depths, placing)
+    least = params.registration.tau_clear
+    return expand(
+        placing,
+        lambda found: calibrated(frames, cameras, depths, placing) if found.moves and found.gain >= least else depths,
     )
 
 

@@ -51,8 +51,9 @@ class CaptureParams:
     depth: Literal["auto", "sensor", "mvs", "mono", "rendered"] = "auto"
     """Where depth comes from; "auto" is the sensor where there is one, else the scene of --scene where one is given
     ("rendered"), else several views (mvs)."""
-    calibrate: Literal["none", "depth"] = "none"
-    """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
+    calibrate: Literal["auto", "none", "depth"] = "auto"
+    """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is found to be better;
+    "auto" where it is clearly better."""
     refine_poses: Literal["auto", "always", "never"] = "auto"
     """Whether poses that come with the capture are first refined by bundle adjustment; "auto" does so where photos do
     not fit the given ones, and uses what it finds where photos then fit better and measured depth no worse."""

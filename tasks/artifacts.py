@@ -109,6 +109,11 @@ class Registration:
     gain: float
     """0..1 share of the agreement between edges of depth and of photo that is lost where the maps stay as they are."""
 
+    @property
+    def moves(self) -> bool:
+        """Whether there is anything to move them by."""
+        return self.scale != 1 or bool(self.shift.any())
+
 
 @dataclass(frozen=True)
 class CaptureChecks:

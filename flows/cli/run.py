@@ -46,8 +46,9 @@ class Run:
     correct: OptionalPath = None
     """A file (.json) of points clicked on what an earlier run joined or broke, as the viewer saves it: what holds
     points of one thing becomes one instance, what holds points of several is divided; all else stays."""
-    calibrate: Literal["none", "depth"] = "none"
-    """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is clearly better."""
+    calibrate: Literal["auto", "none", "depth"] = "auto"
+    """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is found to be better;
+    "auto" leaves it to the preset: where it is clearly better, or not at all."""
     refine_poses: bool = False
     """Refine the poses that come with the capture by bundle adjustment before anything else, also where photos and
     depth do not tell that this is better."""
@@ -58,7 +59,7 @@ class Run:
 
     def run(self) -> int:
         params = settings.preset(Params(), self.execution.preset)
-        if self.calibrate != "none":
+        if self.calibrate != "auto":
             params = settings.apply(params, [f"capture.calibrate={self.calibrate}"])
         if self.refine_poses:
             params = settings.apply(params, ["capture.refine_poses=always"])

@@ -46,8 +46,8 @@ class RegistrationParams:
     tau_found: Fraction = 0.1
     """Gain from which another scale and shift count as found; calibrate=depth then applies them. The gain is the share
     of the agreement between edges of depth and of photo that is lost without them."""
-    tau_warn: Fraction = 0.4
-    """Gain from which a run warns of them."""
+    tau_clear: Fraction = 0.2
+    """Gain from which they are clear: calibrate=auto then applies them, and calibrate=none warns."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def registration(
     if gain < params.tau_found or not agree:
         return Registration(1.0, np.zeros(2), gain)
     result = Registration(found[0], np.array(found[1:]) / _reduction(frames[0]), gain)
-    if advise and gain >= params.tau_warn:
+    if advise and gain >= params.tau_clear:
         warn(
             f"Depth edges fit the photos better when the depth images are {_said(result)}; use --calibrate depth, or "
             "correct the capture's intrinsics."
@@ -112,10 +112,13 @@ def calibrated(
     """
     import cv2
 
-    if registration.scale == 1 and not registration.shift.any():
+    if not registration.moves:
         warn("The depth images stay as they are: no other scale and shift fits the photos clearly better.")
         return tuple(depths)
-    warn(f"The depth images were {_said(registration)}, so that its edges fit the photos.")
+    warn(
+        f"The depth images were {_said(registration)}, so that their edges fit the photos. capture.calibrate=none "
+        "keeps them as they are."
+    )
     result = []
     for frame, intrinsics, depth in zip(frames, cameras.intrinsics, depths, strict=True):
         height, width = depth.depth.shape

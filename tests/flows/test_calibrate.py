@@ -1,4 +1,4 @@
-"""Depth of another focal length than stated: a run warns of it, and with --calibrate depth it is put right."""
+"""Depth of another focal length than stated is put right where that is clear; else a run warns of it."""
 
 from __future__ import annotations
 
@@ -41,23 +41,30 @@ def miou(called: Called) -> float:
 
 
 def test_a_run_warns_of_depth_that_does_not_fit_and_says_what_to_do(scenes, tmp_path):
-    right, wrong = (run_tiny(scene, tmp_path / "store", "--until", "registration") for scene in scenes)
+    asked = "--until", "registration", "--calibrate", "none"
+    right, wrong = (run_tiny(scene, tmp_path / "store", *asked) for scene in scenes)
     assert warnings(right) == []
     (told,) = warnings(wrong)
     assert told.startswith("Depth edges fit the photos better when the depth images are scaled by 1.1")
     assert "use --calibrate depth" in told
-    again = run_tiny(scenes[1], tmp_path / "store", "--until", "registration")
+    again = run_tiny(scenes[1], tmp_path / "store", *asked)
     assert (again.computed(), warnings(again)) == ({}, [told])
     assert told in wrong.err and told in again.err
 
 
 def test_calibrated_depth_gives_better_instances_and_depth_that_fits_stays_to_the_bit(scenes, tmp_path):
     store = tmp_path / "store"
-    right, wrong = (run_tiny(scene, store, *UNTIL) for scene in scenes)
+    right, wrong = (run_tiny(scene, store, *UNTIL, "--calibrate", "none") for scene in scenes)
     same, better = (run_tiny(scene, store, *UNTIL, "--calibrate", "depth") for scene in scenes)
     assert same.results() == right.results()
     assert "stay as they are" in warnings(same)[0]
     assert "were scaled by 1.1" in warnings(better)[0]
+    alone = [run_tiny(scene, store, *UNTIL) for scene in scenes]
+    assert [called.results() for called in alone] == [same.results(), better.results()]
+    assert warnings(alone[0]) == []
+    assert "were scaled by 1.1" in warnings(alone[1])[0]
+    unclear = run_tiny(scenes[1], store, *UNTIL, "--set", "capture.registration.tau_clear=1")
+    assert unclear.results() == wrong.results()
     assert miou(better) > miou(wrong)
     assert miou(better) > miou(right) - 0.1
 
@@ -68,6 +75,9 @@ def test_the_flag_is_the_parameter(scenes, tmp_path):
     assert (one.results(), other.computed()) == (other.results(), {})
 
 
-@pytest.mark.parametrize("name", ["default", "paper", "reference", "fast", "thorough"])
-def test_no_preset_moves_depth(name):
-    assert preset(Params(), name).capture.calibrate == "none"
+@pytest.mark.parametrize(
+    ("name", "when"),
+    [("default", "auto"), ("fast", "auto"), ("thorough", "auto"), ("paper", "none"), ("reference", "none")],
+)
+def test_the_papers_presets_take_depth_as_it_is(name, when):
+    assert preset(Params(), name).capture.calibrate == when

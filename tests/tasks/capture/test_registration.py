@@ -12,7 +12,7 @@ from ss_flow.flows.generated import RoomParams, generate
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Registration
 from ss_flow.tasks.capture import ingest, sensor_depth
-from ss_flow.tasks.capture.registration import calibrated, registration
+from ss_flow.tasks.capture.registration import RegistrationParams, calibrated, registration
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.geometry.images import encode_png
 
@@ -94,8 +94,8 @@ def test_depth_without_edges_says_nothing(room, values):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", ["apc_shelf", "hololens_office"])
-def test_real_captures_that_are_about_right_are_not_warned_of(name):
+@pytest.mark.parametrize(("name", "scale"), [("apc_shelf", 1.037), ("hololens_office", 1.0)])
+def test_of_two_real_captures_one_has_depth_beside_its_photos(name, scale):
     if not (CAPTURES / name).is_dir():
         pytest.skip(f"{name} is not in shared/data beside the project")
     scene = open_scene(CAPTURES / name)
@@ -114,7 +114,9 @@ def test_real_captures_that_are_about_right_are_not_warned_of(name):
         lenses=scene.lenses,
         depth_lens=scene.depth_lens,
     )
-    registration(frames, cameras, maps)
+    found = registration(frames, cameras, maps, advise=False)
+    assert found.scale == pytest.approx(scale, abs=0.005)
+    assert (found.gain >= RegistrationParams().tau_clear) == found.moves == (scale != 1)
 
 
 def one_view(depth, size=(6, 4), center=(3.0, 2.0)):
