@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float64, Int32, Visibility
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, Visibility
 from ss_flow.tasks.geometry.zbuffer import paint
 from ss_flow.tasks.masks.overlap import iou
 
@@ -35,8 +35,8 @@ def labels_in_front(painted: PaintedView, min_points: int) -> list[int]:
     return found
 
 
-def nearest_labels(painted: PaintedView, height: int, width: int, reach: float) -> Int32:
-    """The label of the nearest painted pixel, at most `reach` pixels away: [H, W], 0 = unlabelled or none so near."""
+def nearest_painted(painted: PaintedView, height: int, width: int) -> tuple[Int32, Float32]:
+    """The label of the painted pixel nearest to each pixel, and how far away that is, in pixels: [H, W] each."""
     import cv2
 
     empty = np.ones(height * width, np.uint8)
@@ -46,7 +46,13 @@ def nearest_labels(painted: PaintedView, height: int, width: int, reach: float) 
     )
     table = np.zeros(int(nearest.max()) + 1, np.int32)
     table[nearest.ravel()[painted.pixel]] = painted.label
-    return np.where(distance <= reach, table[nearest], 0)
+    return table[nearest], distance
+
+
+def nearest_labels(painted: PaintedView, height: int, width: int, reach: float) -> Int32:
+    """The label of the nearest painted pixel, at most `reach` pixels away: [H, W], 0 = unlabelled or none so near."""
+    label, distance = nearest_painted(painted, height, width)
+    return np.where(distance <= reach, label, 0)
 
 
 def agreement(painted: PaintedView, mask: Bool, label: int) -> float:

@@ -23,6 +23,7 @@ from ss_flow.tasks.artifacts import (
     PromptedMasks,
     Visibility,
 )
+from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import (
@@ -30,13 +31,16 @@ from ss_flow.tasks.masks.painting import (
     agreement,
     contradicted,
     labels_in_front,
-    nearest_labels,
+    nearest_painted,
     paint_labels,
     stack_exclusive,
 )
 from ss_flow.tasks.masks.pool import smoothed
 from ss_flow.tasks.masks.selection import SelectionParams, select_masks
 from ss_flow.tasks.ranges import Count, NonNegative
+
+_DENSE = 2.5
+"""Pixels, of an image with a diagonal of 800, between a label's points up to which `reach` is meant as it stands."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,8 @@ class ReprojectParams:
     min_points: Count = 10
     """Points of a label that must be in front in a view for this."""
     reach: NonNegative = 4.0
-    """How far a drawn mask reaches round its points, in pixels of an image with a diagonal of 800."""
+    """How far a drawn mask reaches round its points, in pixels of an image with a diagonal of 800; farther, in
+    proportion, where the points lie more than 2.5 such pixels apart."""
     min_views: Count = 2
     """Views with a mask below which an instance is weak: kept as points, not reconstructed."""
 
@@ -142,7 +147,18 @@ def _drawn(painted: PaintedView, view: Visibility, shown: set[int], params: Repr
     missing = [label for label in labels_in_front(painted, params.min_points) if label not in shown]
     if not missing:
         return {}
-    reach = at_diagonal(params.reach, view.height, view.width)
-    nearest = nearest_labels(painted, view.height, view.width, reach)
-    masks = {label: smoothed(nearest == label, round(reach)) for label in missing}
+    nearest, distance = nearest_painted(painted, view.height, view.width)
+    masks = {}
+    for label in missing:
+        reach = _reach_of(label, painted, view, params)
+        masks[label] = smoothed((nearest == label) & (distance <= reach), round(reach))
     return {label: mask for label, mask in masks.items() if agreement(painted, mask, label) >= params.selection.min_iou}
+
+
+def _reach_of(label: int, painted: PaintedView, view: Visibility, params: ReprojectParams) -> float:
+    """How far the drawn mask of a label reaches round its points in a view, in its pixels: farther where these lie far
+    apart, as in a close view of a capture whose points are as dense as its far views need."""
+    v, u = np.divmod(painted.pixel[painted.label == label], view.width)
+    apart = nearest_spacing(np.stack([u, v], axis=-1).astype(np.float32))
+    least = at_diagonal(params.reach, view.height, view.width)
+    return least * max(1.0, apart / at_diagonal(_DENSE, view.height, view.width))

@@ -237,6 +237,28 @@ def test_a_drawn_mask_reaches_a_little_round_its_points():
     assert near[1, 8] == 0
 
 
+@pytest.mark.parametrize("apart", [2, 8, 15])
+def test_a_drawn_mask_has_no_gaps_in_a_close_view_whose_points_lie_far_apart(apart):
+    side = 240
+    v, u = np.mgrid[apart // 2 : side : apart, apart // 2 : side : apart]
+    pixel = (v * side + u).ravel().astype(np.int32)
+    square = (slice(60, 180), slice(60, 180))
+    truth = np.zeros((side, side), bool)
+    truth[square] = True
+    # Around it lies what has no label: the mask must not grow into that, however far it reaches.
+    label = truth.ravel()[pixel].astype(np.int32)
+    none = np.zeros(0, np.int32)
+    labels = PointLabels(label, np.ones(len(pixel), np.float32), 1, none, none, none, np.zeros(0, np.float32))
+    places = np.stack([u.ravel(), v.ravel(), np.zeros(pixel.size)], axis=-1).astype(np.float32)
+    cloud = PointCloud(places, np.zeros((pixel.size, 3), np.uint8), 1.0, float(apart))
+    seen = Visibility("a", np.arange(pixel.size, dtype=np.int32), pixel, np.ones(pixel.size, np.float32), side, side)
+    nothing = mask_set(np.zeros((0, side, side), bool), "a")
+    parts = PointParts(np.zeros(pixel.size, np.int32))
+    instances = reproject(cloud, (seen,), (nothing,), labels, parts, (), params=ReprojectParams())
+    drawn = instances[1].dense()[0]
+    assert (drawn & truth).sum() / (drawn | truth).sum() > 0.85
+
+
 def test_a_smoothed_mask_has_neither_crumbs_nor_holes():
     mask = np.zeros((30, 30), bool)
     mask[5:20, 5:20] = True
