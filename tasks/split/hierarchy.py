@@ -42,7 +42,9 @@ class HierarchyParams:
     """By how much the segmenter may be surer of a piece than of the whole (predicted IoU times stability) before the
     whole no longer counts; from nothing to this, it counts less and less."""
     prior: NonNegative = 1.0
-    """So many views are taken to speak against each union, so that one view alone does not decide."""
+    """So many views more are taken to have been asked about each union, so that one view alone does not decide."""
+    prior_agreement: Fraction = 0.2
+    """Share of these that are taken to show it. If none did, what only a few views can see would come apart."""
     min_agreement: Fraction = 0.2
     """Agreement below which pieces are not united even to a group."""
     min_points: Count = 10
@@ -213,7 +215,8 @@ class _Pieces:
         return {piece for piece in members if all(on_top[row] for row in self.labels[piece])}
 
     def _agreement(self, sets: list[tuple[int, ...]]) -> Float64:
-        """[S] share of the views that show each set of pieces as one, of those that see at least two of them."""
+        """[S] share of the views that show each set of pieces as one, of those that see at least two of them: the mean
+        of the share's posterior, as a beta distribution with the prior."""
         member = np.zeros((len(sets), len(self.stuff)), np.float32)
         for row, members in enumerate(sets):
             member[row, list(members)] = 1
@@ -234,7 +237,8 @@ class _Pieces:
             doubt = (surest_piece[:, None] - view.quality) / max(self.params.doubt, 1e-9)
             fit = _ramp(iou, *_IOU) * _ramp(rest, *_REST) * np.clip(1 - doubt, 0, 1)
             agreed[rows] += weight[rows] * fit.max(axis=1)
-        return agreed / np.maximum(asked + self.params.prior, 1e-9)
+        prior = self.params.prior
+        return (agreed + prior * self.params.prior_agreement) / np.maximum(asked + prior, 1e-9)
 
 
 def _content(tally: Tally) -> tuple[object, ...]:

@@ -34,7 +34,7 @@ def tree(tallies: list[Tally], labels: int, **changes) -> Hierarchy:
     )
     sizes, intrinsics = np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]])
     cameras = Cameras(("a",), sizes, intrinsics, np.eye(4)[None], True)
-    return hierarchy(cloud, cameras, given, tallies, params=HierarchyParams(prior=0.0, **changes))
+    return hierarchy(cloud, cameras, given, tallies, params=HierarchyParams(**{"prior": 0.0, **changes}))
 
 
 def unions(found: Hierarchy) -> dict[frozenset[int], float]:
@@ -87,6 +87,28 @@ def test_a_crumb_that_a_view_hardly_sees_neither_speaks_for_nor_against():
     tiny = Tally("a", np.array([1, 2], np.int32), np.array([SEES, 3], np.int32), np.array([[SEES, 0]], np.int32),
                  NO_BORDERS[:2, :2], np.array([0.9], np.float32))  # fmt: skip
     assert unions(tree([tally([({1, 2}, 0.9)], {1, 2}), tiny, tiny], 2)) == {frozenset({1, 2}): 1.0}
+
+
+def half_agree(views: int) -> list[tuple[list[tuple[set[int], float]], int]]:
+    """Views, all different, of which every second shows two pieces as one."""
+    both, apart = [({1, 2}, 0.9), ({1}, 0.9), ({2}, 0.9)], [({1}, 0.9), ({2}, 0.9)]
+    return [(apart if k % 2 else both, SEES - k) for k in range(views)]
+
+
+@pytest.mark.parametrize("views", [8, 10, 24, 60])
+def test_half_of_few_views_says_the_same_as_half_of_many(views):
+    found = tree([tally(of, {1, 2}, points) for of, points in half_agree(views)], 2, prior=1.0)
+    assert 0.45 < unions(found)[frozenset({1, 2})].expected < 0.5  # a union at the default granularity
+
+
+def test_one_of_two_views_does_not_decide():
+    found = tree([tally(of, {1, 2}, points) for of, points in half_agree(2)], 2, prior=1.0)
+    assert unions(found) == {frozenset({1, 2}): 1.2 / 3}
+
+
+def test_views_that_are_presumed_may_all_speak_against():
+    views = [tally(of, {1, 2}, points) for of, points in half_agree(8)]
+    assert unions(tree(views, 2, prior=1.0, prior_agreement=0.0)) == {frozenset({1, 2}): 4 / 9}
 
 
 def test_without_views_or_labels_there_is_no_union():
