@@ -30,9 +30,10 @@ class SegmentParams:
     grids: tuple[Count, ...] = (1, 4, 8, 16)
     """Prompt points a side of each grid, coarse to fine (row 2)."""
     adaptive: bool = True
-    """Whether the finest grid leaves out the points where the coarser ones agree."""
-    settled_by: Count = 3
-    """A point that lies in the smallest masks of so many prompts is not prompted: it would hardly find more."""
+    """Whether a grid leaves out the points where the coarser ones agree."""
+    settled_by: tuple[Count, ...] = (3, 3, 3, 1)
+    """A point that lies in the smallest masks of so many prompts of coarser grids is not prompted: it would hardly find
+    more. A mask above `max_area` does not count, since any thing may lie in it."""
     pred_iou: Fraction = 0.8
     """Least quality that the segmenter itself predicts (row 3)."""
     stability: tuple[Fraction, ...] | None = None
@@ -69,7 +70,7 @@ class SegmentParams:
     """With "union": share of the smaller mask above which a finer one is united with a coarser one (row 9)."""
 
     def __post_init__(self) -> None:
-        for name in ("stability", "stability_offset", "mask_threshold", "box_nms"):
+        for name in ("settled_by", "stability", "stability_offset", "mask_threshold", "box_nms"):
             values = getattr(self, name)
             if values is not None and len(values) < len(self.grids):
                 raise InputError(
@@ -127,8 +128,8 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
     for level, side in enumerate(params.grids):
         points = grid_points(side, frame.width, frame.height)
         points = points[valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
-        if params.adaptive and level == len(params.grids) - 1:
-            points = points[_at(points, agreed, frame) < params.settled_by]
+        if params.adaptive:
+            points = points[_at(points, agreed, frame) < params.settled_by[level]]
         accepted, held = _ask(sam, embedding, points, level, valid_low, params, model)
         grids.append(accepted)
         agreed += held
@@ -176,7 +177,7 @@ def _ask(
     """The masks that the points of one grid find.
 
     Returns the accepted masks, and for each pixel [h, w] how many of the points have it in the smallest mask that they
-    found.
+    found, leaving out masks above `max_area`.
     """
     parts: list[_Candidates] = []
     held: Int32 = np.zeros(valid.shape, np.int32)
@@ -184,10 +185,13 @@ def _ask(
         logits, scores = sam.predict(embedding, points[start : start + sam.BATCH])
         passed, prompt = _filter(logits, scores, level, valid, params, model)
         parts.append(passed)
+        area = passed.masks.sum(axis=(1, 2))
         smallest = np.full(len(scores), -1)
-        largest_first = np.argsort(-passed.masks.sum(axis=(1, 2)), kind="stable")
+        largest_first = np.argsort(-area, kind="stable")
         smallest[prompt[largest_first]] = largest_first
-        held += passed.masks[smallest[smallest >= 0]].sum(axis=0, dtype=np.int32)
+        smallest = smallest[smallest >= 0]
+        things = smallest[area[smallest] <= params.max_area * valid.sum()]
+        held += passed.masks[things].sum(axis=0, dtype=np.int32)
     found = _Candidates.joined(parts)
     if params.suppression == "masks":
         return found[suppress(mask_iou(found.masks), found.predicted_iou, params.mask_nms)], held

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame
@@ -107,25 +109,62 @@ FOUR_GRIDS = replace(LOOSE, grids=(1, 4, 8, 16))
 def test_adaptive_prompts_are_fewer_and_lose_nothing(scripted):
     full = segment(frame(), embed(frame(), model=MODEL), params=FOUR_GRIDS, model=MODEL)
     assert sum(map(len, scripted.prompts)) == 337
-    adaptive = segment(frame(), embed(frame(), model=MODEL), params=replace(FOUR_GRIDS, adaptive=True), model=MODEL)
+    # The table's mask has no hole where the cup stands, so a grid that hits the cup has to be asked whole.
+    few = replace(FOUR_GRIDS, adaptive=True, settled_by=(99, 99, 99, 3))
+    adaptive = segment(frame(), embed(frame(), model=MODEL), params=few, model=MODEL)
     assert sum(map(len, scripted.prompts)) < 337 / 2
     np.testing.assert_array_equal(adaptive.packed, full.packed)
 
 
-@pytest.mark.parametrize("settled_by", [1, 60, 62, 1000])
-def test_the_finest_grid_leaves_out_points_that_the_smallest_masks_of_so_many_prompts_hold(scripted, settled_by):
+def answers(points: np.ndarray) -> list[str | None]:
+    """The smallest rectangle under each point."""
+    names = sorted(RECTANGLES, key=lambda name: rectangle(name).sum())
+    return [next((name for name in names if rectangle(name)[int(y), int(x)]), None) for x, y in points]
+
+
+@pytest.mark.parametrize("settled_by", [(1, 1, 1, 1), (3, 3, 3, 1), (3, 3, 3, 3), (1, 9, 6, 14), (99, 99, 99, 99)])
+def test_a_grid_leaves_out_points_that_the_smallest_masks_of_so_many_prompts_hold(scripted, settled_by):
     params = replace(FOUR_GRIDS, adaptive=True, settled_by=settled_by)
     segment(frame(), embed(frame(), model=MODEL), params=params, model=MODEL)
-    asked = np.concatenate(scripted.prompts)
-    assert len(asked) >= 81
-    on = {name: lambda x, y, mask=rectangle(name): mask[int(y), int(x)] for name in RECTANGLES}
-    smallest = [next((on[name] for name in ("cup", "plate", "table") if on[name](x, y)), None) for x, y in asked[:81]]
-    expected = [
-        (x, y)
-        for x, y in grid_points(16, SIDE, SIDE)
-        if sum(holds is not None and holds(x, y) for holds in smallest) < settled_by
-    ]
-    assert [tuple(point) for point in asked[81:]] == expected
+    asked = np.zeros((0, 2))
+    for side, enough in zip(FOUR_GRIDS.grids, settled_by, strict=True):
+        holding = [rectangle(name) for name in answers(asked) if name]
+        points = grid_points(side, SIDE, SIDE)
+        held = [sum(bool(mask[int(y), int(x)]) for mask in holding) for x, y in points]
+        asked = np.concatenate([asked, points[np.array(held) < enough]])
+    np.testing.assert_array_equal(np.concatenate(scripted.prompts), asked)
+
+
+def test_a_mask_that_fills_the_picture_settles_no_point(scripted, monkeypatch):
+    monkeypatch.setitem(RECTANGLES, "wall", (0, 64, 0, 64))
+    for name in ("table", "plate"):
+        monkeypatch.delitem(RECTANGLES, name)
+    params = replace(FOUR_GRIDS, adaptive=True, settled_by=(1, 1, 1, 1))
+    segment(frame(), embed(frame(), model=MODEL), params=params, model=MODEL)
+    asked = {tuple(point) for points in scripted.prompts for point in points}
+    finest = grid_points(16, SIDE, SIDE)
+    on_the_wall = [tuple(point) for point, name in zip(finest, answers(finest), strict=True) if name == "wall"]
+    assert on_the_wall
+    assert asked.issuperset(on_the_wall)
+    scripted.prompts.clear()
+    segment(frame(), embed(frame(), model=MODEL), params=replace(params, max_area=1.0), model=MODEL)
+    assert len(np.concatenate(scripted.prompts)) == 1
+
+
+@given(
+    cells=st.sets(st.tuples(st.integers(0, 7), st.integers(0, 7)), max_size=12),
+    settled_by=st.tuples(*[st.integers(1, 4)] * 4),
+)
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_adaptive_prompts_find_all_things_that_do_not_overlap(scripted, cells, settled_by):
+    things = {f"{row} {column}": (8 * row, 8 * row + 7, 8 * column, 8 * column + 7) for row, column in cells}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(globals(), "RECTANGLES", things)
+        params = replace(FOUR_GRIDS, min_pixels=0, settled_by=settled_by)
+        full = segment(frame(), embed(frame(), model=MODEL), params=params, model=MODEL)
+        few = segment(frame(), embed(frame(), model=MODEL), params=replace(params, adaptive=True), model=MODEL)
+    assert len(full) == len(things)
+    np.testing.assert_array_equal(few.packed, full.packed)
 
 
 @pytest.mark.parametrize(
