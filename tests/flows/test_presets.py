@@ -25,7 +25,6 @@ TABLE = {
     # 2
     "split.segment.grids": ((1, 4, 8, 16),) * 3,
     "split.segment.adaptive": (False, False, True),
-    "split.segment.settled_by": ((3, 3, 3, 1),) * 3,
     # 3
     "split.segment.pred_iou": (0.8, 0.8, 0.8),
     # 4: ours is the model's own, as one figure for all drops good masks of small networks (findings, 1).
