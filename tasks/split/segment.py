@@ -34,7 +34,7 @@ class SegmentParams:
     """Whether points are left out that would hardly find more: by `edge`, and on the finest grid by `settled_by`."""
     edge: NonNegative = 0.6
     """A point is prompted where the photo's colour changes at least so much on the straight way to the nearest point of
-    the grid before: as a share of the spread of the photo's colours (root mean square distance from their mean, CIELAB).
+    the grid before: as a share of the spread of its colours (root mean square distance from their mean, CIELAB).
     Without an edge between them, two points get the same answer."""
     settled_by: Count = 3
     """A point that lies in the smallest masks of so many prompts is settled. A mask above `max_area` does not count,
