@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, MaskSet, UInt8
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, MaskSet
+from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.masks.overlap import drop_duplicates, mask_iou, suppress
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree, merge_union, whole_pictures, without_speckles
@@ -31,14 +30,10 @@ class SegmentParams:
     grids: tuple[Count, ...] = (1, 4, 8, 16)
     """Prompt points a side of each grid, coarse to fine (row 2)."""
     adaptive: bool = True
-    """Whether points are left out that would hardly find more: by `edge`, and on the finest grid by `settled_by`."""
-    edge: NonNegative = 0.6
-    """A point is prompted where the photo's colour changes at least so much on the straight way to the nearest point of
-    the grid before: as a share of the spread of its colours (root mean square distance from their mean, CIELAB).
-    Without an edge between them, two points get the same answer."""
+    """Whether the finest grid leaves out the points where the coarser ones agree."""
     settled_by: Count = 3
-    """A point that lies in the smallest masks of so many prompts is settled. A mask above `max_area` does not count,
-    since any thing may lie in it."""
+    """A point that lies in the smallest masks of so many prompts is not prompted: it would hardly find more. A mask
+    above `max_area` does not count, since any thing may lie in it."""
     pred_iou: Fraction = 0.8
     """Least quality that the segmenter itself predicts (row 3)."""
     stability: tuple[Fraction, ...] | None = None
@@ -130,12 +125,9 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
 
     grids: list[_Candidates] = []
     agreed: Int32 = np.zeros(valid_low.shape, np.int32)
-    colours = _colours(decode_rgb(frame), valid_low)
     for level, side in enumerate(params.grids):
         points = grid_points(side, frame.width, frame.height)
         points = points[valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
-        if params.adaptive and level > 0:
-            points = points[_beyond_edges(points, params.grids[level - 1], colours, valid_low, frame, params.edge)]
         if params.adaptive and level == len(params.grids) - 1:
             points = points[_at(points, agreed, frame) < params.settled_by]
         accepted, held = _ask(sam, embedding, points, level, valid_low, params, model)
@@ -229,42 +221,8 @@ def _filter(
 
 def _at(points: Float64, image: Int32, frame: Frame) -> Int32:
     """The pixels of an image of any size [h, w] at points [M, 2] of the frame: [M]."""
-    return image[_pixels(points, image.shape, frame)]
-
-
-def _pixels(points: Float64, shape: tuple[int, int], frame: Frame) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of an image of this size (h, w) under points [..., 2] of the frame."""
-    h, w = shape
-    return (points[..., 1] * h / frame.height).astype(np.intp), (points[..., 0] * w / frame.width).astype(np.intp)
-
-
-def _beyond_edges(points: Float64, coarser: int, colours: Float32, valid: Bool, frame: Frame, edge: float) -> Bool:
-    """[M] between which points [M, 2] and the nearest point of a grid of `coarser` points a side an edge runs, or
-    something that does not count.
-
-    colours: [h, w, 3], of which a point's own and any other on the way differ by at least `edge` at an edge. valid:
-    [h, w].
-    """
-    size = np.array([frame.width, frame.height])
-    nearest = (np.floor(points / size * coarser) + 0.5) / coarser * size
-    # As many samples as the longest way has pixels.
-    h, w = valid.shape
-    count = int(np.hypot(h, w) / coarser / 2) + 2
-    way = points[:, None] + np.linspace(0, 1, count)[:, None] * (nearest - points)[:, None]
-    pixels = _pixels(way, valid.shape, frame)
-    step = np.linalg.norm(colours[pixels] - colours[pixels][:, :1], axis=2).max(axis=1)
-    return (step >= edge) | ~valid[pixels].all(axis=1)
-
-
-def _colours(rgb: UInt8, valid: Bool) -> Float32:
-    """The photo [H, W, 3] as smoothed CIELAB colours at the size of `valid` [h, w], in units of their spread."""
-    import cv2
-
-    h, w = valid.shape
-    small = cv2.resize(rgb, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-    lab = cv2.blur(cv2.cvtColor(small, cv2.COLOR_RGB2LAB), (3, 3))
-    spread = np.sqrt(lab[valid].var(axis=0).sum()) if valid.any() else 0.0
-    return lab / np.maximum(spread, np.finfo(np.float32).eps)
+    h, w = image.shape
+    return image[(points[:, 1] * h / frame.height).astype(int), (points[:, 0] * w / frame.width).astype(int)]
 
 
 def _box_iou(masks: Bool) -> Float32:

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame
@@ -63,8 +61,8 @@ def scripted(monkeypatch):
     return ScriptedSam
 
 
-def frame(valid: np.ndarray | None = None, rgb: np.ndarray | None = None) -> Frame:
-    photo = encode_png(np.zeros((SIDE, SIDE, 3), np.uint8) if rgb is None else rgb)
+def frame(valid: np.ndarray | None = None) -> Frame:
+    photo = encode_png(np.zeros((SIDE, SIDE, 3), np.uint8))
     mask = np.zeros(0, np.uint8) if valid is None else encode_png(valid.astype(np.uint8) * 255)
     return Frame("view", SIDE, SIDE, photo, mask, SIDE, SIDE)
 
@@ -104,7 +102,7 @@ def test_pixels_that_do_not_count_are_in_no_mask_and_get_no_prompt(scripted):
 
 
 FOUR_GRIDS = replace(LOOSE, grids=(1, 4, 8, 16))
-SETTLED = replace(FOUR_GRIDS, adaptive=True, edge=0)
+SETTLED = replace(FOUR_GRIDS, adaptive=True)
 
 
 def test_adaptive_prompts_are_fewer_and_lose_nothing(scripted):
@@ -113,12 +111,6 @@ def test_adaptive_prompts_are_fewer_and_lose_nothing(scripted):
     adaptive = segment(frame(), embed(frame(), model=MODEL), params=SETTLED, model=MODEL)
     assert sum(map(len, scripted.prompts)) < 337 / 2
     np.testing.assert_array_equal(adaptive.packed, full.packed)
-
-
-def answers(points: np.ndarray) -> list[str | None]:
-    """The smallest rectangle under each point."""
-    names = sorted(RECTANGLES, key=lambda name: rectangle(name).sum())
-    return [next((name for name in names if rectangle(name)[int(y), int(x)]), None) for x, y in points]
 
 
 def smallest(points: np.ndarray) -> list[str | None]:
@@ -150,49 +142,6 @@ def test_a_mask_that_fills_the_picture_settles_no_point(scripted, monkeypatch):
     np.testing.assert_array_equal(np.concatenate(scripted.prompts)[81:], wall)
     segment(frame(), embed(frame(), model=MODEL), params=replace(params, max_area=1.0), model=MODEL)
     assert len(np.concatenate(scripted.prompts)) == 81
-
-
-def test_points_without_an_edge_to_the_grid_before_are_not_prompted(scripted):
-    rgb = np.zeros((SIDE, SIDE, 3), np.uint8)
-    rgb[:, 21:] = 255  # lies between 8 and 32, 20 and 24, 22 and 20: a point and the nearest before it
-    photo = frame(rgb=rgb)
-    segment(photo, embed(photo, model=MODEL), params=replace(SETTLED, edge=0.6, settled_by=1000), model=MODEL)
-    asked = [{tuple(point) for point in points} for points in scripted.prompts]
-    expected = [
-        {(32, 32)},
-        {(8, y) for y in (8, 24, 40, 56)},
-        {(20, y) for y in range(4, 64, 8)},
-        {(22, y) for y in range(2, 64, 4)},
-    ]
-    assert asked == expected
-
-
-def test_a_point_is_prompted_when_the_nearest_of_the_grid_before_does_not_count(scripted):
-    valid = np.ones((SIDE, SIDE), bool)
-    valid[28:36, 28:36] = False
-    view = frame(valid)
-    params = replace(SETTLED, grids=(1, 4), edge=0.6, settled_by=1000)
-    segment(view, embed(view, model=MODEL), params=params, model=MODEL)
-    assert len(np.concatenate(scripted.prompts)) == 16
-
-
-@given(cells=st.sets(st.tuples(st.integers(0, 7), st.integers(0, 7)), max_size=12), settled_by=st.integers(1, 4))
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_fewer_prompts_find_all_that_is_apart_and_stands_out(scripted, cells, settled_by):
-    things = {f"{row} {column}": (8 * row, 8 * row + 7, 8 * column, 8 * column + 7) for row, column in cells}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(globals(), "RECTANGLES", things)
-        rgb = np.zeros((SIDE, SIDE, 3), np.uint8)
-        for index, name in enumerate(things):
-            rgb[rectangle(name)] = (255, 255, 20 * index)
-        photo = frame(rgb=rgb)
-        whole = replace(FOUR_GRIDS, min_pixels=0, settled_by=settled_by)
-        full = segment(photo, embed(photo, model=MODEL), params=whole, model=MODEL)
-        every = sum(map(len, scripted.prompts))
-        few = segment(photo, embed(photo, model=MODEL), params=replace(whole, adaptive=True), model=MODEL)
-        assert sum(map(len, scripted.prompts)) <= every
-    assert len(full) == len(things)
-    np.testing.assert_array_equal(few.packed, full.packed)
 
 
 @pytest.mark.parametrize(
