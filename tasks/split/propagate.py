@@ -50,6 +50,9 @@ class PropagateParams:
     min_label_views: Count = 2
     """Views that must show a label by a mask, where as many see at least a tenth of it; else it is dropped in the end.
     1 keeps all."""
+    min_label_share: Fraction = 1 / 3
+    """A label that this share of the views that see it show is kept all the same: where two or three views look, one of
+    them is a third or more."""
 
 
 @task()
@@ -81,7 +84,7 @@ def propagate(
     num_labels = max(matched.label, default=0)
     renamed = _renaming(label, settled, num_labels)
     if params.min_label_views > 1:
-        dropped = _unconfirmed(settled, observations, matched, renamed, params.min_label_views)
+        dropped = _unconfirmed(settled, observations, matched, renamed, params)
         settled, renamed = np.where(dropped[settled], 0, settled), np.where(dropped[renamed], 0, renamed)
     return PointLabels(
         label=settled,
@@ -133,9 +136,9 @@ def _renaming(before: Int32, after: Int32, num_labels: int) -> Int32:
 
 
 def _unconfirmed(
-    label: Int32, observations: Sequence[Observation], matched: Matches, renamed: Int32, min_views: int
+    label: Int32, observations: Sequence[Observation], matched: Matches, renamed: Int32, params: PropagateParams
 ) -> Bool:
-    """Which labels masks of fewer views show, though as many see at least a tenth of their points: [L + 1].
+    """Which labels masks of too few views show, though enough see at least a tenth of their points: [L + 1].
 
     Where no other view looks, there is nothing that could have confirmed them.
     """
@@ -149,12 +152,13 @@ def _unconfirmed(
             known.add(content)
             seen += 10 * np.bincount(label[observation.point_index], minlength=len(size)) >= np.maximum(size, 1)
             support[shown[1, shown[0] == k]] += 1
-    dropped = (support < min_views) & (seen >= min_views) & (size > 0)
+    few = (support < params.min_label_views) & (support < params.min_label_share * seen)
+    dropped = few & (seen >= params.min_label_views) & (size > 0)
     dropped[0] = False
     if dropped.any():
         warn(
             f"{dropped.sum()} of {np.count_nonzero(size[1:])} labels, with {size[dropped].sum()} of {len(label)} "
-            f"points, go to the background, since masks of fewer than {min_views} views show them though others see "
-            f"them too."
+            f"points, go to the background, since masks of fewer than {params.min_label_views} views show them "
+            f"though others see them too."
         )
     return dropped

@@ -308,13 +308,19 @@ def test_contested_points_follow_their_neighbours():
     assert len(set(smooth.label.tolist())) == 2
 
 
-def test_a_label_that_one_of_two_views_shows_by_a_mask_goes_to_the_background():
-    visible, masks = views_of([[1, 2, 3], [4, 5, 6]], [[4, 5, 6]])
-    seen_by_both = visible[0], row_of_points([1, 2, 3, 4, 5, 6])[0]
+@pytest.mark.parametrize(("others", "stays"), [(1, True), (2, True), (3, False)])
+def test_a_label_that_one_view_shows_goes_to_the_background_where_many_others_look(others, stays):
+    visible, masks = views_of([[1, 2, 3], [4, 5, 6]], *[[[4, 5, 6]]] * others)
+    besides = [], [0], [7]  # as a second copy of a view confirms nothing
+    seen_by_all = visible[0], *(row_of_points([1, 2, 3, 4, 5, 6, *more])[0] for more in besides[:others])
     params = replace(BARE, views="at_once", at_once=MaskClusteringParams(min_points=1, background_vote=0.0))
-    settled = run(points(8), seen_by_both, masks, params)
-    assert settled.label[4:7].all() and not settled.label[1:4].any()
-    assert settled.match_label.tolist().count(0) == 1
-    # Where no other view looks, it stays; so it does with min_label_views=1.
-    for views, kept in ((visible, params), (seen_by_both, replace(params, min_label_views=1))):
+    settled = run(points(8), seen_by_all, masks, params)
+    assert settled.label[4:7].all() and settled.label[1:4].any() == stays
+    assert settled.match_label.tolist().count(0) == (not stays)
+    # Where no other view looks, it stays; so it does with min_label_views=1, and with a share of 0.
+    for views, kept in (
+        (visible, params),
+        (seen_by_all, replace(params, min_label_views=1)),
+        (seen_by_all, replace(params, min_label_share=0.0)),
+    ):
         assert run(points(8), views, masks, kept).label[1:7].all()
