@@ -128,7 +128,8 @@ def _turned(own: Gaussians, camera: Camera) -> Camera | None:
     border = 0.08 * side
     scale = _PICTURE / (side + 2 * border)
     width, height = np.ceil((high - low + 2 * border) * scale).astype(int).tolist()
-    return Camera(width, height, scale, scale, *((border - low) * scale).tolist(), pose)
+    cx, cy = ((border - low) * scale).tolist()
+    return Camera(width, height, scale, scale, cx, cy, pose)
 
 
 def _fuse(o3d: Any, volume: Any, seen: Rendering, view: Camera) -> Float32:
