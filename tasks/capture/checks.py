@@ -17,7 +17,7 @@ from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, CaptureChecks, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.capture.ingest import first_of
-from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, size_within
 from ss_flow.tasks.ranges import Fraction, NonNegative
 
@@ -80,7 +80,7 @@ def checks(
     pairs: list[tuple[int, int]] = []
     near: list[Float64] = []
     for row, frame in enumerate(frames):
-        for other in _neighbours(cameras, row):
+        for other in nearest_views(cameras, row, _NEIGHBOURS):
             pairs.append((row, other))
             near.append(_errors(views[row], views[other], _NEAR))
         progress(row + 1, len(frames), frame.name)
@@ -184,17 +184,6 @@ def _view(frame: Frame, camera: Camera, depth: DepthMap) -> _View:
     known = known[:: -(-len(known) // _MOST_PIXELS) or 1]
     points = backproject(small, replace(sized, world_to_camera=np.eye(4)))[known]
     return _View(grey.astype(np.float32), small, sized, points, known)
-
-
-def _neighbours(cameras: Cameras, view: int) -> list[int]:
-    """The nearest views that look the same way, within 45 degrees."""
-    poses = cameras.world_to_camera
-    centres = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
-    distance = np.linalg.norm(centres - centres[view], axis=1)
-    distance[(poses[:, 2, :3] @ poses[view, 2, :3]) < np.sqrt(0.5)] = np.inf
-    distance[view] = np.inf
-    nearest = np.argsort(distance, kind="stable")[:_NEIGHBOURS]
-    return [int(other) for other in nearest if np.isfinite(distance[other])]
 
 
 def _errors(view: _View, other: _View, scales: Float64) -> Float64:

@@ -16,7 +16,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.matches import Matches
-from ss_flow.tasks.geometry.cameras import backproject, camera_of, pixels_in_view
+from ss_flow.tasks.geometry.cameras import backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
 
 _PAIRS = 12
@@ -64,15 +64,9 @@ class PoseFit:
 @task(name="capture.pose_pairs")
 def pose_pairs(cameras: Cameras) -> PosePairs:
     """A few views, evenly chosen, each with the nearest one that looks the same way, within 45 degrees."""
-    poses = cameras.world_to_camera
-    centers = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
     pairs = set()
-    for view in np.unique(np.linspace(0, len(cameras) - 1, min(_PAIRS, len(cameras))).astype(int)).tolist():
-        distance = np.linalg.norm(centers - centers[view], axis=1)
-        distance[poses[:, 2, :3] @ poses[view, 2, :3] < np.sqrt(0.5)] = np.inf
-        distance[view] = np.inf
-        other = int(distance.argmin())
-        if np.isfinite(distance[other]):
+    for view in np.linspace(0, len(cameras) - 1, min(_PAIRS, len(cameras))).astype(int).tolist():
+        for other in nearest_views(cameras, view, 1):
             pairs.add((min(view, other), max(view, other)))
     chosen = np.array(sorted(pairs), np.int32).reshape(-1, 2)
     views, places = np.unique(chosen, return_inverse=True)

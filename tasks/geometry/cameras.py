@@ -141,3 +141,14 @@ def surface_of_pixels(column: NDArray[np.integer], row: NDArray[np.integer], dep
     rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(depth))])
     local = (rays * depth).T - camera.world_to_camera[:3, 3]
     return np.asarray(local @ camera.world_to_camera[:3, :3])
+
+
+def nearest_views(cameras: Cameras, view: int, count: int) -> list[int]:
+    """Rows of the nearest other cameras that look the same way as one does, within 45 degrees; the nearest first."""
+    poses = cameras.world_to_camera
+    centers = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
+    distance = np.linalg.norm(centers - centers[view], axis=1)
+    distance[poses[:, 2, :3] @ poses[view, 2, :3] < np.sqrt(0.5)] = np.inf
+    distance[view] = np.inf
+    nearest = np.argsort(distance, kind="stable")[:count]
+    return [int(other) for other in nearest if np.isfinite(distance[other])]
