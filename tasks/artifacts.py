@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
@@ -150,6 +151,35 @@ class PackedMasks:
         """One of the masks: [H, W]."""
         bits = np.unpackbits(self.packed[row], count=self.height * self.width)
         return bits.reshape(self.height, self.width).astype(bool)
+
+
+class ViewMasks:
+    """Masks of one thing, a bit a pixel, one in each of some views, whose frames may differ in size."""
+
+    views: tuple[str, ...]
+    """[V] names of the views that have a mask, in the order of the frames."""
+    sizes: Int32
+    """[V, 2] width and height of these views."""
+    packed: UInt8
+    """The masks one after the other, each row-major and filled up to a whole byte (`np.packbits`)."""
+
+    def bits(self) -> list[UInt8]:
+        """Of each mask, [ceil(H * W / 8)]."""
+        ends = np.cumsum(-(-self.sizes.prod(axis=1, dtype=np.int64) // 8))
+        return np.split(self.packed, ends[:-1]) if len(ends) else []
+
+    def dense(self) -> list[Bool]:
+        """The masks, [H, W] each."""
+        return [self.mask(row) for row in range(len(self.views))]
+
+    def mask(self, row: int) -> Bool:
+        """One of the masks: [H, W]."""
+        width, height = self.sizes[row].tolist()
+        return np.unpackbits(self.bits()[row], count=height * width).reshape(height, width).astype(bool)
+
+    def areas(self) -> Int64:
+        """[V] pixels of each mask."""
+        return np.array([np.bitwise_count(mask).sum() for mask in self.bits()], np.int64)
 
 
 @dataclass(frozen=True)
@@ -329,7 +359,7 @@ class PromptedMasks(PackedMasks):
 
 
 @dataclass(frozen=True)
-class InstanceMasks(PackedMasks):
+class InstanceMasks(ViewMasks):
     """One instance after Split: its points and view-consistent masks (Split&Splat, M~_{k,l}). Id 0 is background."""
 
     instance_id: int
@@ -343,12 +373,10 @@ class InstanceMasks(PackedMasks):
     """[N] part of the instance, 0 = the whole."""
     confidence: float
     """Mean vote share, less what other labels contradict."""
-    height: int
-    width: int
     views: tuple[str, ...]
-    """[V] names of the views in which it has a mask, in the order of the frames."""
+    sizes: Int32
     packed: UInt8
-    """[V, ceil(H * W / 8)] one bit a pixel (`np.packbits`), exclusive between instances."""
+    """As in `ViewMasks`, exclusive between instances."""
     origin: UInt8
     """[V] where the mask came from: FOUND, PROMPTED, REFINED or DRAWN."""
     weak: bool
@@ -356,18 +384,16 @@ class InstanceMasks(PackedMasks):
 
 
 @dataclass(frozen=True)
-class PartMasks(PackedMasks):
+class PartMasks(ViewMasks):
     """One part of an instance, where the finished scene shows it."""
 
     instance_id: int
     part_id: int
     """1.. within the instance, as `Gaussians.part_id`."""
-    height: int
-    width: int
     views: tuple[str, ...]
-    """[V] names of the views that show it, in the order of the frames."""
+    sizes: Int32
     packed: UInt8
-    """[V, ceil(H * W / 8)] one bit a pixel (`np.packbits`), exclusive between parts."""
+    """As in `ViewMasks`, exclusive between parts."""
 
 
 FOUND, PROMPTED, REFINED, DRAWN = 0, 1, 2, 3

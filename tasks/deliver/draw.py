@@ -166,12 +166,12 @@ def _depth_legend(width: int, low: float, high: float, note: str) -> UInt8:
 @_draw.register
 def _(value: InstanceMasks, context: Context) -> UInt8:
     pictures, captions = [], []
-    order = np.argsort(-np.bitwise_count(value.packed).sum(axis=1, dtype=np.int64), kind="stable")[:12]
-    masks = value.dense()
-    for row in np.sort(order):
-        ids = np.where(masks[row], value.instance_id, 0)
+    order = np.argsort(-value.areas(), kind="stable")[:12]
+    for row in np.sort(order).tolist():
+        ids = np.where(value.mask(row), value.instance_id, 0)
         name = value.views[row]
-        pictures.append(paint_ids(ids, context.photo(value.height, value.width, name), 0.45))
+        width, height = value.sizes[row].tolist()
+        pictures.append(paint_ids(ids, context.photo(height, width, name), 0.45))
         captions.append(name + _ORIGINS[int(value.origin[row])])
     if pictures:
         return contact_sheet(pictures, captions)

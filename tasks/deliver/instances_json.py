@@ -117,8 +117,7 @@ def _parts(instance: InstanceMasks) -> list[dict[str, Any]]:
 
 
 def _is_crumb(instance: InstanceMasks) -> bool:
-    pixels = instance.height * instance.width * len(instance.views)
-    return instance.weak or int(np.bitwise_count(instance.packed).sum()) < _CRUMB * pixels
+    return instance.weak or int(instance.areas().sum()) < _CRUMB * int(instance.sizes.prod(axis=1).sum())
 
 
 def _named_by(instance_id: int, names: InstanceNames | None) -> str | None:

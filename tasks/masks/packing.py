@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, InstanceMasks, UInt8
+from ss_flow.tasks.artifacts import Bool, InstanceMasks, Int32, UInt8
 
 
 def pack_masks(masks: Bool) -> UInt8:
@@ -14,12 +15,17 @@ def pack_masks(masks: Bool) -> UInt8:
     return np.packbits(masks.reshape(len(masks), masks.shape[1] * masks.shape[2]), axis=1)
 
 
+def joined(sizes: Sequence[tuple[int, int]] | Int32, masks: Sequence[UInt8]) -> tuple[Int32, UInt8]:
+    """Width and height of each view, and its mask by `np.packbits`, as `sizes` and `packed` of `ViewMasks`."""
+    return np.array(sizes, np.int32).reshape(-1, 2), np.concatenate([np.zeros(0, np.uint8), *masks])
+
+
 def dilated(instance: InstanceMasks, pixels: int) -> InstanceMasks:
     """The same with masks that reach so many pixels farther on all sides."""
     if not pixels:
         return instance
-    masks = [grown(mask, pixels) for mask in instance.dense()]
-    return replace(instance, packed=pack_masks(np.array(masks, bool).reshape(-1, instance.height, instance.width)))
+    masks = [np.packbits(grown(instance.mask(row), pixels)) for row in range(len(instance.views))]
+    return replace(instance, packed=joined(instance.sizes, masks)[1])
 
 
 def grown(mask: Bool, pixels: int) -> Bool:

@@ -62,16 +62,18 @@ def describe(
     model = encoder_of(encoder)
     by_name = {frame.name: i for i, frame in enumerate(frames)}
     masks = instance.dense()
-    area = masks.sum(axis=(1, 2))
+    area = instance.areas()
     large = np.argsort(-area, kind="stable")[: params.max_views]
-    chosen = np.sort(large[area[large] >= max(1, params.min_area * instance.height * instance.width)])
+    least = np.maximum(1, params.min_area * instance.sizes.prod(axis=1))
+    chosen = np.sort(large[(area >= least)[large]])
     vectors = []
     for done, row in enumerate(chosen):
         frame = frames[by_name[instance.views[row]]]
-        if (frame.height, frame.width) != (instance.height, instance.width):
+        width, height = instance.sizes[row]
+        if (frame.height, frame.width) != (height, width):
             raise InputError(
-                f"Frame {frame.name} is {frame.width} x {frame.height} pixels and the masks of instance "
-                f"{instance.instance_id} are {instance.width} x {instance.height}; both must have one size."
+                f"Frame {frame.name} is {frame.width} x {frame.height} pixels and the mask of instance "
+                f"{instance.instance_id} has {width} x {height}; both must have one size."
             )
         mask = erode(masks[row], params.erosion)
         image = shared_rgb(frame)

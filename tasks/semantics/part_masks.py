@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, PartMasks
+from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, PartMasks, UInt8
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
-from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.packing import joined
 
 _SOLID = 0.5
 """Alpha from which a pixel shows anything."""
@@ -30,7 +29,7 @@ def part_masks(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> 
     if not len(scene):
         return ()
     row_of = {name: row for row, name in enumerate(cameras.names)}
-    found: dict[tuple[int, int], PartMasks] = {}
+    found: dict[tuple[int, int], list[tuple[str, tuple[int, int], UInt8]]] = {}
     for done, shown in enumerate(maps):
         height, width = shown.ids.shape
         seen = render(scene, camera_of(cameras, row_of[shown.name]).scaled(width, height))
@@ -39,9 +38,11 @@ def part_masks(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> 
         part = np.where(same, scene.part_id[top], 0)
         both = np.stack([shown.ids[part > 0], part[part > 0]], axis=1)
         for instance, number in np.unique(both, axis=0).tolist():
-            mask = pack_masks(((shown.ids == instance) & (part == number))[None])
-            before = found.get((instance, number), PartMasks(instance, number, height, width, (), mask[:0]))
-            views, packed = (*before.views, shown.name), np.concatenate([before.packed, mask])
-            found[instance, number] = replace(before, views=views, packed=packed)
+            mask = np.packbits((shown.ids == instance) & (part == number))
+            found.setdefault((instance, number), []).append((shown.name, (width, height), mask))
         progress(done + 1, len(maps), shown.name)
-    return tuple(found[key] for key in sorted(found))
+    result = []
+    for (instance, number), seen_in in sorted(found.items()):
+        views, sizes, masks = zip(*seen_in, strict=True)
+        result.append(PartMasks(instance, number, views, *joined(sizes, masks)))
+    return tuple(result)

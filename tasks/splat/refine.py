@@ -22,7 +22,7 @@ from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
-from ss_flow.tasks.masks.packing import grown
+from ss_flow.tasks.masks.packing import grown, joined
 from ss_flow.tasks.masks.pool import without_speckles
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
@@ -121,7 +121,8 @@ def refine(
     solid = _solid(gaussians, params)
     segmenter = Sam(model) if model else None
     held = {name: row for row, name in enumerate(instance.views)}
-    names, masks, origins = [], [], []
+    names, shapes, masks, origins = [], [], [], []
+    kept = instance.bits()
     for view, frame in enumerate(views.frames):
         row = held.get(frame.name)
         old = None if row is None else instance.mask(row)
@@ -129,20 +130,23 @@ def refine(
         prompt = functools.partial(segmenter.predict_prompt, embeddings[view]) if segmenter else None
         new = _replacement(scene, view, solid, old, drawn, params, prompt)
         if new is not None:
-            names.append(frame.name)
             masks.append(np.packbits(new))
             origins.append(REFINED)
         elif row is not None:
-            names.append(frame.name)
-            masks.append(instance.packed[row])
+            masks.append(kept[row])
             origins.append(int(instance.origin[row]))
+        if new is not None or row is not None:
+            names.append(frame.name)
+            shapes.append((frame.width, frame.height))
         progress(view + 1, len(views.frames), frame.name)
     if not names:
         return instance
+    sizes, packed = joined(shapes, masks)
     return replace(
         instance,
         views=tuple(names),
-        packed=np.array(masks, np.uint8),
+        sizes=sizes,
+        packed=packed,
         origin=np.array(origins, np.uint8),
         weak=instance.weak and len(names) < params.min_views,
     )
@@ -179,10 +183,9 @@ def rendered(
         if shown.any():
             rows.append(row)
             masks.append(np.packbits(shown))
-    packed = np.array(masks, np.uint8).reshape(len(rows), instance.packed.shape[1])
-    return replace(
-        instance, views=tuple(instance.views[row] for row in rows), packed=packed, origin=instance.origin[rows]
-    )
+    sizes, packed = joined(instance.sizes[rows], masks)
+    shown_in = tuple(instance.views[row] for row in rows)
+    return replace(instance, views=shown_in, sizes=sizes, packed=packed, origin=instance.origin[rows])
 
 
 def render_mask(

@@ -22,7 +22,7 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.gaussians.views import SceneViews, Views
 from ss_flow.tasks.geometry.images import at_diagonal, decode_valid
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.packing import joined
 from ss_flow.tasks.masks.painting import nearest_labels, paint_labels
 
 _REACH = 8.0
@@ -104,10 +104,10 @@ def _painted(
         if instance.instance_id == 0:
             continue
         for row, view in enumerate(instance.views):
-            if maps[view].shape != (instance.height, instance.width):
+            if maps[view].shape != tuple(instance.sizes[row][::-1]):
                 raise InputError(
                     f"Frame {view} is {maps[view].shape[1]} x {maps[view].shape[0]} pixels and the "
-                    f"masks of instance {instance.instance_id} are {instance.width} x {instance.height}; "
+                    f"mask of instance {instance.instance_id} has {instance.sizes[row, 0]} x {instance.sizes[row, 1]}; "
                     "both must have one size."
                 )
             area = int(instance.mask(row).sum())
@@ -127,7 +127,7 @@ def exclusive(instance: InstanceMasks, maps: tuple[LabelMap, ...]) -> InstanceMa
     Masks that differ from those in `instance` are marked as refined.
     """
     old = {name: row for row, name in enumerate(instance.views)}
-    views, masks, origins = [], [], []
+    views, shapes, masks, origins = [], [], [], []
     for label_map in maps:
         mask = label_map.ids == instance.instance_id
         if not mask.any():
@@ -135,12 +135,8 @@ def exclusive(instance: InstanceMasks, maps: tuple[LabelMap, ...]) -> InstanceMa
         row = old.get(label_map.name)
         same = row is not None and np.array_equal(mask, instance.mask(row))
         views.append(label_map.name)
-        masks.append(mask)
+        shapes.append((mask.shape[1], mask.shape[0]))
+        masks.append(np.packbits(mask))
         origins.append(instance.origin[row] if same else REFINED)
-    stack = np.array(masks, bool).reshape(-1, instance.height, instance.width)
-    return replace(
-        instance,
-        views=tuple(views),
-        packed=pack_masks(stack),
-        origin=np.array(origins, np.uint8),
-    )
+    sizes, packed = joined(shapes, masks)
+    return replace(instance, views=tuple(views), sizes=sizes, packed=packed, origin=np.array(origins, np.uint8))

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import (
@@ -25,7 +24,6 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.images import at_diagonal
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import (
     PaintedView,
     agreement,
@@ -79,21 +77,13 @@ def reproject(
     instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id. An
     instance's confidence is its points' mean share of votes, less the share of its painted pixels that other labels
     contradict.
-
-    Raises InputError when the frames of two views differ in size.
     """
-    first = visibility[0]
     by_name = {extra.name: extra for extra in prompted}
     num_labels = int(labels.label.max(initial=0))
     held, against = np.zeros(num_labels + 1), np.zeros(num_labels + 1)
     views: list[dict[int, tuple[np.ndarray, int]]] = []
     for k, (view, pool) in enumerate(zip(visibility, masks, strict=True)):
         progress(k, len(masks), view.name)
-        if (view.height, view.width) != (first.height, first.width):
-            raise InputError(
-                f"Frame {view.name} is {view.width} x {view.height} pixels but {first.name} is "
-                f"{first.width} x {first.height}; all frames of a scene should have one size."
-            )
         painted = paint_labels(view, labels.label)
         shown = select_masks(painted, pool, params.selection)
         origin = dict.fromkeys(shown, FOUND)
@@ -108,11 +98,12 @@ def reproject(
             for label, mask in _drawn(painted, view, set(shown), params).items():
                 shown[label], origin[label] = mask, DRAWN
         ids = stack_exclusive(shown, view.height, view.width)
-        views.append({int(i): (pack_masks((ids == i)[None])[0], origin.get(int(i), FOUND)) for i in np.unique(ids)})
+        views.append({int(i): (np.packbits(ids == i), origin.get(int(i), FOUND)) for i in np.unique(ids)})
         for total, part in zip((held, against), contradicted(painted, ids, num_labels), strict=True):
             total += part
     agreed = 1 - against / np.maximum(held, 1)
     names = tuple(view.name for view in visibility)
+    sizes = np.array([(view.width, view.height) for view in visibility], np.int32)
     found = []
     for label in np.union1d([0], labels.label).tolist():
         rows = labels.label == label
@@ -126,12 +117,9 @@ def reproject(
                 point_confidence=share,
                 point_part=parts.part[rows],
                 confidence=float(share.mean(dtype=np.float64)) * float(agreed[label]) if share.size else 0.0,
-                height=first.height,
-                width=first.width,
                 views=tuple(names[k] for k in shown_in),
-                packed=np.array([views[k][label][0] for k in shown_in], np.uint8).reshape(
-                    len(shown_in), (first.height * first.width + 7) // 8
-                ),
+                sizes=sizes[shown_in],
+                packed=np.concatenate([np.zeros(0, np.uint8), *(views[k][label][0] for k in shown_in)]),
                 origin=np.array([views[k][label][1] for k in shown_in], np.uint8),
                 weak=label > 0 and len(shown_in) < params.min_views,
             )

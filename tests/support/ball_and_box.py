@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, InstanceMasks, LabelMap, SceneUnit
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, cameras_by_view
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.masks.packing import pack_masks
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 8
 BALL, RADIUS = np.array([0.42, 0.0, 0.22]), 0.22
@@ -61,10 +61,8 @@ class SmallScene:
             point_confidence=np.full(len(mine), 0.9, np.float32),
             point_part=((self.points[mine, 2] > 0.25) & (instance_id > 0)).astype(np.int32),
             confidence=0.9,
-            height=HEIGHT,
-            width=WIDTH,
             views=tuple(self.frames[k].name for k in views),
-            packed=pack_masks(masks),
+            **as_fields(masks),
             origin=np.zeros(len(views), np.uint8),
             weak=False,
         )

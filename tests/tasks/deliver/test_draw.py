@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from view_masks import sizes_and_bits
 
 from ss_flow.tasks.artifacts import (
     Cameras,
@@ -47,8 +48,8 @@ def labels_of(label: np.ndarray) -> PointLabels:
 def instance_of(masks: np.ndarray, views: list[int]) -> InstanceMasks:
     n = len(views)
     return InstanceMasks(
-        2, POINTS, CLOUD.colors, np.ones(500, np.float32), np.zeros(500, np.int32), 0.9, H, W,
-        tuple(("left", "b", "c", "right")[k] for k in views), np.packbits(masks.reshape(n, H * W), axis=1),
+        2, POINTS, CLOUD.colors, np.ones(500, np.float32), np.zeros(500, np.int32), 0.9,
+        tuple(("left", "b", "c", "right")[k] for k in views), *sizes_and_bits(masks.reshape(n, H, W)),
         np.zeros(n, np.uint8), False,
     )  # fmt: skip
 

@@ -15,7 +15,8 @@ def instance(instance_id: int, points, views=(0, 2), weak: bool = False, shown: 
     n, v = len(points), len(views)
     return InstanceMasks(
         instance_id, points, np.zeros((n, 3), np.uint8), np.ones(n, np.float32), np.arange(n, dtype=np.int32),
-        0.87654321, 2, 4, tuple("abc"[k] for k in views), np.full((v, 1), shown, np.uint8), np.zeros(v, np.uint8), weak,
+        0.87654321, tuple("abc"[k] for k in views), np.full((v, 2), (4, 2), np.int32), np.full(v, shown, np.uint8),
+        np.zeros(v, np.uint8), weak,
     )  # fmt: skip
 
 

@@ -27,10 +27,9 @@ def _instance(number: int, points: np.ndarray, views: int = 20, confidence: floa
         point_confidence=np.ones(n, np.float32),
         point_part=zeros,
         confidence=confidence,
-        height=1,
-        width=8,
         views=tuple(f"v{i}" for i in range(views)),
-        packed=np.full((views, 1), 255, np.uint8),
+        sizes=np.full((views, 2), (8, 1), np.int32),
+        packed=np.full(views, 255, np.uint8),
         origin=np.zeros(views, np.uint8),
         weak=False,
     )

@@ -9,6 +9,7 @@ import box_scene
 import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper, save
+from view_masks import as_fields
 
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import FOUND, Descriptors, InstanceMasks
@@ -86,7 +87,6 @@ def described(model: Model) -> tuple[Descriptors, ...]:
 
 
 def instance(masks: np.ndarray, number: int) -> InstanceMasks:
-    flat = masks.reshape(len(masks), -1)
     return InstanceMasks(
         instance_id=number,
         points=np.zeros((0, 3), np.float32),
@@ -94,10 +94,8 @@ def instance(masks: np.ndarray, number: int) -> InstanceMasks:
         point_confidence=np.zeros(0, np.float32),
         point_part=np.zeros(0, np.int32),
         confidence=1.0,
-        height=box_scene.HEIGHT,
-        width=box_scene.WIDTH,
         views=tuple(f"{k}" for k in range(len(masks))),
-        packed=np.packbits(flat, axis=1),
+        **as_fields(masks),
         origin=np.full(len(masks), FOUND, np.uint8),
         weak=False,
     )

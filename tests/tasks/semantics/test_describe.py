@@ -1,11 +1,11 @@
 import cv2
 import numpy as np
 import pytest
+from view_masks import sizes_and_bits
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, InstanceMasks, PartMasks
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.models.colour_words import TERMS
 from ss_flow.tasks.semantics.describe import DescribeParams, crop, describe, describe_part
 
@@ -35,8 +35,8 @@ def scene(*views: tuple[np.ndarray, tuple[int, int, int]]) -> tuple[tuple[Frame,
     names = tuple(frame.name for frame in frames)
     points = np.zeros((1, 3), np.float32)
     instance = InstanceMasks(
-        7, points, np.zeros((1, 3), np.uint8), np.ones(1, np.float32), np.zeros(1, np.int32), 1.0, H, W, names,
-        pack_masks(masks), np.zeros(len(views), np.uint8), False,
+        7, points, np.zeros((1, 3), np.uint8), np.ones(1, np.float32), np.zeros(1, np.int32), 1.0, names,
+        *sizes_and_bits(masks), np.zeros(len(views), np.uint8), False,
     )  # fmt: skip
     return tuple(frames), instance
 
@@ -51,7 +51,7 @@ def test_a_red_object_on_grey_is_red():
 
 def test_a_part_is_described_as_an_instance_with_its_masks_is():
     frames, instance = scene((square(40, 30, 40), RED))
-    part = PartMasks(7, 2, instance.height, instance.width, instance.views, instance.packed)
+    part = PartMasks(7, 2, instance.views, instance.sizes, instance.packed)
     found, whole = describe_part(frames, part), describe(frames, instance)
     assert (found.instance_id, found.part_id, found.views) == (7, 2, whole.views)
     assert np.array_equal(found.embedding, whole.embedding)

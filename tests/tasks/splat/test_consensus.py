@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from ball_and_box import BALL as CENTRE
 from ball_and_box import HEIGHT, RADIUS, WIDTH, SmallScene
+from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import InstanceMasks
 from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.splat.consensus import agreed, completed
 
 BALL = 2
@@ -27,7 +27,7 @@ def small() -> SmallScene:
 def with_mask(instance: InstanceMasks, row: int, mask: np.ndarray) -> InstanceMasks:
     masks = instance.dense()
     masks[row] = mask
-    return replace(instance, packed=pack_masks(masks))
+    return replace(instance, **as_fields(masks))
 
 
 def channels_of(small: SmallScene, instance: InstanceMasks, share: float = 0.5) -> list[np.ndarray]:
@@ -117,8 +117,7 @@ def test_a_complete_instance_and_what_few_masks_hold_gain_no_points(small):
 
 def test_surface_apart_from_the_labelled_points_is_another_thing(small):
     ball, box = small.instance(BALL), small.instance(1)
-    masks = ball.dense() | box.dense()
-    both = replace(ball, packed=pack_masks(masks))
+    both = replace(ball, **as_fields(np.array(ball.dense()) | np.array(box.dense())))
     apart = np.linalg.norm(ball.points - CENTRE, axis=1) < 0.23
     far = replace(
         both,

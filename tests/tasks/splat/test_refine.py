@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
+from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import DRAWN, REFINED, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import initialise, select
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.splat import refine as module
 from ss_flow.tasks.splat.refine import RefineParams, refine, render_mask, rendered
@@ -93,7 +93,7 @@ def test_without_a_segmenter_masks_stay_and_missing_ones_are_drawn_where_depth_c
 
 def moved(instance: InstanceMasks, pixels: int, **fields) -> InstanceMasks:
     """With masks shifted to the right."""
-    return replace(instance, packed=pack_masks(np.roll(instance.dense(), pixels, axis=2)), **fields)
+    return replace(instance, **as_fields(np.roll(instance.dense(), pixels, axis=2)), **fields)
 
 
 def test_a_mask_stays_unless_the_segmenters_agrees_better(small, box, monkeypatch):
@@ -137,8 +137,8 @@ def test_of_two_masks_that_agree_equally_well_the_preset_says_which_stays(small,
 
 def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small, box, monkeypatch):
     truth = small.instance(1)
-    half = truth.dense() & (np.cumsum(truth.dense(), axis=2) <= truth.dense().sum(axis=2, keepdims=True) // 2)
-    part = replace(truth, packed=pack_masks(half))
+    masks = np.array(truth.dense())
+    part = replace(truth, **as_fields(masks & (np.cumsum(masks, axis=2) <= masks.sum(axis=2, keepdims=True) // 2)))
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
     np.testing.assert_array_equal(refined(small, box, part, monkeypatch, right).packed, part.packed)
     np.testing.assert_array_equal(refined(small, box, part, monkeypatch, right, max_change=0.0).packed, truth.packed)
@@ -163,7 +163,7 @@ def test_new_masks_leave_out_what_is_not_valid(small, box, monkeypatch):
     part = small.instance(1, views=(0, 1))
     for answer in (None, lambda view, _: small.ids[view] == 1):
         result = refined(masked, box, part, monkeypatch, answer)
-        new = result.dense()[result.origin == REFINED]
+        new = np.array(result.dense())[result.origin == REFINED]
         assert len(new) and new.any() and not new[:, :, 48:].any()
 
 
@@ -186,7 +186,7 @@ def test_an_answer_is_taken_without_its_speckles(small, box, monkeypatch):
     def wrong(**params) -> int:
         found = refined(small, box, small.instance(1, views=(0,)), monkeypatch, lambda view, _: spots[view], **params)
         assert found.views == NAMES
-        return int((found.dense() != truth.dense())[1:].sum())
+        return int((np.array(found.dense()) != truth.dense())[1:].sum())
 
     assert wrong() < 0.5 * wrong(speckle=0.0)
 
@@ -196,7 +196,7 @@ def test_prompts_lie_on_visible_parts_of_the_instance(small, box, monkeypatch):
 
     def prompted(view, points):
         asked[view] = points
-        return np.zeros((small.instance(1).height, small.instance(1).width), bool)
+        return np.zeros(small.ids[0].shape, bool)
 
     refined(small, box, small.instance(1), monkeypatch, prompted)
     assert sorted(asked) == list(range(VIEWS))
@@ -225,7 +225,7 @@ def test_faint_and_huge_gaussians_do_not_draw(small, box):
     np.testing.assert_array_equal(refined(small, cluttered, part).packed, clean.packed)
     for allowed in ({"min_opacity": 0.0}, {"max_scale": 0.0}):
         drawn = refined(small, cluttered, part, min_support=0.0, cut_occluded=False, **allowed)
-        assert drawn.dense()[drawn.origin == REFINED].sum() > 1.02 * clean.dense()[clean.origin == REFINED].sum()
+        assert drawn.areas()[drawn.origin == REFINED].sum() > 1.02 * clean.areas()[clean.origin == REFINED].sum()
 
 
 def test_a_descriptor_may_be_shown_the_rendered_masks_in_the_views_that_have_one(small, box):

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
+from view_masks import as_fields, sizes_and_bits
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import REFINED, Cameras, Frame, InstanceMasks, LabelMap
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.splat.resolve import ResolveParams, exclusive, resolve, resolve_refined
 
 CAMERAS = Cameras(
@@ -21,8 +21,8 @@ def masks_of(instance_id: int, masks: dict[int, list[str]]) -> InstanceMasks:
     dense = np.array([[[c == "x" for c in row] for row in rows] for rows in masks.values()], bool)
     return InstanceMasks(
         instance_id, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32),
-        np.zeros(0, np.int32), 1.0, 3, 4, tuple("ab"[view] for view in masks),
-        pack_masks(dense), np.zeros(len(masks), np.uint8), False,
+        np.zeros(0, np.int32), 1.0, tuple("ab"[view] for view in masks),
+        *sizes_and_bits(dense), np.zeros(len(masks), np.uint8), False,
     )  # fmt: skip
 
 
@@ -48,7 +48,7 @@ def test_the_order_of_instances_and_the_background_do_not_matter():
 
 def test_masks_of_another_size_are_refused_by_name():
     other = Cameras(("a",), np.array([[5, 3]], np.int32), np.ones((1, 4)), np.eye(4)[None], metric=True)
-    with pytest.raises(InputError, match="Frame a is 5 x 3 pixels and the masks of instance 2 are 4 x 3"):
+    with pytest.raises(InputError, match="Frame a is 5 x 3 pixels and the mask of instance 2 has 4 x 3"):
         resolve(other, (SMALL,))
 
 
@@ -82,17 +82,17 @@ def settled(small: SmallScene, *instances: InstanceMasks, contested: str = "poin
 
 def grown_over(instance: InstanceMasks, other: InstanceMasks) -> InstanceMasks:
     """What refinement may make of an instance: its masks with those of another one."""
-    masks = instance.dense() | other.dense()
-    return replace(instance, packed=pack_masks(masks), origin=np.full(VIEWS, REFINED, np.uint8))
+    masks = np.array(instance.dense()) | np.array(other.dense())
+    return replace(instance, **as_fields(masks), origin=np.full(VIEWS, REFINED, np.uint8))
 
 
 def test_a_contested_pixel_goes_to_the_instance_whose_points_are_near_whatever_the_sizes(small):
     box, ball, background = grown_over(small.instance(1), small.instance(1)), small.instance(2), small.instance(0)
     truth = np.stack(small.ids)
     # The box is the larger one, so its side would go to a ball that has grown over a part of it.
-    part = replace(box, packed=pack_masks(box.dense() & (np.arange(truth.shape[2]) % 48 < 24)))
+    part = replace(box, **as_fields(np.array(box.dense()) & (np.arange(truth.shape[2]) % 48 < 24)))
     grown = grown_over(ball, part)
-    assert (grown.dense().sum() < box.dense().sum()) and (grown.dense() & box.dense()).any()
+    assert grown.areas().sum() < box.areas().sum() and (np.array(grown.dense()) & np.array(box.dense())).any()
     rest = (background, box)
     assert (settled(small, *rest, grown) == truth).mean() > 0.99
     assert (settled(small, grown, *rest[::-1]) == settled(small, *rest, grown)).all()

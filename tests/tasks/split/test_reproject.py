@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from box_scene import mask_set
 
-from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import (
     DRAWN,
     FOUND,
@@ -140,7 +139,7 @@ def test_confidence_is_the_mean_share_less_what_other_labels_contradict():
     # The mask of label 1 holds one column of label 2 among six.
     assert one.confidence == pytest.approx(0.8 * 5 / 6)
     assert two.confidence == pytest.approx(0.8)
-    assert two.packed.shape == (0, 5)
+    assert len(two.packed) == 0 and two.sizes.shape == (0, 2)
 
 
 def prompt(label, mask):
@@ -211,12 +210,16 @@ def test_true_masks_come_back_with_one_id_in_every_view(params):
     assert (found[0].dense() == (truth == 0)).all()
 
 
-def test_frames_of_different_sizes_are_bad_input():
+def test_views_may_differ_in_size():
     cloud, labels = labelled(halves())
-    other = replace(view("b"), height=H + 1)
-    masks = (mask_set(columns(0, 5)[None], "a"),) * 2
-    with pytest.raises(InputError, match="Frame b is 10 x 5"):
-        reproject(cloud, (view("a"), other), masks, labels, WHOLE, (), params=FOUND_ONLY)
+    lower = np.vstack([columns(0, 5), np.ones((1, W), bool)])
+    views = (view("a"), replace(view("b"), height=H + 1))
+    masks = (mask_set(columns(0, 5)[None], "a"), mask_set(lower[None], "b"))
+    _, one, _ = reproject(cloud, views, masks, labels, WHOLE, (), params=FOUND_ONLY)
+    assert one.sizes.tolist() == [[W, H], [W, H + 1]]
+    for mask, truth in zip(one.dense(), (columns(0, 5), lower), strict=True):
+        np.testing.assert_array_equal(mask, truth)
+    assert one.areas().tolist() == [5 * H, 5 * H + W]
 
 
 def test_a_label_without_a_mask_is_drawn_from_its_points():
