@@ -26,7 +26,7 @@ ROOMS = (
 LATE = {f"ss_flow.tasks.gaussians.{name}" for name in ("autograd", "cuda", "torch_backend", "torch_render")}
 """Modules that cannot be defined without torch, and so are imported inside functions only."""
 HEAVY = {"torch", "cv2", "scipy", "open3d", "onnxruntime", "onnx", "pycolmap", "zarr", "matplotlib", "jinja2"}
-HEAVY |= {"dask", "distributed", "obstore", "viser", "rerun", "IPython"}
+HEAVY |= {"pi_heif", "dask", "distributed", "obstore", "viser", "rerun", "IPython"}
 
 
 def floor_of(module: str) -> str | None:

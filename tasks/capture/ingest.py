@@ -117,7 +117,7 @@ def frame_of(
         image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
         # A pixel counts only where all that it averages does.
         keep = cv2.resize(keep.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.999
-    if turn or distorted or scale < 1 or photo.format == "other":
+    if turn or distorted or scale < 1 or photo.format not in ("jpeg", "png"):
         if params.jpeg_quality:
             encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
         else:

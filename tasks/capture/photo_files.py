@@ -1,4 +1,7 @@
-"""Photo files: what their headers say, and whether they are whole (OpenCV reads cut JPEGs without a word)."""
+"""Photo files: what their headers say, and whether they are whole (OpenCV reads cut JPEGs without a word).
+
+Phones of Apple write HEIC, which OpenCV does not read; libheif does, and turns such photos upright by itself.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +21,7 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _NEXT_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 _EXIF_ORIENTATION = 0x0112
+_HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 
 
 @dataclass(frozen=True)
@@ -25,10 +30,10 @@ class Photo:
 
     data: bytes
     format: str
-    """"jpeg", "png" or "other"."""
+    """"jpeg", "png", "heic" or "other"."""
     width: int
     height: int
-    """Size as stored, before any rotation that EXIF asks for; 0, 0 for other formats."""
+    """Size as stored, before any rotation that EXIF asks for; that of HEIC is after it, 0, 0 that of other formats."""
     orientation: int
     """EXIF orientation, 1 = upright."""
 
@@ -52,7 +57,10 @@ def inspect(data: bytes, where: str) -> Photo:
             return _inspect_jpeg(data)
         if data.startswith(_PNG_SIGNATURE):
             return _inspect_png(data)
-    except (IndexError, struct.error, ValueError) as error:
+        if _is_heic(data):
+            width, height = _open_heic(data).size
+            return Photo(data, "heic", width, height, 1)
+    except (IndexError, struct.error, ValueError, EOFError) as error:
         raise InputError(f"{where} is cut short or damaged; a whole image file is expected.") from error
     return Photo(data, "other", 0, 0, 1)
 
@@ -60,21 +68,30 @@ def inspect(data: bytes, where: str) -> Photo:
 def header_size(path: Path) -> tuple[int, int]:
     """Width and height of a photo as stored.
 
-    Raises InputError as `read_photo` does, or when it is neither JPEG nor PNG.
+    Raises InputError as `read_photo` does, or when it is neither JPEG nor PNG nor HEIC.
     """
     photo = read_photo(path)
     if not photo.width:
-        raise InputError(f"{path} is neither JPEG nor PNG, and its size is not stated; give it, or convert the photo.")
+        raise InputError(
+            f"{path} is neither JPEG nor PNG nor HEIC, and its size is not stated; give it, or convert the photo."
+        )
     return photo.width, photo.height
 
 
 def decode(data: bytes, where: str, flags: int) -> np.ndarray:
-    """Decode an image file with OpenCV (colour channels in its order, blue first).
+    """Decode an image file (colour channels in OpenCV's order, blue first).
 
+    flags: OpenCV's; HEIC comes upright and in eight bits whatever they are.
     Raises InputError when it cannot be decoded.
     """
     import cv2
 
+    if _is_heic(data):
+        try:
+            heic = _open_heic(data)
+            return np.array(heic)[..., :3]  # a copy, since its memory goes with the object
+        except (ValueError, EOFError) as error:
+            raise InputError(f"{where} is cut short or damaged; a whole image file is expected.") from error
     buffer: UInt8 = np.frombuffer(data, np.uint8)
     image = None
     if buffer.size:
@@ -83,7 +100,7 @@ def decode(data: bytes, where: str, flags: int) -> np.ndarray:
         except cv2.error:
             image = None
     if image is None:
-        raise InputError(f"{where} is no image that can be read; a JPEG or PNG file is expected.")
+        raise InputError(f"{where} is no image that can be read; a JPEG, PNG or HEIC file is expected.")
     return image
 
 
@@ -98,6 +115,17 @@ def read_gray(path: Path) -> np.ndarray:
     if image.ndim != 2:
         raise InputError(f"{path} has {image.shape[2]} channels; an image of one channel is expected.")
     return image
+
+
+def _is_heic(data: bytes) -> bool:
+    return data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS
+
+
+def _open_heic(data: bytes) -> Any:
+    """The file's main picture, not decoded yet."""
+    import pi_heif
+
+    return pi_heif.open_heif(data, convert_hdr_to_8bit=True, bgr_mode=True)
 
 
 def _inspect_jpeg(data: bytes) -> Photo:

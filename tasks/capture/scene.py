@@ -13,6 +13,7 @@ from ss_flow.tasks.capture.layout_nerfstudio import open_nerfstudio
 from ss_flow.tasks.capture.layout_scannet import is_scannet, open_scannet, open_sens
 from ss_flow.tasks.capture.layout_tum import open_tum
 from ss_flow.tasks.capture.scene_files import (
+    HEIC_SUFFIXES,
     PHOTO_SUFFIXES,
     UNREAD_SUFFIXES,
     VIDEO_SUFFIXES,
@@ -122,7 +123,7 @@ def _open_layout(path: Path) -> SceneFiles:
 
 
 def _open_loose(path: Path) -> SceneFiles:
-    photos = files_in(path) or files_in(path / "images")
+    photos = _one_of_each(files_in(path) or files_in(path / "images"))
     recordings = files_in(path, VIDEO_SUFFIXES | {".sens"})
     if photos:
         return SceneFiles(
@@ -140,6 +141,12 @@ def _open_loose(path: Path) -> SceneFiles:
     raise InputError(f"{path} holds no photo and no capture that is known; give {ACCEPTED}.")
 
 
+def _one_of_each(photos: list[Path]) -> list[Path]:
+    """Photos without those in HEIC that lie beside a copy in another format, as phones export them."""
+    copied = {photo.stem for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES}
+    return [photo for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES or photo.stem not in copied]
+
+
 def _check_files(scene: SceneFiles) -> None:
     by_stem(list(scene.photos))
     if len(set(scene.names)) < len(scene.names):
@@ -155,7 +162,7 @@ def _check_files(scene: SceneFiles) -> None:
         if file.name not in listings[file.parent]:
             raise InputError(f"{file}, which the scene lists, does not exist; put it there or drop the view.")
         if file.suffix.lower() not in PHOTO_SUFFIXES:
-            raise InputError(f"{file} is no image file by its name; JPEG or PNG is expected.")
+            raise InputError(f"{file} is no image file by its name; JPEG, PNG or HEIC is expected.")
 
 
 def _some_by_name(folder: Path, names: Sequence[str]) -> tuple[Path | None, ...]:

@@ -238,6 +238,14 @@ def photo_that_is_a_cut_jpeg(root):
     return root
 
 
+@case("20.heic", "cut short or damaged")
+def photo_that_is_a_cut_heic(root):
+    made.photos(root)
+    (root / "20.heic").write_bytes((Path(made.__file__).parent / "quarters.heic").read_bytes())
+    cut(root / "20.heic")
+    return root
+
+
 @case("10.png", "cut short or damaged")
 def photo_that_is_a_cut_png(root):
     cut(made.nerfstudio(root) / "images" / "10.png")

@@ -1,4 +1,5 @@
 import struct
+from pathlib import Path
 
 import capture_folders as made
 import cv2
@@ -14,6 +15,8 @@ from ss_flow.tasks.capture.photo_files import read_photo
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.sensor_depth import depth
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+
+SUPPORT = Path(__file__).parents[2] / "support"
 
 
 def ingested(scene, **changes):
@@ -51,6 +54,31 @@ def test_png_is_lossless_where_it_is_asked_for(tmp_path):
     made.write(tmp_path / "a.bmp", made.photo())
     frame = ingested(open_scene(tmp_path), jpeg_quality=0)[0]
     np.testing.assert_array_equal(decode_rgb(frame), made.photo()[..., ::-1])
+
+
+QUARTERS = [[(220, 40, 40), (40, 200, 60)], [(50, 70, 220), (230, 210, 60)]]
+"""Of the HEIC files, 48 x 32 pixels: colours upper left and right, lower left and right."""
+
+
+@pytest.mark.parametrize(("file", "turns"), [("quarters.heic", 0), ("ten_bits.heic", 0), ("turned.heic", 3)])
+def test_photos_of_apples_phones_are_read_upright(tmp_path, file, turns):
+    (tmp_path / "IMG_1.HEIC").write_bytes((SUPPORT / file).read_bytes())
+    scene = open_scene(tmp_path)
+    assert scene.names == ("IMG_1",) and scene.skipped == ()
+    expected = np.rot90(np.array(QUARTERS).repeat(16, axis=0).repeat(24, axis=1), turns)
+    (frame,) = ingested(scene)
+    assert (frame.height, frame.width) == expected.shape[:2]
+    image = decode_rgb(frame)
+    inside = np.s_[6::12, 6::12]  # chroma is stored at half the size, so borders are blurred
+    assert np.abs(image[inside].astype(int) - expected[inside]).max() < 12
+
+
+def test_a_photo_that_was_exported_beside_its_original_is_one_view(tmp_path):
+    made.photos(tmp_path)
+    original = next(tmp_path.rglob("2.*")).with_suffix(".heic")
+    original.write_bytes((SUPPORT / "quarters.heic").read_bytes())
+    scene = open_scene(tmp_path)
+    assert scene.names == ("2", "10", "11") and scene.photos[0].suffix != ".heic"
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

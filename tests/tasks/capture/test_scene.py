@@ -85,8 +85,8 @@ def test_photos_that_a_colmap_model_lacks_or_that_are_not_read_are_skipped(tmp_p
     (tmp_path / "colmap/images/12.png").write_bytes((tmp_path / "colmap/images/2.png").read_bytes())
     assert open_scene(tmp_path / "colmap").skipped == ("12",)
     loose = made.photos(tmp_path / "loose")
-    (next(loose.rglob("2.*")).parent / "IMG_3.HEIC").write_bytes(b"")
-    assert open_scene(loose).skipped == ("IMG_3.HEIC",)
+    (next(loose.rglob("2.*")).parent / "IMG_3.DNG").write_bytes(b"")
+    assert open_scene(loose).skipped == ("IMG_3.DNG",)
 
 
 def test_a_colmap_model_that_pycolmap_wrote_reads_the_same(tmp_path):
