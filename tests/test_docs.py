@@ -110,7 +110,8 @@ def test_the_readme_has_two_command_lines_to_install_run_and_test():
     block = text.partition("<!-- commands -->")[2].partition("<!-- end -->")[0]
     lines = [line for line in block.splitlines() if line.strip() and not line.startswith("```")]
     assert len(lines) == 2
-    assert lines[0].endswith("&& .venv/bin/ss-flow demo") and lines[1].endswith("&& .venv/bin/pytest")
+    assert lines[0].endswith("&& .venv/bin/ss-flow demo")
+    assert lines[1].endswith("&& .venv/bin/pytest -n auto --dist loadfile")
 
 
 def test_the_examples_from_python_run_and_print_what_the_page_says(tmp_path, monkeypatch, capsys):

@@ -177,9 +177,9 @@ def deaf(x: Number, *, pid_file: str) -> Number:
 
 @task()
 def crawl(x: Number, *, seconds: float) -> Number:
-    """Works for so long, and says how far it is."""
+    """Works for so long, and says how far it is, and in which process."""
     for i in range(20):
-        progress(i, 20)
+        progress(i, 20, str(os.getpid()))
         time.sleep(seconds / 20)
     return x
 
