@@ -127,10 +127,11 @@ def test_a_sweep_makes_the_damaged_results_again_of_which_it_tells(warm, tmp_pat
 
 def test_an_answer_to_a_search_that_is_damaged_is_found_anew(warm):
     def ask():
-        return ss_flow("query", warm.out, "red, not asked by any other test", "--json", "--cache", warm.store)
+        return ss_flow("query", warm.out, "the purple shelf", "--json", "--cache", warm.store)
 
     held = {entry.name for entry in Store(warm.store).objects()}
     first = ask()
+    assert first.code == 0, first.err
     found = {entry.name for entry in Store(warm.store).objects()} - held
     assert len(found) == 2  # the similarities, and the answer that is made of them
     for result in found:
