@@ -93,8 +93,14 @@ class _Encoder:
 
     def _add_items(self, value: list[Any] | tuple[Any, ...]) -> None:
         self._pending += b"l" + _LENGTH(len(value))
-        for item in value:
-            self.add(item)
+        for item in value:  # most are digests and names, or pairs with them
+            if type(item) is str:
+                content = item.encode()
+                self._pending += b"s" + _LENGTH(len(content)) + content
+            elif type(item) is tuple:
+                self._add_items(item)
+            else:
+                self.add(item)
 
     def _add_mapping(self, value: Mapping[str, Any]) -> None:
         self._pending += b"m" + _LENGTH(len(value))

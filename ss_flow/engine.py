@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,12 +14,12 @@ import psutil
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
 from ss_flow.cache.store import Store
-from ss_flow.events import JsonLines, Reporter, Reporters
+from ss_flow.events import Log, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
 from ss_flow.graph import Flow, Node
 from ss_flow.keys import Value
 from ss_flow.resolution import Failure
-from ss_flow.runs import ENDS, PreviousKeys, settled, start_run
+from ss_flow.runs import PreviousKeys, settled, start_run
 from ss_flow.scheduler import Listening, Scheduler
 from ss_flow.task import Resources
 
@@ -66,15 +65,6 @@ class Report:
                 raise value.error
             found[name] = value
         return found
-
-
-class _Recorder(Reporter):
-    def __init__(self) -> None:
-        self.events: list[dict[str, Any]] = []
-
-    def event(self, kind: str, **details: Any) -> None:
-        if kind in ENDS:
-            self.events.append({"event": kind, "time": round(time.time(), 3), **details})
 
 
 def usable_cores() -> int:
@@ -178,7 +168,7 @@ class _Run:
         recorded: bool,
     ) -> None:
         self._requests, self._store, self._claims = requests, store, claims
-        self._recorders = [_Recorder() for _ in requests]
+        self._logs: list[Log] = []
         self._folders = ["" for _ in requests]
         self._healed: set[str] = set()
         self._open = set(range(len(requests)))
@@ -190,13 +180,14 @@ class _Run:
         previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
         self._previous = [previous[request.scene] for request in requests]
         for position, request in enumerate(requests):
-            listeners: list[Reporter] = [self._recorders[position], *([request.reporter] if request.reporter else [])]
+            events = None
             if recorded:
                 folder = start_run(runs, {"scene": request.scene, **request.header}).folder
                 claims.take(RUN_CLAIM + folder.name)
                 self._folders[position] = str(folder)
-                listeners.append(JsonLines(folder / "events.jsonl", store.root))
-            self._reporters.append(Reporters(*listeners))
+                events = folder / "events.jsonl"
+            self._logs.append(Log(events, store.root))
+            self._reporters.append(Reporters(self._logs[-1], request.reporter) if request.reporter else self._logs[-1])
             self._reporters[-1].event("run started", scene=request.scene)
 
     @property
@@ -232,7 +223,7 @@ class _Run:
             failures = scheduler.failures[flow]
             results = {name: _digests(value) for name, value in values.items() if not isinstance(value, Failure)}
             self._reporters[position].event("run ended", failed=len(failures), results=results)
-            report = Report(values, settled(self._recorders[position].events), failures, self._folders[position])
+            report = Report(values, settled(self._logs[position].ended), failures, self._folders[position])
             self._open.discard(position)
             if position not in self._reported:
                 try:
@@ -256,7 +247,7 @@ class _Run:
     def _heal(self, gone: Gone) -> None:
         """Have something made again. Raises StoreFailure when it was made again before, or nothing here makes it."""
         # Counted by what made it: results that differ from time to time would otherwise never be the same one.
-        made = (event for recorder in self._recorders for event in recorder.events if "outputs" in event)
+        made = (event for log in self._logs for event in log.ended if "outputs" in event)
         maker = next((e for e in made if gone.digest in e["outputs"]), None)
         name = f"{maker['key']}.{maker['outputs'].index(gone.digest)}" if maker else gone.digest
         if name in self._healed:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from ss_flow.cache.errors import writing
+from ss_flow.runs import ENDS
 
 _as_json = json.JSONEncoder(check_circular=False).encode
 
@@ -58,31 +59,38 @@ class Reporters(Reporter):
             reporter.close()
 
 
-class JsonLines(Reporter):
-    """Appends every event to a file, one JSON document a line; a line is complete or absent.
+class Log(Reporter):
+    """Keeps what nodes came to, and appends every event to a file, one JSON document a line, complete or absent.
 
     Hits come in great numbers: they are written together, with whatever comes next or before a pause.
-    store: the store that holds the file; named when the disk is full.
+    path: the file; None for no file. store: the store that holds it; named when the disk is full.
     """
 
-    def __init__(self, path: Path, store: Path) -> None:
+    def __init__(self, path: Path | None, store: Path) -> None:
+        self.ended: list[dict[str, Any]] = []
+        """The events that say what a node came to, with their times."""
         self._store = store
-        self._held_back: list[str] = []
-        self._stream: IO[str] = path.open("a", encoding="utf-8", buffering=1 << 16)
+        self._held_back: list[dict[str, Any]] = []
+        self._stream: IO[str] | None = path.open("a", encoding="utf-8", buffering=1 << 16) if path else None
 
     def event(self, kind: str, **details: Any) -> None:
-        self._held_back.append(_as_json({"time": round(time.time(), 3), "event": kind, **details}))
-        if kind != "hit":
-            self.pause()
+        told = {"time": round(time.time(), 3), "event": kind, **details}
+        if kind in ENDS:
+            self.ended.append(told)
+        if self._stream is not None:
+            self._held_back.append(told)
+            if kind != "hit":
+                self.pause()
 
     def pause(self) -> None:
-        if self._held_back:
+        if self._stream is not None and self._held_back:
             with writing(self._store):
-                self._stream.write("".join(f"{line}\n" for line in self._held_back))
+                self._stream.write("\n".join([*map(_as_json, self._held_back), ""]))
                 self._stream.flush()
             self._held_back.clear()
 
     def close(self) -> None:
-        self.pause()
-        with writing(self._store):
-            self._stream.close()
+        if self._stream is not None:
+            self.pause()
+            with writing(self._store):
+                self._stream.close()

@@ -23,7 +23,6 @@ B = TypeVar("B")
 C = TypeVar("C")
 D = TypeVar("D")
 R = TypeVar("R")
-N = TypeVar("N", bound="Node")
 
 INDEX: Sequence[int] = cast(Any, object())
 """In the place of a list of `each`: the position of the item, a plain number."""
@@ -42,9 +41,13 @@ class Node:
     def label(self) -> str:
         return f"{self.step}[{self.item}]" if self.item else self.step
 
+    def waits_for(self) -> list[Node]:
+        """The nodes that it waits for."""
+        return []
+
     def __getitem__(self, index: int) -> Node:
         """One artifact of a list."""
-        return self.flow.attach(Item(self.flow, self.step, str(index), self, index))
+        return Item(self.flow, self.step, str(index), self, index)
 
 
 @dataclass(eq=False)
@@ -55,6 +58,9 @@ class Call(Node):
     inputs: dict[str, Node]
     parameters: dict[str, Any]
 
+    def waits_for(self) -> list[Node]:
+        return list(self.inputs.values())
+
 
 @dataclass(eq=False)
 class Item(Node):
@@ -62,6 +68,9 @@ class Item(Node):
 
     source: Node
     index: int
+
+    def waits_for(self) -> list[Node]:
+        return [self.source]
 
 
 @dataclass(eq=False)
@@ -71,6 +80,9 @@ class Pick(Node):
     source: Node
     positions: tuple[int, ...]
 
+    def waits_for(self) -> list[Node]:
+        return [self.source]
+
 
 @dataclass(eq=False)
 class Gather(Node):
@@ -79,6 +91,9 @@ class Gather(Node):
     items: list[Node]
     on_error: OnError
     """With "skip", what failed is left out."""
+
+    def waits_for(self) -> list[Node]:
+        return self.items
 
     def __getitem__(self, index: int) -> Node:
         """One artifact of the list: where each is one call's single result, that call."""
@@ -98,6 +113,9 @@ class Expand(Node):
     """Called in the flow. For `each`, with the lengths of the lists; for `expand`, with the loaded artifacts."""
     loads: bool
 
+    def waits_for(self) -> list[Node]:
+        return self.sources
+
 
 @dataclass(eq=False)
 class Otherwise(Node):
@@ -105,6 +123,9 @@ class Otherwise(Node):
 
     source: Node
     build: Callable[[], Node]
+
+    def waits_for(self) -> list[Node]:
+        return [self.source]
 
 
 @dataclass(eq=False)
@@ -128,7 +149,6 @@ class Flow:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.nodes: list[Node] = []
 
     @contextmanager
     def building(self, item: str = "") -> Iterator[None]:
@@ -140,10 +160,6 @@ class Flow:
             _current.reset(flow_token)
             _item.reset(item_token)
 
-    def attach(self, node: N) -> N:
-        self.nodes.append(node)
-        return node
-
     def add(self, task: Task[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
         """The node of one call of a task.
 
@@ -153,21 +169,7 @@ class Flow:
         inputs: dict[str, Any] = {
             n: value if isinstance(value, Node) else gather(value) for n, value in given[0].items()
         }
-        return self.attach(Call(self, task.name, _item.get(), task, inputs, given[1]))
-
-
-def sources_of(node: Node) -> list[Node]:
-    """The nodes that a node waits for."""
-    match node:
-        case Call():
-            return list(node.inputs.values())
-        case Item() | Pick() | Otherwise():
-            return [node.source]
-        case Gather():
-            return node.items
-        case Expand():
-            return list(node.sources)
-    return []
+        return Call(self, task.name, _item.get(), task, inputs, given[1])
 
 
 def nodes_by_step(outputs: Iterable[Node]) -> dict[str, list[Node]]:
@@ -183,11 +185,11 @@ def nodes_by_step(outputs: Iterable[Node]) -> dict[str, list[Node]]:
         if node in seen:
             continue
         seen.add(node)
-        pending += sources_of(node)
+        pending += node.waits_for()
         made = node
         if isinstance(node, Expand) and not node.loads:  # what it makes of a list shows in what it makes of one item
-            (made,) = sources_of(node.build(*(1 for _ in node.sources)))
-            pending += sources_of(made)
+            (made,) = node.build(*(1 for _ in node.sources)).waits_for()
+            pending += made.waits_for()
         if isinstance(made, Call):
             found.setdefault(made.step, []).append(node)
     return found
@@ -207,13 +209,13 @@ def gather(nodes: Sequence[A]) -> tuple[A, ...]:
 def pick(nodes: Sequence[A], positions: Iterable[int]) -> tuple[A, ...]:
     """Some artifacts of a list, as a list: a task that gets them does not depend on the others."""
     assert isinstance(nodes, Node)
-    picked = Pick(nodes.flow, nodes.step, nodes.item, nodes, tuple(positions))
-    return cast(tuple[A, ...], _building().attach(picked))
+    picked = Pick(_building(), nodes.step, nodes.item, nodes, tuple(positions))
+    return cast(tuple[A, ...], picked)
 
 
 def _gathered(items: list[Any], on_error: OnError) -> Gather:
     flow = _building()
-    return flow.attach(Gather(flow, "gather", _item.get(), items, on_error))
+    return Gather(flow, "gather", _item.get(), items, on_error)
 
 
 @overload
@@ -260,14 +262,14 @@ def each(
                 items.append(build(*(index if source is INDEX else source[index] for source in lists)))
         return _gathered(items, on_error)
 
-    return flow.attach(Expand(flow, "each", _item.get(), sources, build_list, loads=False))
+    return Expand(flow, "each", _item.get(), sources, build_list, loads=False)
 
 
 def expand(plan: A, build: Callable[[A], R]) -> R:
     """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes."""
     flow = _building()
     node = Expand(flow, "expand", _item.get(), [cast(Any, plan)], cast(Any, build), loads=True)
-    return cast(R, flow.attach(node))
+    return cast(R, node)
 
 
 def otherwise(node: R, build: Callable[[], R]) -> R:
@@ -276,13 +278,13 @@ def otherwise(node: R, build: Callable[[], R]) -> R:
     The run is then degraded.
     """
     flow = _building()
-    return cast(R, flow.attach(Otherwise(flow, "otherwise", _item.get(), cast(Any, node), cast(Any, build))))
+    return cast(R, Otherwise(flow, "otherwise", _item.get(), cast(Any, node), cast(Any, build)))
 
 
 def stored(name: str, value: str | Sequence[str]) -> Any:
     """A node for one artifact, or a list of them, that the store holds under these digests."""
     flow = _building()
-    return flow.attach(Stored(flow, name, _item.get(), value if isinstance(value, str) else tuple(value)))
+    return Stored(flow, name, _item.get(), value if isinstance(value, str) else tuple(value))
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ss_flow.graph import Call, Expand, Flow, Gather, Item, Node, Otherwise, Pick, Stored, sources_of
+from ss_flow.graph import Call, Expand, Flow, Gather, Item, Node, Otherwise, Pick, Stored
 from ss_flow.keys import Value
 
 
@@ -38,13 +38,14 @@ class Resolution:
         self._load, self._call, self._skipped = load, call, skipped
         self.values: dict[Node, Value | Failure] = {}
         self.known_calls: dict[Flow, Counter[str]] = defaultdict(Counter)
-        """How many calls of each step are needed, as far as the graph is known."""
+        """How many calls of each step are needed, as far as the graph is known; under "" of all steps."""
         self._unresolved: dict[Node, int] = {}
         self._consumers: dict[Node, list[Node]] = defaultdict(list)
         self._awaited: dict[Node, list[Callable[[], None]]] = defaultdict(list)
         self._expanded: dict[Node, Node] = {}
         self._ranks: dict[Node, int] = {}
         self._ready: deque[Node] = deque()
+        self._any_failed = False
 
     def need(self, node: Node, settled: Callable[[], None] | None = None) -> None:
         """Resolve this node too, and all that it needs. settled: called when it is."""
@@ -56,8 +57,10 @@ class Resolution:
             if node in self._unresolved:
                 continue
             if isinstance(node, Call):
-                self.known_calls[node.flow][node.step] += 1
-            sources = list(dict.fromkeys(sources_of(node)))
+                known = self.known_calls[node.flow]
+                known[node.step] += 1
+                known[""] += 1
+            sources = list(dict.fromkeys(node.waits_for()))
             self._await(node, sources)
             pending.extend(sources)
 
@@ -74,6 +77,7 @@ class Resolution:
     def settle(self, node: Node, value: Value | Failure) -> None:
         """A node has come to this."""
         self.values[node] = value
+        self._any_failed = self._any_failed or isinstance(value, Failure)
         for consumer in self._consumers.pop(node, ()):
             self._unresolved[consumer] -= 1
             if self._unresolved[consumer] == 0:
@@ -99,7 +103,7 @@ class Resolution:
         while not isinstance(node, Call):
             if isinstance(node, Gather) and node.items:
                 node = node.items[0]
-            elif sources := [self._expanded[node]] if node in self._expanded else sources_of(node):
+            elif sources := [self._expanded[node]] if node in self._expanded else node.waits_for():
                 node = sources[0]
             else:
                 return node.step
@@ -167,9 +171,10 @@ class Resolution:
                 self.settle(node, node.value)
 
     def _failed_source(self, node: Node) -> Failure | None:
-        for source in sources_of(node):
-            if isinstance(value := self.values[source], Failure):
-                return value
+        if self._any_failed:
+            for source in node.waits_for():
+                if isinstance(value := self.values[source], Failure):
+                    return value
         return None
 
     def _gathered(self, node: Gather) -> Value | Failure:

@@ -88,8 +88,10 @@ def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     for event in events:
         if event["event"] in ENDS:
             node = (event["label"], event.get("key", ""))
-            if last.get(node, event)["event"] != "finished" or event["event"] == "finished":
-                last.pop(node, None)
+            if node not in last:
+                last[node] = event
+            elif last[node]["event"] != "finished" or event["event"] == "finished":
+                del last[node]
                 last[node] = event
     return list(last.values())
 

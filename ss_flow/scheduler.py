@@ -257,17 +257,23 @@ class Scheduler:
             self._finish(node, action, kind if position == 0 else "hit", why=job.why)
 
     def _finish(self, node: Call, action: Action, kind: str, why: str = "") -> None:
-        self._tell(
-            kind,
-            node,
-            key=action.key,
-            outputs=list(action.outputs),
-            seconds=action.seconds,
-            peak_rss_mb=action.peak_rss_mb,
-            warnings=list(action.warnings),
-            inputs={name: self._graph.producer(source) for name, source in node.inputs.items()},
-            **({"why": why} if kind == "finished" else {}),
-        )
+        known = self._graph.known_calls[node.flow]
+        details = {
+            "label": node.label,
+            "step": node.step,
+            "item": node.item,
+            "of": known[node.step],
+            "known": known[""],
+            "key": action.key,
+            "outputs": list(action.outputs),
+            "seconds": action.seconds,
+            "peak_rss_mb": action.peak_rss_mb,
+            "warnings": list(action.warnings),
+            "inputs": {name: self._graph.producer(source) for name, source in node.inputs.items()},
+        }
+        if kind == "finished":
+            details["why"] = why
+        self._flows[node.flow].reporter.event(kind, **details)
         self._graph.settle(node, action.outputs if action.is_list else action.outputs[0])
 
     def _fail(self, job: Job, error: BaseException) -> None:
@@ -282,8 +288,8 @@ class Scheduler:
 
     def _tell(self, kind: str, node: Node, **details: Any) -> None:
         known = self._graph.known_calls[node.flow]
-        told = {"label": node.label, "step": node.step, "item": node.item, "of": known[node.step]}
-        self._flows[node.flow].reporter.event(kind, **told, known=known.total(), **details)
+        told = {"label": node.label, "step": node.step, "item": node.item, "of": known[node.step], "known": known[""]}
+        self._flows[node.flow].reporter.event(kind, **told, **details)
 
 
 def _described(error: BaseException) -> str:

@@ -80,10 +80,8 @@ class Task(Generic[P, R]):
         Raises TypeError when that does not fit the task.
         """
         defaults = self._defaults
-        if len(args) == len(self._artifacts) and kwargs.keys() <= defaults.keys():
-            parameters = {name: kwargs.get(name, default) for name, default in defaults.items()}
-            if not any(value is inspect.Parameter.empty for value in parameters.values()):
-                return _taken_apart(zip(self._artifacts, args, strict=True)), parameters
+        if len(args) == len(self._artifacts) and self._required <= kwargs.keys() <= defaults.keys():
+            return _taken_apart(zip(self._artifacts, args, strict=True)), {**defaults, **kwargs}
         bound = self.signature.bind(*args, **kwargs)  # slower; says what is wrong
         bound.apply_defaults()
         given = [(name, bound.arguments.pop(name)) for name in self._artifacts]
@@ -103,6 +101,10 @@ class Task(Generic[P, R]):
     def _defaults(self) -> dict[str, Any]:
         """The parameters by name; `Parameter.empty` for one that has no default."""
         return {p.name: p.default for p in self.signature.parameters.values() if p.kind == p.KEYWORD_ONLY}
+
+    @functools.cached_property
+    def _required(self) -> frozenset[str]:
+        return frozenset(name for name, default in self._defaults.items() if default is inspect.Parameter.empty)
 
     @functools.cached_property
     def inputs(self) -> dict[str, bool]:
