@@ -57,12 +57,14 @@ class _Encoder:
     """Encodes values one after the other; small ones are gathered before they are hashed."""
 
     def __init__(self) -> None:
-        self._hasher = blake3()
+        self._hasher: blake3 | None = None
         self._pending = bytearray()
 
     def hexdigest(self) -> str:
+        if self._hasher is None:
+            return str(blake3(self._pending).hexdigest())
         self._hasher.update(self._pending)
-        return self._hasher.hexdigest()
+        return str(self._hasher.hexdigest())
 
     def add(self, value: Any) -> None:
         known = _ENCODERS.get(type(value))
@@ -117,6 +119,7 @@ class _Encoder:
         array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
         self._tagged(b"a", array.dtype.str.encode())
         self._add_items(array.shape)
+        self._hasher = self._hasher or blake3()
         self._hasher.update(self._pending)
         self._pending.clear()
         flat = array.reshape(-1)
