@@ -144,12 +144,16 @@ def _tried(run: Run) -> list[dict[str, Any]]:
 
 
 def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
-    """The nodes of a run that a user may mean: propagate, split.propagate, segment[0003], or a result, as masks."""
+    """The nodes of a run that a user may mean: propagate, split.propagate, segment[0003], or a result, as masks.
+
+    An item of a result may be named, too: masks come from steps of other names where no network finds them.
+    """
     steps = [n for n in nodes if any(t == name or t.endswith(f".{name}") for t in (n["label"], n["step"]))]
     if steps:
         return steps
-    digests = set(run.results().get(name, ()))
-    return [n for n in nodes if not digests.isdisjoint(n.get("outputs", ()))]
+    result, bracket, item = name.partition("[")
+    digests = set(run.results().get(result, ()))
+    return [n for n in nodes if n["label"].endswith(bracket + item) and not digests.isdisjoint(n.get("outputs", ()))]
 
 
 def run_with(store: Store, scene: Path | None, name: str) -> tuple[Run | None, list[dict[str, Any]]]:
