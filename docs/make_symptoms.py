@@ -1,13 +1,14 @@
 """Draw the pictures of troubleshooting.md: what faults look like, and what mends them.
 
 `python docs/make_symptoms.py granularity|depth FILE.jpg --cache DIR --capture DIR --view NAME`, where NAME is that of a
-photo; `python docs/make_symptoms.py poses|fog|side FILE.jpg --cache DIR`, in generated rooms. Preset `fast`, as far as
-the picture needs it; what is in the store is not computed again.
+photo; `python docs/make_symptoms.py poses|fog|side|missing FILE.jpg --cache DIR`, in generated rooms. Preset `fast`, as
+far as the picture needs it; what is in the store is not computed again.
 
 `granularity`: the photo, and its masks at three values of split.granularity. `depth`: edges of measured depth on the
 photo, as they are with a wrong focal length, and as they should be. `poses`: the dense points as they should be, with
 poses that jitter, and with depth of another scale. `fog`: a gripper that moves along with the camera, with and without
-`valid` masks. `side`: a room that was photographed from one side only.
+`valid` masks. `side`: a room that was photographed from one side only. `missing`: a photo, its masks, and its masks
+after Split, where one thing has a mask in this photo alone.
 """
 
 from __future__ import annotations
@@ -157,6 +158,17 @@ def side(store: Store) -> list[UInt8]:
     return [room.rgb[2], drawn(scene, middle), drawn(scene, beside(middle, TURN))]
 
 
+def missing(store: Store) -> list[UInt8]:
+    """A photo, its masks, and its masks after Split: one thing has a mask in this photo alone."""
+    room = generate(replace(ROOM, views=16))
+    areas = np.array([[int((ids == thing.instance_id).sum()) for thing in room.objects] for ids in room.ids])
+    view, thing = np.unravel_index(areas.argmax(), areas.shape)
+    ids = np.where(room.ids == room.objects[thing].instance_id, 0, room.ids)
+    ids[view] = room.ids[view]
+    after = of_room(replace(room, ids=ids), store, "masks_split")["masks_split"][view].ids
+    return [room.rgb[view], *(paint_ids(one.astype(np.int32), room.rgb[view]) for one in (ids[view], after))]
+
+
 def beside(camera: Camera, degrees: float) -> Camera:
     """A camera as far from the middle of the room, turned about the vertical through it."""
     turn = cv2.Rodrigues(np.radians([0, 0, degrees]))[0]
@@ -169,7 +181,7 @@ def drawn(scene: Gaussians, camera: Camera) -> UInt8:
     return to_8bit(render(scene, camera).rgb)
 
 
-IN_ROOMS = {"poses": poses, "fog": fog, "side": side}
+IN_ROOMS = {"poses": poses, "fog": fog, "side": side, "missing": missing}
 
 
 def main() -> None:
