@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,12 +14,24 @@ import tyro
 from rich.markup import escape
 
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, choose_model, console, file_digests, open_run
+from ss_flow.flows.cli.context import (
+    OptionalCount,
+    OptionalPath,
+    StoreOptions,
+    choose_model,
+    console,
+    file_digests,
+    open_run,
+)
 from ss_flow.flows.cli.query import encoder_name, query_params
 from ss_flow.flows.results import FinishedRun, read_run
 
 if TYPE_CHECKING:
     from ss_flow.flows.view.search import Search
+
+
+_MANY, _FEW = 50_000, 30_000
+"""Gaussians that a browser without a GPU takes long to draw, and so many that it does not."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +52,9 @@ class View:
     """Write a page to this file instead, which needs neither this program nor a network."""
     rerun: OptionalPath = None
     """Write a recording for Rerun (.rrd) to this file instead."""
+    draw_at_most: OptionalCount = None
+    """Draw about so many Gaussians, chosen by lot and enlarged to cover as much, for a browser that has no GPU to draw
+    with; clicks and edits mean all of them."""
     host: str = "127.0.0.1"
     """The address to listen on; 0.0.0.0 lets other machines in who know the token."""
     port: int = 8080
@@ -50,6 +65,8 @@ class View:
     def run(self) -> int:
         if not 0 <= self.port < 65536:
             raise InputError(f"--port {self.port} is out of range; it must be from 0 to 65535.")
+        if self.draw_at_most is not None and (self.draw_at_most < 1 or self.html or self.rerun):
+            raise InputError("--draw-at-most takes a number above 0, and is for the viewer, not for --html or --rerun.")
         for option, file in (("--html", self.html), ("--rerun", self.rerun)):
             if file and (file.is_dir() or not file.absolute().parent.is_dir()):
                 raise InputError(f"{file} cannot be written; {option} must name a file in a folder that exists.")
@@ -69,12 +86,16 @@ class View:
         from ss_flow.flows.cli.inspect import results_named
         from ss_flow.flows.describe import maker, told
         from ss_flow.flows.view.artifact import Around, around_of, placed, show, write_artifact_page
+        from ss_flow.tasks.artifacts import Gaussians
 
         out, store = console(json=False), self.store.existing_store()
         run, digests = results_named(store, None, self.what)
         values = [store.get(digest) for digest in digests]
         made = maker(store, digests[0], run)
         around = around_of(store, made[0]) if made else Around()
+        if self.draw_at_most:
+            count = sum(len(value) for value in values if isinstance(value, Gaussians))
+            around = replace(around, share=min(1.0, self.draw_at_most / max(count, 1)))
         if self.html:
             write_artifact_page(self.html, self.what, digests, store, around, run)
             out.print(escape(str(self.html)))
@@ -128,11 +149,18 @@ class View:
             search = None
             out.print(f"The search box stays empty: {escape(str(error))}")
         beside = open_run(self.beside, self.store, ("scene",)) if self.beside else None
-        viewer = Viewer(run, script, operations, search, hints, host=self.host, port=self.port)
+        viewer = Viewer(
+            run, script, operations, search, hints, host=self.host, port=self.port, draw_at_most=self.draw_at_most
+        )
         viewer.add_timeline(beside)
         out.print(
             f"{viewer.address}\nCtrl-C ends it. Edits are saved in {escape(str(script))} ({len(operations)} so far)."
         )
+        count = len(run.results.one("scene"))
+        if self.draw_at_most is None and count > _MANY:
+            out.print(
+                f"The scene has {count:,} Gaussians. If the browser has no GPU: --draw-at-most {_FEW} draws fewer."
+            )
         again = shlex.join(["ss-flow", "run", run.document["scene"], "--correct", str(hints), "--out", str(run.folder)])
         out.print(f"Corrections are made by: {escape(again)}, and the run's other options.")
         try:

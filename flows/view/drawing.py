@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ss_flow.errors import InputError
+from ss_flow.flows.view.thinning import thinned
 from ss_flow.tasks.artifacts import (
     Cameras,
     DepthMap,
@@ -68,6 +69,8 @@ class Around:
     """Where views stand."""
     points: PointCloud | None = None
     """The dense points, which labels refer to."""
+    share: float = 1.0
+    """Of the Gaussians, how many are drawn (`thinned`)."""
 
     def frame(self, name: str) -> Frame | None:
         """The photo of a view."""
@@ -343,7 +346,7 @@ def _(value: InstanceMasks, scene: SceneApi, name: str, around: Around) -> None:
 @_draw.register(Gaussians)
 def _(value: Gaussians, scene: SceneApi, name: str, around: Around) -> None:
     if len(value):
-        add_gaussians(scene, name, value)
+        add_gaussians(scene, name, thinned(value, around.share))
 
 
 def spacing_of(points: Float32) -> float:

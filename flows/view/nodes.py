@@ -9,7 +9,8 @@ import numpy as np
 
 from ss_flow.flows.view.drawing import add_gaussians, change_gaussians
 from ss_flow.flows.view.session import Piece
-from ss_flow.tasks.artifacts import Float64, UInt8
+from ss_flow.flows.view.thinning import thinned
+from ss_flow.tasks.artifacts import Float64, Gaussians, UInt8
 from ss_flow.tasks.deliver.export.content import base_colors
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.edit.operations import Motion
@@ -32,8 +33,9 @@ _DIGITS = 6
 class SceneNodes:
     """What stands in viser's scene. A piece that has not changed is not sent again."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
+    def __init__(self, server: viser.ViserServer, share: float = 1.0) -> None:
+        """share: of each piece's Gaussians, how many are drawn (`thinned`)."""
+        self._server, self.share = server, share
         self._nodes: dict[int, viser.GaussianSplatHandle] = {}
         self._drawn: dict[int, tuple[Piece, Colors, bool]] = {}
         """Of each node: what it shows, in which colours, and whether as selected."""
@@ -104,11 +106,12 @@ class SceneNodes:
         before, look = self._drawn.get(instance), (colors, is_selected)
         if before is not None and before[0] is piece and before[1:] == look:
             return
-        own = _colors(instance, piece, colors, is_selected=is_selected)
+        drawn = thinned(piece.gaussians, self.share)
+        own = _colors(instance, drawn, colors, is_selected=is_selected)
         if instance in self._nodes:
-            change_gaussians(self._nodes[instance], piece.gaussians, own)
+            change_gaussians(self._nodes[instance], drawn, own)
         else:
-            self._nodes[instance] = add_gaussians(self._server.scene, f"/objects/{instance}", piece.gaussians, own)
+            self._nodes[instance] = add_gaussians(self._server.scene, f"/objects/{instance}", drawn, own)
         self._drawn[instance] = (piece, *look)
 
     def _boxed(self, instance: int, piece: Piece) -> viser.BoxHandle:
@@ -133,11 +136,11 @@ def _short(vector: Float64) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _colors(instance: int, piece: Piece, colors: Colors, *, is_selected: bool) -> UInt8 | None:
+def _colors(instance: int, gaussians: Gaussians, colors: Colors, *, is_selected: bool) -> UInt8 | None:
     """[N, 3] RGB; None for those of the Gaussians themselves."""
     if colors == "photos" and not is_selected:
         return None
-    own = 255 * base_colors(piece.gaussians).clip(0, 1)
+    own = 255 * base_colors(gaussians).clip(0, 1)
     if colors == "objects":
         own = 0.25 * own + 0.75 * np.array(instance_color(instance))
     if is_selected:

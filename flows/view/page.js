@@ -34,10 +34,9 @@ function read(spz, instances) {
 
 const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
-uniform usampler2D texels; uniform sampler2D palette;
+uniform usampler2D texels, order; uniform sampler2D palette;
 uniform mat3 axes; uniform vec3 eye; uniform vec2 viewport; uniform float focal;
 uniform bool labelled; uniform int selected;
-in vec2 corner; in uint row;
 out vec4 tint; out vec2 place; flat out uint instance;
 
 float component(uint bits) {
@@ -61,6 +60,10 @@ mat3 rotation(uint packed) {
 vec4 bytes(uint word) { return vec4(word & 255u, (word >> 8) & 255u, (word >> 16) & 255u, word >> 24); }
 
 void main() {
+  int nth = gl_VertexID / 6, vertex = gl_VertexID - 6 * nth; // two triangles each: an instance each would cost a
+  vertex = vertex > 2 ? 6 - vertex : vertex; // browser that draws on the processor five times as much
+  vec2 corner = vec2(2 * (vertex & 1) - 1, 2 * (vertex >> 1) - 1);
+  uint row = texelFetch(order, ivec2(nth % ${ROW}, nth / ${ROW}), 0).x;
   ivec2 at = ivec2(2u * (row % ${ROW}u), row / ${ROW}u);
   uvec4 first = texelFetch(texels, at, 0), second = texelFetch(texels, at + ivec2(1, 0), 0);
   vec3 p = axes * (uintBitsToFloat(first.xyz) - eye);
@@ -113,7 +116,7 @@ class Splats {
     this.labelled = false;
     this.selected = -1;
     this.rows = new Uint32Array(count);
-    this.order = new Uint32Array(count);
+    this.order = new Uint32Array(ROW * Math.ceil(count / ROW));
     this.depths = new Float32Array(count);
     this.drawn = 0;
     const gl = (this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false }));
@@ -131,14 +134,13 @@ class Splats {
     gl.useProgram(this.program);
     this.texture(0, "texels", gl.RGBA32UI, 2 * ROW, gl.RGBA_INTEGER, gl.UNSIGNED_INT, texels);
     this.texture(1, "palette", gl.RGBA8, 256, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(scene.palette));
-    this.attribute("corner", new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]));
-    this.attribute("row", null);
+    this.texture(2, "order", gl.R32UI, ROW, gl.RED_INTEGER, gl.UNSIGNED_INT, this.order); // stays the active one
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
   texture(unit, name, inner, width, format, type, content) {
-    const gl = this.gl, height = content.length / 4 / width;
+    const gl = this.gl, height = content.length / (format === gl.RED_INTEGER ? 1 : 4) / width;
     if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("The scene is too large for this graphics card.");
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
@@ -146,20 +148,6 @@ class Splats {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     gl.uniform1i(this.uniform(name), unit);
-  }
-
-  attribute(name, content) {
-    const gl = this.gl, place = gl.getAttribLocation(this.program, name);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer()); // the last one stays bound: that of the rows
-    gl.enableVertexAttribArray(place);
-    if (content) {
-      gl.bufferData(gl.ARRAY_BUFFER, content, gl.STATIC_DRAW);
-      gl.vertexAttribPointer(place, 2, gl.FLOAT, false, 0, 0);
-    } else {
-      gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
-      gl.vertexAttribIPointer(place, 1, gl.UNSIGNED_INT, 0, 0);
-      gl.vertexAttribDivisor(place, 1);
-    }
   }
 
   uniform(name) { return this.gl.getUniformLocation(this.program, name); }
@@ -182,7 +170,8 @@ class Splats {
     for (let j = 0; j < n; j++) first[1 + (((high - depths[j]) * scale) | 0)]++;
     for (let level = 0; level < LEVELS; level++) first[level + 1] += first[level];
     for (let j = 0; j < n; j++) order[first[((high - depths[j]) * scale) | 0]++] = rows[j];
-    this.gl.bufferSubData(this.gl.ARRAY_BUFFER, 0, order, 0, n);
+    const gl = this.gl;
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, Math.ceil(n / ROW), gl.RED_INTEGER, gl.UNSIGNED_INT, order);
     this.drawn = n;
   }
 
@@ -198,7 +187,7 @@ class Splats {
     gl.uniform1i(this.uniform("labelled"), this.labelled);
     gl.uniform1i(this.uniform("selected"), this.selected);
     gl.uniform1i(this.uniform("picking"), picking);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.drawn);
+    gl.drawArrays(gl.TRIANGLES, 0, 6 * this.drawn);
   }
 
   // The instance of the nearest Gaussian that is not faint at a pixel; -1 where there is none.

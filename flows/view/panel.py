@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 _BESIDE = 1.1
 """How many of its own widths a copy is put aside."""
 _NOTE_SECONDS = 8.0
+_FEWER = (
+    '<div style="padding:0 0.8em"><small>Drawn: {drawn:,} of {count:,} Gaussians, enlarged to cover as much. '
+    "Clicks and edits mean all of them.</small></div>"
+)
 
 Act = Callable[[], None]
 
@@ -47,11 +51,14 @@ class Panel:
         script: Path,
         search: Search | None,
         corrections: Callable[[], Corrections] | None = None,
+        draw_at_most: int | None = None,
     ) -> None:
         """script: the file that the edit script is saved to. search: None where a run cannot be searched. corrections:
-        opens those of the run; None where it cannot be run again."""
+        opens those of the run; None where it cannot be run again. draw_at_most: so many Gaussians, for browsers that
+        draw without a GPU; what is done means all of them."""
         self._server, self.session, self._script = server, session, script
-        self.nodes = SceneNodes(server)
+        count = sum(len(piece.rows) for piece in session.state.pieces.values())
+        self.nodes = SceneNodes(server, min(1.0, (draw_at_most or count) / max(count, 1)))
         self.lock = threading.RLock()
         self._picker: tuple[dict[int, Piece], Picker] | None = None
         self._saved = session.script()
@@ -60,6 +67,8 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self.objects = ObjectList(gui, session, search, self._chosen)
         self._told = gui.add_html("")
+        if self.nodes.share < 1:
+            gui.add_html(_FEWER.format(drawn=draw_at_most, count=count))
         self.several = gui.add_checkbox("Select several", False, hint="Shift and a click in the scene does the same")
         self._build_actions(gui)
         self.correcting: Correcting | None = None

@@ -16,6 +16,7 @@ import math
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Iterator
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -129,13 +130,21 @@ def _guarded(guard: Guard) -> Iterator[list[bool]]:
 def _behind(guard: Guard, answer: _Answer) -> _Answer:
     """What answers a request, if the guard lets it through."""
 
+    quads = resources.files(__package__ or "").joinpath("quads.js").read_bytes()
+
     def guarded(connection: ServerConnection, request: Request) -> Response | None:
         path = guard.path(request)
         if path is None:
             return connection.respond(403, "Refused. The address, with its token, is where ss-flow view was started.\n")
+        if "Accept-Encoding" in request.headers:  # the page is added to
+            del request.headers["Accept-Encoding"]
         response = answer(connection, dataclasses.replace(request, path=path))
         if response is not None:
             response.headers.update(_HEADERS)
+            if b"<head>" in (response.body or b""):
+                response.body = response.body.replace(b"<head>", b"<head><script>" + quads + b"</script>", 1)
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
         return response
 
     return guarded

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,7 @@ from ss_flow.flows.view.drawing import (
     label_colors,
     start_view,
 )
+from ss_flow.flows.view.thinning import thinned
 from ss_flow.tasks.artifacts import Gaussians, PointLabels, UInt8
 from ss_flow.tasks.deliver.palette import instance_color
 
@@ -57,10 +58,13 @@ class Round:
     """Of those that stayed as they were."""
 
 
-def stages(run: FinishedRun) -> list[Stage]:
-    """The stages of a run, in order; those of which the run has no result, or the store no longer, are left out."""
+def stages(run: FinishedRun, share: float = 1.0) -> list[Stage]:
+    """The stages of a run, in order; those of which the run has no result, or the store no longer, are left out.
+
+    share: of the Gaussians, how many are drawn (`thinned`).
+    """
     results = run.results
-    around = functools.cache(lambda: around_results(results))
+    around = functools.cache(lambda: replace(around_results(results), share=share))
 
     def of_result(name: str, said: str, told: str, needed: Sequence[str] = ()) -> Iterator[Stage]:
         def drawn(scene: SceneApi, node: str) -> None:
@@ -97,7 +101,7 @@ def stages(run: FinishedRun) -> list[Stage]:
             yield Stage(
                 f"Merge round {one.number + 1}",
                 f"{len(one.merged)} pairs that overlapped were joined, each in a colour of its own.",
-                functools.partial(_draw_round, run, one),
+                functools.partial(_draw_round, run, one, share),
             )
         yield from of_result("scene", "Scene", "All Gaussians, trained together once more.")
         yield from of_result("masks", "Final masks", "The objects of the scene, seen from each photo.", ["cameras"])
@@ -135,9 +139,9 @@ def rounds(run: FinishedRun) -> list[Round]:
     return found
 
 
-def _draw_round(run: FinishedRun, one: Round, scene: SceneApi, node: str) -> None:
+def _draw_round(run: FinishedRun, one: Round, share: float, scene: SceneApi, node: str) -> None:
     for index, digest in enumerate((*one.merged, *one.untouched)):
-        group: Gaussians = run.store.get(digest)
+        group: Gaussians = thinned(run.store.get(digest), share)
         if len(group):
             color = instance_color(index + 1) if index < len(one.merged) else _UNTOUCHED
             add_gaussians(scene, f"{node}/{index}", group, np.tile(np.array(color, np.uint8), (len(group), 1)))
@@ -146,19 +150,21 @@ def _draw_round(run: FinishedRun, one: Round, scene: SceneApi, node: str) -> Non
 class Timeline:
     """The stages of one run, or of two of the same capture side by side, in one scene; one stage is shown at a time."""
 
-    def __init__(self, scene: SceneApi, run: FinishedRun, beside: FinishedRun | None = None) -> None:
-        """beside: a run to show to the right of the other, at the stages of the same name.
+    def __init__(
+        self, scene: SceneApi, run: FinishedRun, beside: FinishedRun | None = None, share: float = 1.0
+    ) -> None:
+        """beside: a run to show to the right of the other, at the stages of the same name. share: as for `stages`.
 
         Raises InputError when nothing of the run is left in the store.
         """
         self._scene = scene
-        self.stages = stages(run)
+        self.stages = stages(run, share)
         if not self.stages:
             raise InputError(f"the store {run.store.location} holds no stage of {run.folder} any more; run it again.")
         self._sides = [{stage.name: stage for stage in self.stages}]
         scene.add_frame(f"{_ROOT}/0", show_axes=False)
         if beside is not None:
-            self._sides.append({stage.name: stage for stage in stages(beside)})
+            self._sides.append({stage.name: stage for stage in stages(beside, share)})
             scene.add_frame(f"{_ROOT}/1", show_axes=False, position=_to_the_right(run))
         self._drawn: dict[tuple[int, int], bool] = {}
         self._lock = threading.Lock()
@@ -203,14 +209,18 @@ class Timeline:
 
 
 def add_timeline(
-    server: ViserServer, run: FinishedRun, shown: Callable[[bool], None], beside: FinishedRun | None = None
+    server: ViserServer,
+    run: FinishedRun,
+    shown: Callable[[bool], None],
+    beside: FinishedRun | None = None,
+    share: float = 1.0,
 ) -> Timeline:
     """A slider over the stages of a run in a viewer's panel; at its left end stands what the viewer itself shows.
 
     shown: told whether the viewer is to show its own scene. beside: a run to show to the right of this one.
-    Raises InputError when nothing of the run is left in the store.
+    share: as for `stages`. Raises InputError when nothing of the run is left in the store.
     """
-    timeline = Timeline(server.scene, run, beside)
+    timeline = Timeline(server.scene, run, beside, share)
     ends = {0: "now", len(timeline.names): timeline.names[-1]}
     with server.gui.add_folder("How it came about", expand_by_default=False):
         slider = server.gui.add_slider(

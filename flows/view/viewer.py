@@ -30,10 +30,11 @@ class Viewer:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
+        draw_at_most: int | None = None,
     ) -> None:
         """run: with the results "scene" and "cameras". script: the file to save to. operations: those to begin with.
         search: None where the run cannot be searched. hints: the file that corrections are saved to; None = none are
-        picked. host, port: where to listen.
+        picked. host, port: where to listen. draw_at_most: as for `Panel`.
 
         Raises InputError for an operation that is refused, and when it cannot listen there.
         """
@@ -43,7 +44,7 @@ class Viewer:
         self.server, self.address = start(host, port, run.name)
         look_from(self.server, start_view(cameras, scene.means))
         corrections = None if hints is None else partial(Corrections, run, hints)
-        self.panel = Panel(self.server, session, script, search, corrections)
+        self.panel = Panel(self.server, session, script, search, corrections, draw_at_most)
         self.cameras = CameraViews(self.server, cameras, run.results)
 
     def add_timeline(self, beside: FinishedRun | None = None) -> None:
@@ -58,7 +59,7 @@ class Viewer:
                 if (node := self.server.scene.get_handle_by_name(name)) is not None:
                     node.visible = is_now
 
-        self.timeline = add_timeline(self.server, self._run, shown, beside)
+        self.timeline = add_timeline(self.server, self._run, shown, beside, self.panel.nodes.share)
 
     def load_pictures(self) -> None:
         """Give the objects in the list their pictures; this may take a while, where the run kept none."""

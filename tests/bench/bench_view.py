@@ -1,6 +1,6 @@
 """What the viewer costs: a generated scene of many Gaussians and objects, opened in headless Chromium.
 
-    python tests/bench/bench_view.py [--gaussians 100000 1000000] [--objects 200] [--frames 10]
+    python tests/bench/bench_view.py [--gaussians 100000 1000000] [--objects 200] [--frames 10] [--draw-at-most N]
 
 Of each number of Gaussians: the seconds until the server is ready; until a browser shows the first of them, and all of
 them (two pictures, one after the other, are the same); of a frame while the mouse turns the scene; of finding what a
@@ -57,6 +57,9 @@ def generated(count: int, objects: int) -> tuple[Gaussians, dict]:
     means[floor] = np.stack([*rng.uniform(-1, side, (2, floor.sum())), np.full(floor.sum(), -0.4)], axis=1)
     colors = rng.integers(0, 255, (objects + 1, 3)).astype(np.uint8)[ids]
     scene = initialise(means.astype(np.float32), colors, ids, 0.02)
+    scene.opacity_logits[:] = (
+        2.2  # as after a training: viser leaves out what is small and as faint as at its beginning
+    )
     entries = [
         {"id": i, "name": f"object {i}", "parts": [], "confidence": 1.0, "parent": None, "views": [], "num_points": 0}
         for i in range(1, objects + 1)
@@ -64,7 +67,7 @@ def generated(count: int, objects: int) -> tuple[Gaussians, dict]:
     return scene, {"instances": entries, "groups": []}
 
 
-def measure(count: int, objects: int, frames: int) -> dict[str, float]:
+def measure(count: int, objects: int, frames: int, draw_at_most: int | None) -> dict[str, float]:
     """The figures of one size of scene."""
     scene, instances = generated(count, objects)
     side = objects**0.5
@@ -73,7 +76,7 @@ def measure(count: int, objects: int, frames: int) -> dict[str, float]:
     server, address = start("127.0.0.1", 0, "bench")
     server.initial_camera.position, server.initial_camera.look_at = eye, middle
     with tempfile.TemporaryDirectory() as folder:
-        panel = Panel(server, Session(scene, instances, Path()), Path(folder, "script.json"), None)
+        panel = Panel(server, Session(scene, instances, Path()), Path(folder, "script.json"), None, None, draw_at_most)
         told = {"server ready, s": time.perf_counter() - begun}
         if frames:
             told |= _browser(address, frames)
@@ -205,9 +208,10 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, nargs="*", default=[100_000, 1_000_000])
     parser.add_argument("--objects", type=int, default=200)
     parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--draw-at-most", type=int)
     options = parser.parse_args()
     for count in options.gaussians:
-        told = measure(count, options.objects, options.frames)
+        told = measure(count, options.objects, options.frames, options.draw_at_most)
         print(json.dumps({"gaussians": count} | {name: round(value, 4) for name, value in told.items()}), flush=True)
 
 
