@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
 import os
 import time
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 from browser import Page, browser_page, needs_browser
 from scipy.spatial.transform import Rotation
-from tiny_runs import ss_flow
+from tiny_runs import run_tiny, ss_flow
 
 from ss_flow.cache.store import Store
 from ss_flow.flows.cli.context import StoreOptions, open_run
@@ -44,7 +46,32 @@ window.field = label => {
   while (found && !found.querySelector('input')) found = found.parentElement;
   return found.querySelector('input');
 };
+window.thumb = label => {
+  let found = [...document.querySelectorAll('label, div, span, p')].find(
+    e => e.children.length === 0 && e.textContent.trim() === label);
+  while (found && !found.querySelector('[role=slider]')) found = found.parentElement;
+  return found.querySelector('[role=slider]');
+};
 """
+
+_COUNT = """
+window.flat = window.instanced = 0;
+for (const [name, count] of [['drawArrays', () => flat++], ['drawElementsInstanced', () => instanced++]]) {
+  const draw = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...all) {
+    if ((all.length === 5 ? 6 * all[4] : all[2]) > 6000) count();
+    return draw.apply(this, all);
+  };
+}
+"""
+"""Counts pictures of more than a thousand Gaussians by how they are drawn."""
+_NO_NAME = """
+const extension = WebGL2RenderingContext.prototype.getExtension;
+WebGL2RenderingContext.prototype.getExtension = function (name) {
+  return name === 'WEBGL_debug_renderer_info' ? null : extension.call(this, name);
+};
+"""
+"""The browser does not tell what it draws with."""
 
 
 class Hands:
@@ -134,6 +161,41 @@ class Hands:
         self.mouse("mouseReleased", arrow[grip + 10])
         self.until(lambda: "end" in told)
 
+    def open_stages(self) -> None:
+        """Unfold the part of the panel with the time line, and bring its slider into the window."""
+        title = "[...document.querySelectorAll('*')].filter(e => e.innerText === 'How it came about').at(-1)"
+        self.page.evaluate(f"{title}.click()")
+        self.page.wait_for("thumb('Stage')?.getBoundingClientRect().height > 0")
+        time.sleep(1)  # it unfolds step by step
+        self.page.evaluate("thumb('Stage').scrollIntoView({block: 'center'})")
+
+    def slide(self, label: str, value: int, last: int) -> None:
+        """Press the mouse on a slider that goes from 0 to `last`, until it is where it is wanted; it may unfold yet."""
+        thumb = f"thumb({json.dumps(label)})"
+
+        def is_there() -> bool:
+            box = (
+                f"(b => [b.x, b.width, b.y, b.height])({thumb}.closest('[class*=Slider-root]').getBoundingClientRect())"
+            )
+            x, width, y, height = self.page.evaluate(box)
+            self.click(np.array([x + min(value / last, 0.99) * width, y + height / 2]))
+            time.sleep(1)
+            return self.page.evaluate(f"{thumb}.getAttribute('aria-valuenow')") == str(value)
+
+        self.until(is_there)
+
+    def looked(self) -> Float64:
+        """[H, W, 3] what the page shows of the scene, once two pictures of it are the same."""
+        end, before = time.monotonic() + 240, b""
+        while time.monotonic() < end:
+            time.sleep(1)
+            now = self.page.screenshot()
+            if now == before:
+                picture = cv2.imdecode(np.frombuffer(now, np.uint8), cv2.IMREAD_COLOR_RGB)
+                return picture[150:, :-350].astype(np.float64)  # below viser's notice, left of the panel
+            before = now
+        raise TimeoutError("the page does not come to rest")
+
     def camera(self) -> Camera:
         """What the browser shows the scene with, in its pixels."""
         (client,) = self.viewer.server.get_clients().values()
@@ -163,10 +225,21 @@ class Hands:
 @pytest.fixture
 def hands(warm, tmp_path: Path) -> Iterator[Hands]:
     """Somebody who has opened the viewer of the tiny run."""
+    with opened(warm, tmp_path) as hands:
+        yield hands
+
+
+@contextlib.contextmanager
+def opened(warm, folder: Path, beside: Path | None = None, width: int = 900) -> Iterator[Hands]:
+    """The viewer of the tiny run, as `ss-flow view` puts it together.
+
+    beside: the output folder of another run. width: of the window, pixels.
+    """
     run = open_run(warm.out, StoreOptions(warm.store), ("scene", "cameras"))
-    viewer = Viewer(run, tmp_path / "script.json", (), search_of(run), tmp_path / "hints.json", port=0)
+    viewer = Viewer(run, folder / "script.json", (), search_of(run), folder / "hints.json", port=0)
+    viewer.add_timeline(open_run(beside, StoreOptions(warm.store), ("scene",)) if beside else None)
     viewer.load_pictures()
-    with browser_page(900, 600) as page:
+    with browser_page(width, 600) as page:
         page.open(viewer.address)
         page.wait_for("document.querySelector('canvas') !== null && document.querySelectorAll('button').length > 12")
         page.evaluate(_LOOK)
@@ -288,3 +361,78 @@ def test_cameras_stand_in_the_scene_with_what_they_saw(hands, tmp_path, kind):
     assert all((frustum.image is None) == (kind == "outlines") for frustum in hands.viewer.cameras.frusta)
     (tmp_path / "cameras.png").write_bytes(page.screenshot())
     assert not [text for text in page.complaints if not text.startswith("THREE.")]
+
+
+def test_the_slider_goes_through_the_stages_and_back_to_the_scene(hands, tmp_path):
+    page, timeline = hands.page, hands.viewer.timeline
+    hands.open_stages()
+    now, pictures = hands.looked(), {}
+    for number, name in enumerate(timeline.names, 1):
+        hands.slide("Stage", number, len(timeline.names))
+        page.wait_for(f"[...document.querySelectorAll('b')].some(b => b.innerText === {json.dumps(name)})")
+        hands.until(lambda number=number: [n for (n, _), shown in timeline._drawn.items() if shown] == [number - 1])
+        pictures[name] = hands.looked()
+        (tmp_path / f"{number} {name}.png").write_bytes(page.screenshot())
+    different = [
+        (one, other)
+        for one, other in itertools.combinations(pictures, 2)
+        if np.abs(pictures[one] - pictures[other]).mean() > 0.5
+    ]
+    assert len(different) == len(pictures) * (len(pictures) - 1) / 2  # no two look alike
+    page.evaluate("thumb('Stage').focus()")
+    for kind in ("rawKeyDown", "keyUp"):
+        page.call("Input.dispatchKeyEvent", type=kind, key="Home", code="Home")
+    page.wait_for("thumb('Stage').getAttribute('aria-valuenow') === '0'")
+    hands.until(lambda: not any(timeline._drawn.values()))
+    assert np.abs(hands.looked() - now).mean() < 0.5
+    assert not [text for text in page.complaints if not text.startswith("THREE.")]
+
+
+def test_another_run_stands_to_the_right_at_the_same_stage(warm, tmp_path):
+    other = run_tiny(warm.scene, warm.store, "--set=split.dense.max_points=2000", out=tmp_path / "other")
+    assert other.code == 0, other.err
+    with opened(warm, tmp_path, tmp_path / "other", 1500) as hands:
+        page, timeline = hands.page, hands.viewer.timeline
+        hands.open_stages()
+        number = timeline.names.index("Dense points") + 1
+        hands.slide("Stage", number, len(timeline.names))
+        hands.until(
+            lambda: {key for key, shown in timeline._drawn.items() if shown} == {(number - 1, 0), (number - 1, 1)}
+        )
+        near = hands.looked()
+        for _ in range(6):  # away from the scene, until both are in the picture
+            page.call("Input.dispatchMouseEvent", type="mouseWheel", x=250, y=300, deltaX=0, deltaY=400)
+        far = hands.looked()
+        (tmp_path / "beside.png").write_bytes(page.screenshot())
+        assert np.abs(far - near).mean() > 1
+        sides = [hands.viewer.server.scene.get_handle_by_name(f"/timeline/{k}/{number - 1}/it") for k in (0, 1)]
+        runs = [open_run(out, StoreOptions(warm.store), ("dense",)) for out in (warm.out, tmp_path / "other")]
+        assert [len(side.points) for side in sides] == [len(run.results.one("dense").points) for run in runs]
+        assert len(sides[1].points) < len(sides[0].points)
+        place = np.asarray(hands.viewer.server.scene.get_handle_by_name("/timeline/1").position)
+        for side, away in zip(sides, (np.zeros(3), place), strict=True):
+            x, y = np.median(project(side.points.astype(np.float64) + away, hands.camera())[0], axis=0)
+            shown = far[int(y) - 150 - 15 : int(y) - 150 + 15, int(x) - 15 : int(x) + 15]
+            assert shown.size and (shown.min(axis=-1) < 200).mean() > 0.2, (x, y)  # the page is white
+        assert not [text for text in page.complaints if not text.startswith("THREE.")]
+
+
+def test_triangles_in_one_list_look_like_an_instance_each(warm, tmp_path):
+    pictures = {}
+    for kept in (True, False):
+        run = open_run(warm.out, StoreOptions(warm.store), ("scene", "cameras"))
+        viewer = Viewer(run, tmp_path / "script.json", port=0)
+        with browser_page(900, 600) as page:
+            page.call("Page.addScriptToEvaluateOnNewDocument", source=_COUNT + ("" if kept else _NO_NAME))
+            page.open(viewer.address)
+            page.wait_for("document.querySelectorAll('button').length > 12")
+            hands = Hands(page, viewer)
+            hands.until(hands.has_arrived)
+            pictures[kept] = hands.looked()
+            flat, instanced = page.evaluate("[flat, instanced]")
+            assert (flat > 3 and instanced == 0) if kept else (flat == 0 and instanced > 3)
+            assert not [text for text in page.complaints if not text.startswith("THREE.")]
+        viewer.close()
+    assert pictures[True].std() > 5
+    error = np.mean((pictures[True] - pictures[False]) ** 2)  # Gaussians of one depth may come in another order
+    assert 10 * np.log10(255**2 / max(error, 1e-9)) > 45
