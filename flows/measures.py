@@ -22,7 +22,8 @@ NAMES: dict[str, tuple[str, ...]] = {
     "metrics_refined": tuple(f"refined.{name}" for name in _MASKS + _COUNTS),
     "metrics_splat": tuple(f"splat.{name}" for name in _MASKS + _COUNTS),
     "novel_view": tuple(
-        f"novel_view.{name}" for name in ("psnr", "ssim", "psnr_colour_fitted", "lpips", "lpips_unscaled")
+        f"novel_view.{name}"
+        for name in ("psnr", "ssim", "psnr_neighbour_colours", "psnr_colour_fitted", "lpips", "lpips_unscaled")
     ),
     "query": ("query.matched", "query.matched_share", "query.best"),
 }

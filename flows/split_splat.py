@@ -82,7 +82,11 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         if held_out.truth is not None:
             results["truth_held_out"] = held_out.truth
         results["novel_view"] = novel_view(
-            held_out.frames, held_out.cameras, results["scene"], perception=networks.perception
+            held_out.frames,
+            held_out.cameras,
+            results["scene"],
+            *((capture.by_view, capture.colours) if capture.colours else ()),
+            perception=networks.perception,
         )
     results["report_pictures"] = report_pictures(
         capture.frames, capture.cameras, capture.depths, masks_split, results["masks"], results["scene"]

@@ -167,9 +167,11 @@ def _tell(document: dict[str, Any], out_folder: Path | None, out: Console) -> No
             table.add_row(f"after {stage.title()}", *figures)
         print_table(table, out)
     if views := document["metrics"].get("novel_view"):
+        beside = "psnr_neighbour_colours"
         out.print(
-            f"views that were kept back: PSNR {views['psnr']:.2f} dB, {views['psnr_colour_fitted']:.2f} with "
-            f"colours fitted to each view, SSIM {views['ssim']:.3f}, "
+            f"views that were kept back: PSNR {views['psnr']:.2f} dB, "
+            + (f"{views[beside]:.2f} in the colours of the photos beside, " if beside in views else "")
+            + f"{views['psnr_colour_fitted']:.2f} with colours fitted to each view, SSIM {views['ssim']:.3f}, "
             + (f"LPIPS {views['lpips']:.3f}" if "lpips" in views else "LPIPS not measured (no network)")
         )
     hits = sum(node["hit"] for node in document["nodes"])

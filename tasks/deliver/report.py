@@ -30,6 +30,7 @@ _METRIC_NAMES = {
     "sq": "SQ",
     "rq": "RQ",
     "psnr": "PSNR",
+    "psnr_neighbour_colours": "PSNR, colours of the photos beside",
     "psnr_colour_fitted": "PSNR, colours fitted to each view",
     "ssim": "SSIM",
     "lpips": "LPIPS (VGG)",

@@ -7,9 +7,20 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, Gaussians, Metrics, UInt8
+from ss_flow.tasks.artifacts import (
+    Bool,
+    Cameras,
+    ColourTransform,
+    Float32,
+    Float64,
+    Frame,
+    Gaussians,
+    Metrics,
+    UInt8,
+)
+from ss_flow.tasks.evaluate.neighbour_colours import NeighbourColours
 from ss_flow.tasks.gaussians.rasterize import backend_identity
-from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.cameras import Camera, camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.lpips import distance, lpips_of
@@ -32,15 +43,19 @@ def novel_view(
     frames_held_out: tuple[Frame, ...],
     cameras_held_out: Cameras,
     scene: Gaussians,
+    cameras_trained: tuple[Camera, ...] = (),
+    colours: tuple[ColourTransform, ...] = (),
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     perception: Model | None = None,
 ) -> Metrics:
     """Render the scene from the held-out cameras and compare with the photos, as 8-bit images.
 
+    colours: what the photos that were trained on went through, one each of `cameras_trained`; empty where they stayed.
     background: colour where nothing is, 0..1. perception: the network of LPIPS. Pixels that a frame's `valid` mask
     excludes count in no measure.
-    Returns psnr (dB) and ssim, and psnr_colour_fitted, the PSNR after `colour_fitted`; with a network lpips, and
+    Returns psnr (dB) and ssim, and psnr_colour_fitted, the PSNR after `colour_fitted`; where photos went through
+    transforms, psnr_neighbour_colours, in the colours that `NeighbourColours` expects; with a network lpips, and
     lpips_unscaled, that of pictures 0..1 (see `Lpips.differences`); each the mean over the views.
     Raises InputError when there is no view, when frames and cameras do not belong together, or when a view has no valid
     pixel.
@@ -52,6 +67,7 @@ def novel_view(
         raise InputError("There is no held-out view; at least one is needed to evaluate novel views.")
     if names != cameras_held_out.names:
         raise InputError("The held-out frames and cameras are not the same views in the same order.")
+    beside = NeighbourColours.of(scene, cameras_trained, colours) if colours else None
     found: list[dict[str, float]] = []
     for view, frame in enumerate(frames_held_out):
         valid = decode_valid(frame)
@@ -67,6 +83,9 @@ def novel_view(
                 "psnr_colour_fitted": psnr(fitted, photo, valid),
             }
         )
+        if beside is not None:
+            expected = to_8bit(beside.applied(rgb, frame.name, scene, camera))
+            found[-1]["psnr_neighbour_colours"] = psnr(expected, photo, valid)
         if perception is not None:
             for name, lowest in (("lpips", -1.0), ("lpips_unscaled", 0.0)):
                 found[-1][name] = distance(perceived(image, photo, valid, perception, lowest=lowest), valid)

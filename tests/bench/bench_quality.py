@@ -20,9 +20,10 @@ from ss_flow.flows.capture import capture
 from ss_flow.flows.params import CaptureParams
 from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, PointCloud, SceneUnit
+from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Frame, Gaussians, PointCloud, SceneUnit
 from ss_flow.tasks.capture.colours import ColourParams, colours
 from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.evaluate.neighbour_colours import NeighbourColours
 from ss_flow.tasks.evaluate.novel_view import colour_fitted, psnr, ssim, to_8bit
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.render import render
@@ -62,15 +63,10 @@ def view_of(frame: Frame, cameras: Cameras, depth: DepthMap, index: int, side: i
     return TrainView(camera, image, inside, np.zeros_like(inside), z)
 
 
-def evened(
-    views: list[TrainView],
-    rows: Sequence[int],
-    frames: list[Frame],
-    cameras: Cameras,
-    depths: list[DepthMap],
-    unit: float,
-) -> list[TrainView]:
-    """The views with the colours of one of them; rows: which of the frames they are."""
+def even(
+    rows: Sequence[int], frames: list[Frame], cameras: Cameras, depths: list[DepthMap], unit: float
+) -> tuple[ColourTransform, ...]:
+    """What gives these rows of the frames the colours of one of them."""
     own = replace(
         cameras,
         names=tuple(cameras.names[row] for row in rows),
@@ -79,8 +75,16 @@ def evened(
         world_to_camera=cameras.world_to_camera[rows],
     )
     known = tuple(frames[row] for row in rows), own, tuple(depths[row] for row in rows), SceneUnit(unit)
-    found = colours(*known, params=ColourParams())
-    return [replace(view, image=transformed(view.image, of)) for view, of in zip(views, found, strict=True)]
+    return colours(*known, params=ColourParams())
+
+
+def expected(scene: Gaussians, views: list[TrainView], beside: NeighbourColours, names: Sequence[str]) -> float:
+    """PSNR in the colours that the photos beside let expect, mean over views."""
+    values = []
+    for view, name in zip(views, names, strict=True):
+        rgb = beside.applied(render(scene, view.camera).rgb, name, scene, view.camera)
+        values.append(psnr(to_8bit(rgb), to_8bit(view.image), view.inside))
+    return float(np.mean(values))
 
 
 def measured(scene: Gaussians, views: list[TrainView]) -> tuple[float, float, float]:
@@ -114,8 +118,10 @@ def main() -> None:
     held_out = [v for i, v in enumerate(views) if i % 8 == 0]
     rows_of_training = [i for i in range(len(views)) if i % 8]
     training = [views[i] for i in rows_of_training]
+    transforms: tuple[ColourTransform, ...] = ()
     if args.colours:
-        training = evened(training, rows_of_training, frames, cameras, depths, cloud.unit)
+        transforms = even(rows_of_training, frames, cameras, depths, cloud.unit)
+        training = [replace(v, image=transformed(v.image, of)) for v, of in zip(training, transforms, strict=True)]
     rows = thin(cloud.points, args.points)
     initial = initialise(cloud.points[rows], cloud.colors[rows], 0, 1.0)
     print(f"{args.capture.name}: {len(training)} views to train, {len(held_out)} held out, {len(rows)} points")
@@ -140,6 +146,13 @@ def main() -> None:
                 f"{seconds:.0f} s",
                 flush=True,
             )
+            if transforms:
+                beside = NeighbourColours.of(result.gaussians, [view.camera for view in training], transforms)
+                names = [frame.name for i, frame in enumerate(frames) if i % 8 == 0]
+                metered, mean = (
+                    expected(result.gaussians, held_out, one, names) for one in (beside, replace(beside, metering=0.0))
+                )
+                print(f"in the colours of the photos beside {metered:.2f} dB, without metering {mean:.2f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -136,6 +136,7 @@ def test_views_kept_back_are_measured_and_the_photo_whose_colours_the_scene_has_
     assert called.document()["reference_photo"] in {path.stem for path in (room / "color").iterdir()}
     measured = called.document()["metrics"]["novel_view"]
     assert 5 < measured["psnr"] < 60 and measured["psnr"] < measured["psnr_colour_fitted"]
+    assert 5 < measured["psnr_neighbour_colours"] < measured["psnr_colour_fitted"] + 0.1
     assert "lpips" not in measured and "not measured (no network)" in (tmp_path / "out/report.html").read_text()
 
 

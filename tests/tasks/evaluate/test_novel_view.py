@@ -12,8 +12,9 @@ import pytest
 from random_networks import narrow_lpips
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Cameras, Frame, Gaussians
+from ss_flow.tasks.artifacts import Cameras, ColourTransform, Frame, Gaussians
 from ss_flow.tasks.evaluate.novel_view import colour_fitted, novel_view, psnr, ssim, to_8bit
+from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.models.lpips import Lpips, distance
 
@@ -154,6 +155,17 @@ def test_lpips_is_measured_with_a_network_and_on_valid_pixels_alone(
 def test_an_affine_change_of_colours_is_fitted_away(rendered: list[Any]) -> None:
     values = novel_view((_frame("a"), _frame("b")), _cameras("a", "b"), _gaussians()).values
     assert values["psnr"] < 40 < 55 < values["psnr_colour_fitted"]  # what is left is rounding
+
+
+def test_renderings_are_compared_in_the_colours_of_the_photos_beside_too(rendered: list[Any]) -> None:
+    views = (_frame("b"),), _cameras("b"), _gaussians()
+    assert "psnr_neighbour_colours" not in novel_view(*views).values
+    rendered.clear()
+    trained = _cameras("a", "c")
+    matrix = np.hstack([0.9 * np.eye(3), np.zeros((3, 1))])  # what made the photos as dark as the renderings are
+    colours = tuple(ColourTransform(name, "a", matrix) for name in ("a", "c"))
+    values = novel_view(*views, (camera_of(trained, 0), camera_of(trained, 1)), colours).values
+    assert values["psnr"] < 30 < 35 < values["psnr_neighbour_colours"]
 
 
 def test_colours_are_fitted_to_the_valid_pixels_alone() -> None:
