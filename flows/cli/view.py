@@ -153,18 +153,17 @@ class View:
             run, script, operations, search, hints, host=self.host, port=self.port, draw_at_most=self.draw_at_most
         )
         viewer.add_timeline(beside)
-        out.print(
-            f"{viewer.address}\nCtrl-C ends it. Edits are saved in {escape(str(script))} ({len(operations)} so far)."
-        )
         count = len(run.results.one("scene"))
         if self.draw_at_most is None and count > _MANY:
             out.print(
                 f"The scene has {count:,} Gaussians. If the browser has no GPU: --draw-at-most {_FEW} draws fewer."
             )
         again = shlex.join(["ss-flow", "run", run.document["scene"], "--correct", str(hints), "--out", str(run.folder)])
-        out.print(f"Corrections are made by: {escape(again)}, and the run's other options.")
+        saved = f"Edits are saved in {escape(str(script))} ({len(operations)} so far)."
         try:
             with contextlib.suppress(KeyboardInterrupt):
+                out.print(f"{viewer.address}\nCtrl-C ends it. {saved}")
+                out.print(f"Corrections are made by: {escape(again)}, and the run's other options.")
                 viewer.load_pictures()
                 _wait()
             if viewer.panel.unsaved:

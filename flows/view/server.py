@@ -141,8 +141,9 @@ def _behind(guard: Guard, answer: _Answer) -> _Answer:
         response = answer(connection, dataclasses.replace(request, path=path))
         if response is not None:
             response.headers.update(_HEADERS)
-            if b"<head>" in (response.body or b""):
-                response.body = response.body.replace(b"<head>", b"<head><script>" + quads + b"</script>", 1)
+            body = response.body or b""
+            if b"<head>" in body:
+                response.body = body.replace(b"<head>", b"<head><script>" + quads + b"</script>", 1)
                 del response.headers["Content-Length"]
                 response.headers["Content-Length"] = str(len(response.body))
         return response
