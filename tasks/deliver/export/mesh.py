@@ -28,8 +28,9 @@ _WIDEST = 1.5
 _MARGIN = 0.06
 _STRAY = 0.005
 """Share of the Gaussians at each end of each axis that may lie outside the box."""
-_SMALLEST_PIECE = 0.05
-"""Share of the largest piece's triangles below which another piece is taken for floating debris."""
+_SMALLEST_PIECE = 0.2
+"""Share of the largest piece's diagonal below which another piece is taken for floating debris: a leg whose seat no
+view shows is a piece of few triangles, but a long one."""
 
 
 @dataclass(frozen=True)
@@ -163,11 +164,16 @@ def _carve(empty: Bool, middles: Float64, depth: Float32, view: Camera, margin: 
 
 
 def _drop_debris(surface: Any) -> None:
-    pieces, sizes, _ = surface.cluster_connected_triangles()
-    counts = np.asarray(sizes)
+    pieces, counts, _ = surface.cluster_connected_triangles()
     if len(counts):
-        small = counts < _SMALLEST_PIECE * counts.max()
-        surface.remove_triangles_by_mask(small[np.asarray(pieces)])
+        piece = np.asarray(pieces)
+        corners = np.asarray(surface.vertices)[np.asarray(surface.triangles)]
+        low, high = np.full((len(counts), 3), np.inf), np.full((len(counts), 3), -np.inf)
+        np.minimum.at(low, piece, corners.min(axis=1))
+        np.maximum.at(high, piece, corners.max(axis=1))
+        diagonal = np.linalg.norm(high - low, axis=1)
+        small = diagonal < _SMALLEST_PIECE * diagonal[np.argmax(counts)]
+        surface.remove_triangles_by_mask(small[piece])
         surface.remove_unreferenced_vertices()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -72,6 +73,22 @@ def test_what_no_view_shows_is_open_or_closed_as_asked():
     volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
     ball_volume = 4 / 3 * np.pi * RADIUS**3
     assert ball_volume * 0.95 < volume < ball_volume * 1.5  # it holds the ball, and little of the shadow below it
+
+
+@pytest.mark.parametrize(("length", "stays"), [(0.6, True), (0.2, False)])
+def test_a_long_piece_of_few_triangles_stays_and_a_crumb_goes(length, stays):
+    cap, leg = (
+        select(ball(), rows) for rows in (np.arange(2000), np.arange(2000, 2060))
+    )  # its upper third, a leg below
+    places = np.random.default_rng(0).uniform((-0.03, -0.03, -0.5), (0.03, 0.03, -0.5 + length), (60, 3))
+    both = replace(cap, **{n: np.concatenate([getattr(cap, n), getattr(leg, n)]) for n in cap.__dataclass_fields__})
+    both.means[2000:] = places
+    both.log_scales[2000:] = np.log(0.02)
+    found = mesh.function(both, ROUND, instance_id=3, holes="open")
+    low = found.vertices[:, 2] < -0.5 + length
+    assert low.any() == stays and (~low).mean() > 0.5
+    if stays:
+        assert np.bincount(low[found.triangles[:, 0]])[1] < 0.2 * len(found.triangles)
 
 
 def test_the_same_gaussians_give_the_same_mesh():
