@@ -1,7 +1,7 @@
 """Exports read by programs of others; each test needs its reader, and says which is not here.
 
-`npm install @playcanvas/splat-transform gltf-validator` in a folder, and that folder in SS_FLOW_TEST_NPM, bring the
-ones in JavaScript; `pip install trimesh usd-core` those in Python.
+`npm install @playcanvas/splat-transform @spz-loader/core gltf-validator` in a folder, and that folder in
+SS_FLOW_TEST_NPM, bring the ones in JavaScript; `pip install trimesh usd-core` those in Python.
 """
 
 from __future__ import annotations
@@ -35,6 +35,15 @@ _VALIDATE = """
 const { validateBytes } = await import(process.argv[1]);
 const { readFileSync } = await import('fs');
 console.log(JSON.stringify(await validateBytes(new Uint8Array(readFileSync(process.argv[2])))));
+"""
+_LOAD_SPZ = """
+process.type = 'renderer';  // else the package looks for a part of Node that its bundler left out
+const { loadSpz } = await import(process.argv[1]);
+const { readFileSync, writeFileSync } = await import('fs');
+const cloud = await loadSpz(new Uint8Array(readFileSync(process.argv[2])));
+const columns = ['positions', 'scales', 'rotations', 'alphas', 'colors', 'sh'].map((name) => cloud[name]);
+for (const column of columns) writeFileSync(process.argv[3], Buffer.from(column.buffer), { flag: 'a' });
+console.log(JSON.stringify(columns.map((column) => column.length)));
 """
 
 
@@ -84,6 +93,49 @@ def test_a_rendering_of_what_was_read_is_that_of_what_was_written(tmp_path, writ
     camera = camera_of(made_cameras(), 0)
     ours, theirs = (render(g, camera).rgb.clip(0, 1) for g in (made, read))
     assert -10 * np.log10(np.square(ours - theirs).mean() + 1e-12) > decibels
+
+
+@pytest.mark.parametrize("count", [1, 100_000])
+@pytest.mark.parametrize(
+    ("write", "suffix", "decibels"),
+    [
+        (lambda g: gaussian_ply(g, labelled=False), ".ply", 100),
+        (compressed_ply, ".compressed.ply", 40),
+        (spz, ".spz", 36),
+        (splat, ".splat", 50),
+        (sog, ".sog", 40),
+    ],
+    ids=["ply", "compressed-ply", "spz", "splat", "sog"],
+)
+def test_one_gaussian_and_a_hundred_thousand_are_read(tmp_path, write, suffix, decibels, count):
+    made = made_gaussians(count, 0)
+    read = through_splat_transform(write(made).content.tobytes(), tmp_path, suffix)
+    assert len(read) == count
+    camera = camera_of(made_cameras(), 0)
+    ours, theirs = (render(g, camera).rgb.clip(0, 1) for g in (made, read))
+    assert -10 * np.log10(np.square(ours - theirs).mean() + 1e-12) > decibels
+
+
+@pytest.mark.parametrize(("count", "degree"), [(1, 0), (700, 1), (700, 2), (700, 3), (100_000, 0)])
+def test_spz_loader_reads_every_number_within_its_step(tmp_path, count, degree):
+    tool = needs("@spz-loader/core")
+    made = made_gaussians(count, degree)
+    (tmp_path / "a.spz").write_bytes(spz(made).content.tobytes())
+    command = ["node", "--input-type=module", "-e", _LOAD_SPZ, tool / "dist/index.js", tmp_path / "a.spz"]
+    lengths = json.loads(subprocess.run([*command, tmp_path / "raw"], check=True, capture_output=True).stdout)
+    read = np.split(np.fromfile(tmp_path / "raw", np.float32), np.cumsum(lengths)[:-1])
+    positions, scales, rotations, alphas, colors, sh = (column.reshape(count, -1) for column in read)
+    axes = np.array([1, -1, -1])  # the file's are right, up, back
+    np.testing.assert_allclose(positions * axes, made.means, atol=2**-12)
+    np.testing.assert_allclose(np.log(scales), made.log_scales, atol=1 / 32 + 1e-4)
+    np.testing.assert_allclose(alphas[:, 0], made.opacities, atol=0.5 / 255 + 1e-4)
+    # The angle between the two rotations; the file's order is x y z w.
+    turned = rotations[:, [3, 0, 1, 2]] * np.array([1, 1, -1, -1])
+    cosine = np.abs((turned * made.quaternions).sum(axis=1))
+    assert cosine.min() > np.cos(0.004)
+    base = 0.5 + 0.28209479177387814 * made.sh[:, 0]
+    assert np.abs(colors - base).max() < 0.28209479177387814 / 0.15 * 0.5 / 255 + 1e-4
+    assert sh.shape[1] == 3 * ((degree + 1) ** 2 - 1)
 
 
 @pytest.mark.parametrize("count", [1, 3, 17])
