@@ -10,8 +10,19 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, Float32, Int32, Observation, PointCloud, PointLabels, Visibility
-from ss_flow.tasks.geometry.clustering import rows_by_label
+from ss_flow.tasks.artifacts import (
+    BORDER,
+    INSIDE,
+    Bool,
+    Float32,
+    Float64,
+    Int32,
+    Observation,
+    PointCloud,
+    PointLabels,
+    Visibility,
+)
+from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, Natural
 from ss_flow.tasks.split.observe import ClusterParams
 from ss_flow.tasks.split.votes.at_once import (
@@ -45,6 +56,10 @@ class PropagateParams:
     """When they are (only with touching_merge)."""
     label_clusters: ClusterParams = field(default_factory=lambda: ClusterParams(eps=2.5, keep_share=0.05))
     """Which points of a label are kept in the end."""
+    tau_piece: Fraction = 0.55
+    """What label_clusters leaves out of a label is kept all the same, piece by piece, where its points lie inside masks
+    of the label in more than this share of the views that see them; under a mask's border counts a third. A leg apart
+    from its seat stays so; what a mask covers beyond a thing's outline goes. 1 = never."""
     min_label_points: Natural = 10
     """Points below which a label is dropped in the end."""
     min_label_views: Count = 2
@@ -80,7 +95,7 @@ def propagate(
     label = np.where(sure, leader, 0).astype(np.int32)
     if params.smoothing:
         label = smooth(label, covered & ~sure, points.points, points.spacing, params.smoothing)
-    settled = _settle(label, points, params)
+    settled = _settle(label, points, _sightings(label, observations, matched), params)
     num_labels = max(matched.label, default=0)
     renamed = _renaming(label, settled, num_labels)
     if params.min_label_views > 1:
@@ -114,14 +129,36 @@ def _at_once(
     return votes, against, matched
 
 
-def _settle(label: Int32, points: PointCloud, params: PropagateParams) -> Int32:
+def _sightings(label: Int32, observations: Sequence[Observation], matched: Matches) -> tuple[Int32, Float64]:
+    """How many views see each point [N], and how many of them under a mask of its label [N]; at its border a third."""
+    worth = np.zeros(3)
+    worth[[BORDER, INSIDE]] = 1 / 3, 1.0
+    seen, shown = np.zeros(len(label), np.int32), np.zeros(len(label))
+    name_of = {(k, mask): name for k, mask, name in zip(matched.view, matched.mask, matched.label, strict=True)}
+    for k, observation in enumerate(observations):
+        seen[observation.point_index] += 1
+        best = np.zeros(len(label))
+        for j, mask in enumerate(observation.mask.tolist()):
+            part = slice(observation.first[j], observation.first[j + 1])
+            under = observation.point_index[observation.row[part]]
+            own = label[under] == name_of.get((k, mask), -1)
+            best[under[own]] = np.maximum(best[under[own]], worth[observation.standing[part][own]])
+        shown += best
+    return seen, shown
+
+
+def _settle(label: Int32, points: PointCloud, sightings: tuple[Int32, Float64], params: PropagateParams) -> Int32:
     """The final labels: united where surfaces say so, without stray points, without tiny labels."""
     if params.touching_merge:
         label = merge_touching(label, points, params.touching)
     label = label.copy()
+    reach = params.label_clusters.eps * points.spacing
     for name, rows in rows_by_label(label).items():
         if name:
-            label[rows[~params.label_clusters.kept(points.points[rows], points.spacing)]] = 0
+            rest = rows[~params.label_clusters.kept(points.points[rows], points.spacing)]
+            piece = dbscan(points.points[rest], reach, min_samples=1)
+            seen, shown = (np.bincount(piece, of[rest]) for of in sightings)
+            label[rest[(shown <= params.tau_piece * seen)[piece]]] = 0
     size = np.bincount(label)
     label[size[label] < params.min_label_points] = 0
     return label

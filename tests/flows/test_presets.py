@@ -79,6 +79,7 @@ TABLE = {
     "split.propagate.label_clusters.min_samples": (10, 10, 10),
     "split.propagate.label_clusters.keep_share": (1.0, 1.0, 0.05),
     "split.propagate.label_clusters.max_clusters": (3, 3, 0),
+    "split.propagate.tau_piece": (1.0, 1.0, 0.55),
     "split.observe.clusters.max_clusters": (0, 0, 0),
     # 16
     "split.propagate.in_turn.lambda_init": (0.25, 0.25, 0.25),

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from ss_flow.tasks.artifacts import PointCloud
+from ss_flow.tasks.artifacts import BORDER, INSIDE, Observation, PointCloud
 from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -324,3 +324,23 @@ def test_a_label_that_one_view_shows_goes_to_the_background_where_many_others_lo
         (seen_by_all, replace(params, min_label_share=0.0)),
     ):
         assert run(points(8), views, masks, kept).label[1:7].all()
+
+
+@pytest.mark.parametrize(
+    ("inside_in", "tau_piece", "stays"),
+    [(2, 0.55, True), (1, 0.55, True), (0, 0.55, False), (1, 0.75, False), (2, 1, False)],
+)
+def test_a_small_piece_of_a_label_stays_where_views_see_it_inside_of_masks(inside_in, tau_piece, stays):
+    # A seat of 100 points and, well apart, a leg of 4, under one mask of both views.
+    seat = np.stack([*np.indices((10, 10)).reshape(2, -1), np.zeros(100)], axis=1)
+    leg = np.array([[40.0, 0, 0], [41, 0, 0], [42, 0, 0], [43, 0, 0]])
+    cloud = PointCloud(np.concatenate([seat, leg]).astype(np.float32), np.zeros((104, 3), np.uint8), 1.0, 1.0)
+    everything = np.arange(104, dtype=np.int32)
+    observations = []
+    for view in range(2):
+        standing = np.where(everything < 100, INSIDE, INSIDE if view < inside_in else BORDER).astype(np.uint8)
+        first = np.array([0, 104], np.int32)
+        observations.append(Observation(f"{view}", everything, np.zeros(1, np.int32), first, everything, standing))
+    found = propagate(cloud, (), tuple(observations), params=PropagateParams(tau_piece=tau_piece))
+    assert found.label[:100].all()
+    assert found.label[100:].all() == found.label[100:].any() == stays
