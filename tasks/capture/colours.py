@@ -24,7 +24,7 @@ from ss_flow.tasks.ranges import Count, Fraction, Positive
 
 _SIDE = 320
 """Photos are compared at this size, pixels of the longer side, so that poses may be off by a pixel or two."""
-_SAME_SURFACE = VisibilityParams(tau_depth=0.02, tau_relative=0.01)
+_SAME_SURFACE = VisibilityParams(tau_depth=0.02, share_of_depth=0.5)
 _MIN_VIEWS = 3
 """Photos that must show a point; two alone cannot tell which one is wrong."""
 _UNCLIPPED = (0.02, 0.98)

@@ -18,12 +18,13 @@ class VisibilityParams:
 
     tau_depth: Positive = 0.02
     """How far a point may lie from the view's depth, in scene units (metres where the scale is known)."""
-    tau_relative: NonNegative = 0.0
-    """The same as a fraction of the depth; the larger of the two counts."""
+    share_of_depth: NonNegative = 0.5
+    """Share of the depth that counts as the scene unit where it is more than one, since sensors and comparisons of
+    photos err by a share of what they measure; 0 in `paper`."""
 
     def tolerance(self, depth: Float32 | Float64, unit: float) -> Float32 | Float64:
         """How far two depths of one surface may differ, world units; unit: length of a scene unit in these."""
-        return np.maximum(self.tau_depth * unit, self.tau_relative * depth)
+        return np.maximum(self.tau_depth * unit, self.tau_depth * self.share_of_depth * depth)
 
 
 def surface_points(

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import box_scene
 import numpy as np
 from hypothesis import given, settings
@@ -49,11 +51,25 @@ def test_unknown_depth_shows_nothing_even_close_to_the_camera():
 def test_the_tolerance_grows_with_the_unit_and_with_depth():
     cameras, depth = one_camera(10.0)
     points = cloud([[0, 0, 10.05]])
-    assert not len(visibility(points, camera_of(cameras, 0), depth, params=VisibilityParams(0.02)).pixel)
-    assert len(visibility(points, camera_of(cameras, 0), depth, params=VisibilityParams(0.02, 0.01)).pixel)
+    assert not len(visibility(points, camera_of(cameras, 0), depth, params=VisibilityParams(0.02, 0)).pixel)
+    assert len(visibility(points, camera_of(cameras, 0), depth, params=VisibilityParams(0.02, 0.5)).pixel)
     assert len(
-        visibility(cloud([[0, 0, 10.05]], unit=3.0), camera_of(cameras, 0), depth, params=VisibilityParams(0.02)).pixel
+        visibility(
+            cloud([[0, 0, 10.05]], unit=3.0), camera_of(cameras, 0), depth, params=VisibilityParams(0.02, 0)
+        ).pixel
     )
+
+
+def test_depth_that_errs_by_a_share_of_itself_is_seen_in_a_hall_as_in_a_room():
+    pixels = np.stack(np.meshgrid([0.5, 1.5, 2.5, 3.5], [0.5, 1.5]), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([(pixels - (2, 1)) / 2, np.ones(8)])
+    for metres in (2.0, 20.0):
+        cameras, depth = one_camera(metres)
+        wrong = replace(depth, depth=depth.depth * np.float32([[1.008, 0.992] * 2] * 2))
+        seen = visibility(cloud(rays * metres), camera_of(cameras, 0), wrong, params=VisibilityParams())
+        assert len(seen.pixel) == 8, metres
+        behind = visibility(cloud(rays * metres * 1.04), camera_of(cameras, 0), wrong, params=VisibilityParams())
+        assert not len(behind.pixel), metres
 
 
 @settings(deadline=None, max_examples=20)
@@ -69,7 +85,7 @@ def test_it_agrees_with_equations_1_and_2_point_by_point(view, seed):
         inside = z > 0 and 0 <= w < camera.width and 0 <= h < camera.height
         if inside and depth.depth[h, w] > 0 and abs(depth.depth[h, w] - z) < 0.02:
             expected.append((i, h * camera.width + w))
-    seen = visibility(points, camera_of(cameras, view), depth, params=VisibilityParams(0.02))
+    seen = visibility(points, camera_of(cameras, view), depth, params=VisibilityParams(0.02, 0))
     assert list(zip(seen.point_index.tolist(), seen.pixel.tolist(), strict=True)) == expected
 
 
@@ -79,7 +95,8 @@ def test_raising_the_threshold_removes_no_point(view, seed, thresholds):
     points = cloud(np.random.default_rng(seed).uniform((-1, -1, -0.1), (1, 1, 0.1), (300, 3)))
     cameras, depth = box_scene.cameras(), box_scene.depths()[view]
     few, many = (
-        visibility(points, camera_of(cameras, view), depth, params=VisibilityParams(tau)) for tau in sorted(thresholds)
+        visibility(points, camera_of(cameras, view), depth, params=VisibilityParams(tau, 0))
+        for tau in sorted(thresholds)
     )
     assert set(zip(few.point_index.tolist(), few.pixel.tolist(), strict=True)) <= set(
         zip(many.point_index.tolist(), many.pixel.tolist(), strict=True)
