@@ -18,7 +18,7 @@ class VisibilityParams:
 
     tau_depth: Positive = 0.02
     """How far a point may lie from the view's depth, in scene units (metres where the scale is known)."""
-    share_of_depth: NonNegative = 0.5
+    share_of_depth: NonNegative = 0.25
     """Share of the depth that counts as the scene unit where it is more than one, since sensors and comparisons of
     photos err by a share of what they measure; 0 in `paper`."""
 

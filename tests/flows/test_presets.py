@@ -56,7 +56,7 @@ TABLE = {
     "split.dense.max_points": (400_000, 400_000, 400_000),
     # 12
     "split.visibility.tau_depth": (0.02, 0.02, 0.02),
-    "split.visibility.share_of_depth": (0.0, 0.0, 0.5),
+    "split.visibility.share_of_depth": (0.0, 0.0, 0.25),
     # 13: 3x3 three times is a radius of 3, 5x5 twice one of 4; no back-off for small masks.
     "split.observe.erosion.radius": (3.0, 3.0, 3.0),
     "split.observe.erosion.radius_large": (4.0, 4.0, 4.0),

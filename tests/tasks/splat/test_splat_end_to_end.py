@@ -274,5 +274,5 @@ def test_an_instance_that_only_excluded_pixels_show_stays_as_its_points_and_is_t
     nothing = encode_png(np.zeros(built.scene.maps[0].ids.shape, np.uint8))
     views = replace(built.views, frames=tuple(replace(frame, valid=nothing) for frame in built.scene.frames))
     with pytest.warns(UserWarning, match="No view shows instance 1"):
-        kept = reconstruct(views, instance, params=replace(TRAIN, max_points=0, tau_agree=0.0))  # adds no points
+        kept = reconstruct(views, instance, params=replace(TRAIN, max_points=0))
     np.testing.assert_array_equal(kept.means, instance.points)

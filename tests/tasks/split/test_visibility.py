@@ -65,7 +65,7 @@ def test_depth_that_errs_by_a_share_of_itself_is_seen_in_a_hall_as_in_a_room():
     rays = np.column_stack([(pixels - (2, 1)) / 2, np.ones(8)])
     for metres in (2.0, 20.0):
         cameras, depth = one_camera(metres)
-        wrong = replace(depth, depth=depth.depth * np.float32([[1.008, 0.992] * 2] * 2))
+        wrong = replace(depth, depth=depth.depth * np.float32([[1.004, 0.996] * 2] * 2))
         seen = visibility(cloud(rays * metres), camera_of(cameras, 0), wrong, params=VisibilityParams())
         assert len(seen.pixel) == 8, metres
         behind = visibility(cloud(rays * metres * 1.04), camera_of(cameras, 0), wrong, params=VisibilityParams())
