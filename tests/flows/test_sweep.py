@@ -165,10 +165,10 @@ def test_the_records_of_a_sweep_leave_those_of_the_scene_alone(warm, tmp_path):
 def test_a_variant_that_fails_is_told_of_and_the_others_are_measured(warm, tmp_path, monkeypatch):
     real = propagate_module._settle
 
-    def fail(given, points, params):
+    def fail(given, points, sightings, params):
         if params.tau_label == 0.9:
             raise ArithmeticError("no label is left")
-        return real(given, points, params)
+        return real(given, points, sightings, params)
 
     monkeypatch.setattr(propagate_module, "_settle", fail)
     called = sweep_tiny(warm, "--set", "tau_label=0.7,0.9", out=tmp_path / "swept")

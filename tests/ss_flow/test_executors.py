@@ -228,14 +228,14 @@ def test_a_call_that_dask_lost_with_its_worker_is_run_by_another(store):
 
     class Killer(Reporter):
         def progressed(self, label, done, total, note):
-            if done or "crawl" not in label:
+            if "located" not in label:
                 return
             begun.append(label)
             if len(begun) == 1:
                 os.kill(int(note), signal.SIGKILL)
 
     def build():
-        return {"total": toy.total(each(toy.source(values=(1.0, 2.0)), build=lambda x: toy.crawl(x, seconds=2.0)))}
+        return {"total": toy.total(each(toy.source(values=(1.0, 2.0)), build=lambda x: toy.located(x, seconds=2.0)))}
 
     with dask_cluster() as cluster:
         report = run_flow(build, store, scene="toy", executor=at(cluster), reporter=Killer())

@@ -177,10 +177,18 @@ def deaf(x: Number, *, pid_file: str) -> Number:
 
 @task()
 def crawl(x: Number, *, seconds: float) -> Number:
-    """Works for so long, and says how far it is, and in which process."""
+    """Works for so long, and says how far it is."""
     for i in range(20):
-        progress(i, 20, str(os.getpid()))
+        progress(i, 20)
         time.sleep(seconds / 20)
+    return x
+
+
+@task()
+def located(x: Number, *, seconds: float) -> Number:
+    """Says in which process it is, and works for so long."""
+    progress(0, 1, str(os.getpid()))
+    time.sleep(seconds)
     return x
 
 
