@@ -163,23 +163,24 @@ class ViewMasks:
     packed: UInt8
     """The masks one after the other, each row-major and filled up to a whole byte (`np.packbits`)."""
 
-    def bits(self) -> list[UInt8]:
-        """Of each mask, [ceil(H * W / 8)]."""
-        ends = np.cumsum(-(-self.sizes.prod(axis=1, dtype=np.int64) // 8))
-        return np.split(self.packed, ends[:-1]) if len(ends) else []
+    def bits(self, row: int) -> UInt8:
+        """[ceil(H * W / 8)] one of the masks."""
+        lengths = -(-self.sizes[: row + 1].prod(axis=1, dtype=np.int64) // 8)
+        end = int(lengths.sum())
+        return self.packed[end - int(lengths[-1]) : end]
+
+    def mask(self, row: int) -> Bool:
+        """One of the masks: [H, W]."""
+        width, height = self.sizes[row].tolist()
+        return np.unpackbits(self.bits(row), count=height * width).reshape(height, width).astype(bool)
 
     def dense(self) -> list[Bool]:
         """The masks, [H, W] each."""
         return [self.mask(row) for row in range(len(self.views))]
 
-    def mask(self, row: int) -> Bool:
-        """One of the masks: [H, W]."""
-        width, height = self.sizes[row].tolist()
-        return np.unpackbits(self.bits()[row], count=height * width).reshape(height, width).astype(bool)
-
     def areas(self) -> Int64:
         """[V] pixels of each mask."""
-        return np.array([np.bitwise_count(mask).sum() for mask in self.bits()], np.int64)
+        return np.array([np.bitwise_count(self.bits(row)).sum() for row in range(len(self.views))], np.int64)
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,6 @@ def refine(
     segmenter = Sam(model) if model else None
     held = {name: row for row, name in enumerate(instance.views)}
     names, shapes, masks, origins = [], [], [], []
-    kept = instance.bits()
     for view, frame in enumerate(views.frames):
         row = held.get(frame.name)
         old = None if row is None else instance.mask(row)
@@ -133,7 +132,7 @@ def refine(
             masks.append(np.packbits(new))
             origins.append(REFINED)
         elif row is not None:
-            masks.append(kept[row])
+            masks.append(instance.bits(row))
             origins.append(int(instance.origin[row]))
         if new is not None or row is not None:
             names.append(frame.name)
