@@ -257,13 +257,8 @@ class Scheduler:
             self._finish(node, action, kind if position == 0 else "hit", why=job.why)
 
     def _finish(self, node: Call, action: Action, kind: str, why: str = "") -> None:
-        known = self._graph.known_calls[node.flow]
         details = {
-            "label": node.label,
-            "step": node.step,
-            "item": node.item,
-            "of": known[node.step],
-            "known": known[""],
+            **self._about(node),
             "key": action.key,
             "outputs": list(action.outputs),
             "seconds": action.seconds,
@@ -287,9 +282,11 @@ class Scheduler:
             self._graph.settle(node, failure)
 
     def _tell(self, kind: str, node: Node, **details: Any) -> None:
+        self._flows[node.flow].reporter.event(kind, **self._about(node), **details)
+
+    def _about(self, node: Node) -> dict[str, Any]:
         known = self._graph.known_calls[node.flow]
-        told = {"label": node.label, "step": node.step, "item": node.item, "of": known[node.step], "known": known[""]}
-        self._flows[node.flow].reporter.event(kind, **told, **details)
+        return {"label": node.label, "step": node.step, "item": node.item, "of": known[node.step], "known": known[""]}
 
 
 def _described(error: BaseException) -> str:

@@ -155,10 +155,9 @@ def looked(shelf: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
             assert page.status == 200
         raise KeyboardInterrupt
 
-    try:
-        from ss_flow.flows.view import server, viewer
-    except ImportError:
-        pytest.skip("needs the extra `view`")
+    pytest.importorskip("viser", reason="needs the extra `view`")
+    from ss_flow.flows.view import server, viewer
+
     started = server.start
     monkeypatch.setattr(server, "start", start)
     monkeypatch.setattr(viewer, "start", start)
