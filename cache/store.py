@@ -50,12 +50,12 @@ from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, writing
 from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder
+from ss_flow.cache.plain_json import from_json
 
 MEMORY_BYTES = 2 << 30
 """How much of what was read lately a process keeps in memory."""
 GRACE_SECONDS = 3600.0
 """What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
-_from_json = json.JSONDecoder().decode  # json.loads without its questions
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ class Store:
         path = f"{self._actions}/{key[:2]}/{key}.json"
         try:
             content, modified = read_stamped(path)
-            action = _action_of(_from_json(content.decode()), key)
+            action = _action_of(from_json(content), key)
         except (FileNotFoundError, ValueError, TypeError, KeyError):  # not there, or not one of ours
             return None
         if not whole:

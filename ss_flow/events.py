@@ -5,15 +5,13 @@ The scheduler speaks to one `Reporter`; the silent one at the root of the hierar
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import IO, Any
 
 from ss_flow.cache.errors import writing
+from ss_flow.cache.plain_json import as_json
 from ss_flow.runs import ENDS
-
-_as_json = json.JSONEncoder(check_circular=False).encode
 
 
 class Reporter:
@@ -71,7 +69,7 @@ class Log(Reporter):
         """The events that say what a node came to, with their times."""
         self._store = store
         self._held_back: list[dict[str, Any]] = []
-        self._stream: IO[str] | None = path.open("a", encoding="utf-8", buffering=1 << 16) if path else None
+        self._stream: IO[bytes] | None = path.open("ab", buffering=1 << 16) if path else None
 
     def event(self, kind: str, **details: Any) -> None:
         told = {"time": round(time.time(), 3), "event": kind, **details}
@@ -85,7 +83,7 @@ class Log(Reporter):
     def pause(self) -> None:
         if self._stream is not None and self._held_back:
             with writing(self._store):
-                self._stream.write("\n".join([*map(_as_json, self._held_back), ""]))
+                self._stream.write(b"\n".join([*map(as_json, self._held_back), b""]))
                 self._stream.flush()
             self._held_back.clear()
 

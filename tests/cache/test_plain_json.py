@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ss_flow.cache.plain_json import as_json, from_json
+
+SCALARS = st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats(allow_nan=False, allow_infinity=False)
+NAMES = st.text(st.characters(codec=None))  # lone surrogates too: names of files that are no text
+DOCUMENTS = st.recursive(SCALARS | NAMES, lambda inner: st.lists(inner) | st.dictionaries(NAMES, inner))
+
+
+@given(DOCUMENTS)
+def test_what_is_written_is_what_the_standard_library_reads(value: object):
+    line = as_json(value)
+    assert b"\n" not in line
+    assert json.loads(line) == value
+    assert from_json(line) == value
+
+
+@given(DOCUMENTS)
+def test_what_the_standard_library_writes_is_read(value: object):
+    assert from_json(json.dumps(value).encode()) == value
+
+
+def test_infinity_is_read():
+    assert from_json(b'{"limit": Infinity, "least": -Infinity}') == {"limit": float("inf"), "least": float("-inf")}
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b'{"a": 1} more', b"\x00" * 100])
+def test_what_is_no_document_is_a_value_error(content: bytes):
+    with pytest.raises(ValueError):
+        from_json(content)
