@@ -16,6 +16,12 @@ def iou(a: Bool, b: Bool) -> float:
     return int(np.count_nonzero(a & b)) / union if union else 0.0
 
 
+def weighted_iou(a: Bool, b: Bool, weight: Float32) -> float:
+    """The same of two sets [P] whose elements weigh differently: [P]."""
+    union = float(weight[a | b].sum(dtype=np.float64))
+    return float(weight[a & b].sum(dtype=np.float64)) / union if union else 0.0
+
+
 def intersections(masks: Bool) -> Float32:
     """Pixels that masks [N, H, W] share, two by two: [N, N], exact below 2^24."""
     flat = masks.reshape(len(masks), masks.shape[1] * masks.shape[2])

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, Visibility
+from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.geometry.zbuffer import paint
-from ss_flow.tasks.masks.overlap import iou
+from ss_flow.tasks.masks.overlap import weighted_iou
+
+_REACH = 5.0
+"""How far a painted pixel stands for those around it, in pixels of an image with a diagonal of 800."""
 
 
 @dataclass(frozen=True)
@@ -19,13 +23,34 @@ class PaintedView:
     """[P] flat indices of the pixels where a point falls, ascending."""
     label: Int32
     """[P] label of the point in front, 0 = unlabelled."""
+    area: Float32
+    """[P] pixels that each stands for."""
+
+    @staticmethod
+    def of(pixel: Int32, label: Int32) -> PaintedView:
+        """Each painted pixel stands for itself."""
+        return PaintedView(pixel, label, np.ones(len(pixel), np.float32))
 
 
 def paint_labels(view: Visibility, label: Int32) -> PaintedView:
-    """Paint the labels [N] of all dense points into a view; nearest depth wins a pixel."""
+    """Paint the labels [N] of all dense points into a view; nearest depth wins a pixel, and stands for itself."""
     image = paint(label[view.point_index] + 1, view.pixel, view.depth, view.height * view.width)
     pixel = np.flatnonzero(image).astype(np.int32)
-    return PaintedView(pixel, image[pixel] - 1)
+    return PaintedView.of(pixel, image[pixel] - 1)
+
+
+def by_area(painted: PaintedView, height: int, width: int) -> PaintedView:
+    """The same, where each painted pixel stands for all those that it is the nearest to, as far as `_REACH`.
+
+    Points lie evenly in the world, not in a view: a wall far behind a table has more of them on fewer pixels.
+    """
+    if not len(painted.pixel):
+        return painted
+    number = np.arange(1, len(painted.pixel) + 1, dtype=np.int32)
+    reach = at_diagonal(_REACH, height, width)
+    nearest = nearest_labels(replace(painted, label=number), height, width, reach)
+    area = np.bincount(nearest.ravel(), minlength=len(number) + 1)[1:]
+    return replace(painted, area=area.astype(np.float32))
 
 
 def labels_in_front(painted: PaintedView, min_points: int) -> list[int]:
@@ -56,8 +81,8 @@ def nearest_labels(painted: PaintedView, height: int, width: int, reach: float) 
 
 
 def agreement(painted: PaintedView, mask: Bool, label: int) -> float:
-    """IoU of a mask [H, W] with the points of a label, on the pixels where points fall."""
-    return iou(mask.ravel()[painted.pixel], painted.label == label)
+    """IoU of a mask [H, W] with the points of a label, on the pixels where points fall, each by its area."""
+    return weighted_iou(mask.ravel()[painted.pixel], painted.label == label, painted.area)
 
 
 def stack_exclusive(shown: dict[int, Bool], height: int, width: int) -> Int32:

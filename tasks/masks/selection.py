@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, MaskSet
+from ss_flow.tasks.artifacts import Bool, Int32, MaskSet, Visibility
 from ss_flow.tasks.masks.erosion import ErosionParams, interiors
-from ss_flow.tasks.masks.overlap import iou
-from ss_flow.tasks.masks.painting import PaintedView
+from ss_flow.tasks.masks.overlap import weighted_iou
+from ss_flow.tasks.masks.painting import PaintedView, by_area, paint_labels
 from ss_flow.tasks.masks.pool import canonical_order
 from ss_flow.tasks.ranges import Fraction
 
@@ -31,6 +31,13 @@ class SelectionParams:
     """How much a point without a label counts against a mask that holds it (only with "best")."""
     erosion: ErosionParams = field(default_factory=ErosionParams)
     """How far a mask's border is taken off before its majority is counted (only with "all")."""
+
+
+def paint_for_selection(view: Visibility, label: Int32, params: SelectionParams) -> PaintedView:
+    """The labels [N] of all dense points as masks are picked by: by the area that they cover, or, with "all", by their
+    number."""
+    painted = paint_labels(view, label)
+    return painted if params.masks == "all" else by_area(painted, view.height, view.width)
 
 
 def select_masks(painted: PaintedView, pool: MaskSet, params: SelectionParams) -> dict[int, Bool]:
@@ -67,8 +74,8 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     dense = dense[order]
     names, index = np.unique(painted.label, return_inverse=True)
     flat = dense.reshape(len(dense), -1)[:, painted.pixel]
-    count = np.stack([np.bincount(index[mask], minlength=len(names)) for mask in flat])
-    total = np.bincount(index, minlength=len(names))
+    count = np.stack([np.bincount(index[mask], painted.area[mask], len(names)) for mask in flat])
+    total = np.bincount(index, painted.area, len(names))
     area = count @ np.where(names == 0, params.unlabelled, 1.0)
     fits = count / np.maximum(area[:, None] + total - count, 1)
     fits[:, names == 0] = 0
@@ -93,7 +100,8 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
             added = dense[row] & ~shown[label]
             backed = (mine & both & ~chosen[column]).sum() / max(1, added.sum())
             dense_enough = backed >= _BACKED * (mine & chosen[column]).sum() / shown[label].sum()
-            if dense_enough and iou(both, mine) > iou(chosen[column], mine):
+            before, after = (weighted_iou(one, mine, painted.area) for one in (chosen[column], both))
+            if dense_enough and after > before:
                 free[row] = False
                 chosen[column] = both
                 shown[label] = shown[label] | dense[row]

@@ -108,7 +108,7 @@ def part_masks(
             origin.append(row)
             continue
         among = of_most & inside & np.isin(new.label, shown)
-        nearest = nearest_labels(PaintedView(old.pixel[among], new.label[among]), masks.height, masks.width, np.inf)
+        nearest = nearest_labels(PaintedView.of(old.pixel[among], new.label[among]), masks.height, masks.width, np.inf)
         parts += [mask & (nearest == thing) for thing in shown]
         origin += [row] * len(shown)
     if len(parts) == len(dense):

@@ -30,11 +30,10 @@ from ss_flow.tasks.masks.painting import (
     contradicted,
     labels_in_front,
     nearest_painted,
-    paint_labels,
     stack_exclusive,
 )
 from ss_flow.tasks.masks.pool import smoothed
-from ss_flow.tasks.masks.selection import SelectionParams, select_masks
+from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
 from ss_flow.tasks.ranges import Count, NonNegative
 
 _DENSE = 2.5
@@ -84,7 +83,7 @@ def reproject(
     views: list[dict[int, tuple[np.ndarray, int]]] = []
     for k, (view, pool) in enumerate(zip(visibility, masks, strict=True)):
         progress(k, len(masks), view.name)
-        painted = paint_labels(view, labels.label)
+        painted = paint_for_selection(view, labels.label, params.selection)
         shown = select_masks(painted, pool, params.selection)
         origin = dict.fromkeys(shown, FOUND)
         if view.name in by_name:

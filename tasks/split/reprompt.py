@@ -11,9 +11,9 @@ from ss_flow.tasks.artifacts import Float64, Int32, MaskSet, PointLabels, Prompt
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.masks.packing import pack_masks
-from ss_flow.tasks.masks.painting import PaintedView, agreement, labels_in_front, paint_labels
+from ss_flow.tasks.masks.painting import PaintedView, agreement, labels_in_front
 from ss_flow.tasks.masks.pool import without_speckles
-from ss_flow.tasks.masks.selection import SelectionParams, select_masks
+from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Sam
@@ -56,7 +56,7 @@ def reprompt(
     the re-projection. Each such label gets one mask, prompted at points spread over it. Whether the mask agrees with
     the label is for `split.reproject` to judge. Raises InputError when the model cannot be opened.
     """
-    painted = paint_labels(visibility, labels.label)
+    painted = paint_for_selection(visibility, labels.label, selection)
     shown = select_masks(painted, masks, selection)
     good = {label for label, mask in shown.items() if agreement(painted, mask, label) >= params.min_agreement}
     return prompt(photo, spread_prompts(painted, photo.frame.width, good, params), model, params.speckle)

@@ -166,7 +166,7 @@ def test_a_view_that_sees_too_few_points_of_an_object_has_no_mask_of_it():
 
 
 def test_an_answer_fits_that_holds_most_of_its_label_and_little_of_others():
-    painted = PaintedView(np.arange(8, dtype=np.int32), np.array([1, 1, 1, 1, 2, 2, 2, 0], np.int32))
+    painted = PaintedView.of(np.arange(8, dtype=np.int32), np.array([1, 1, 1, 1, 2, 2, 2, 0], np.int32))
 
     def fits(*pixels: int) -> bool:
         return hints._fits(painted, np.isin(np.arange(8), pixels)[None], 1)

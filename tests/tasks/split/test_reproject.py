@@ -19,9 +19,9 @@ from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.packing import pack_masks
-from ss_flow.tasks.masks.painting import PaintedView, nearest_labels, paint_labels, stack_exclusive
+from ss_flow.tasks.masks.painting import PaintedView, by_area, nearest_labels, paint_labels, stack_exclusive
 from ss_flow.tasks.masks.pool import smoothed
-from ss_flow.tasks.masks.selection import SelectionParams, select_masks
+from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
@@ -65,6 +65,16 @@ def halves(left=1, right=2):
     return image
 
 
+def wall_behind_a_table():
+    """A view of 300 x 400 pixels whose upper third has a point (label 1) a pixel, the rest one (label 2) of 25."""
+    image = np.zeros((300, 400), np.int32)
+    image[2::5, 2::5] = 2
+    image[:100] = 1
+    pixel = np.flatnonzero(image).astype(np.int32)
+    points = np.arange(len(pixel), dtype=np.int32)
+    return Visibility("a", points, pixel, np.ones(len(pixel), np.float32), 300, 400), image.ravel()[pixel]
+
+
 def run(masks, image, params=None, prompted=()):
     cloud, labels = labelled(image)
     found = reproject(
@@ -78,6 +88,27 @@ def test_each_label_takes_the_mask_that_agrees_best():
     found = run([columns(0, 4), columns(0, 5), columns(5, 10)], halves())
     assert (found[1].dense()[0] == columns(0, 5)).all()
     assert (found[2].dense()[0] == columns(5, 10)).all()
+
+
+def test_points_count_by_the_area_that_they_cover():
+    seen, label = wall_behind_a_table()
+    painted = by_area(paint_labels(seen, label), 300, 400)
+    assert painted.area[label == 1].sum() == pytest.approx(100 * 400, rel=0.05)
+    assert painted.area[label == 2].sum() == pytest.approx(200 * 400, rel=0.05)
+
+
+def test_a_mask_of_both_shows_the_table_that_fills_it_not_the_wall_that_has_more_points():
+    seen, label = wall_behind_a_table()
+    pool = mask_set(np.ones((1, 300, 400), bool))
+    by_number = select_masks(paint_labels(seen, label), pool, SelectionParams())
+    params = SelectionParams()
+    assert list(by_number) == [1]
+    assert list(select_masks(paint_for_selection(seen, label, params), pool, params)) == [2]
+
+
+def test_a_point_stands_for_no_more_than_what_is_near_it():
+    alone = PaintedView.of(np.array([150 * 400 + 200], np.int32), np.array([1], np.int32))
+    assert 0 < by_area(alone, 300, 400).area[0] < 0.01 * 300 * 400
 
 
 def test_two_masks_of_an_object_cut_in_two_are_united():
@@ -232,7 +263,7 @@ def test_a_label_without_a_mask_is_drawn_from_its_points():
 
 
 def test_a_drawn_mask_reaches_a_little_round_its_points():
-    painted = PaintedView(np.array([0, 5, 33], np.int32), np.array([4, 0, 7], np.int32))
+    painted = PaintedView.of(np.array([0, 5, 33], np.int32), np.array([4, 0, 7], np.int32))
     near = nearest_labels(painted, H, W, 1.5)
     assert near[0, :2].tolist() == [4, 4] and near[1, 0] == 4
     assert near[3, 2:5].tolist() == [7, 7, 7] and near[2, 3] == 7
