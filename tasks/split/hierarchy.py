@@ -18,6 +18,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Hierarchy, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.mounds import Mounds, find_mounds
+from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 
 _IOU = (0.5, 0.8)
@@ -55,6 +56,9 @@ class HierarchyParams:
     """Share of its border with other labels along which a piece is surrounded by what it stands on."""
     bulge: Fraction = 0.09
     """How far it must rise from there, as a share of its extent: a bag on a sofa is no part of the sofa."""
+    flush: Fraction = 0.6
+    """Share of its border along which a flat piece goes on without an edge into something larger: a mug on a page that
+    lies on a table is no part of the page. 1 = none does."""
     stuff: StuffParams = field(default_factory=StuffParams)
     """What is a wall or a floor rather than a thing."""
 
@@ -77,7 +81,8 @@ def hierarchy(
     names = np.unique(labels.label[labels.label > 0]).astype(np.int32)
     is_stuff = find_stuff(points, cameras, labels, params.stuff)
     mounds = find_mounds(points, cameras, labels, tallies, around=params.around, height=params.bulge)
-    pieces = _Pieces.of(names, tallies, is_stuff, mounds, params)
+    sheets = find_sheets(points, labels, flush=params.flush, height=params.bulge)
+    pieces = _Pieces.of(names, tallies, is_stuff, mounds, sheets, params)
     node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
     top = list(range(len(names)))  # the tree's row of each piece
     while True:
@@ -130,10 +135,13 @@ class _Pieces:
     labels: list[tuple[int, ...]]
     """G x the labels (rows) that each is made of."""
     mounds: Mounds
+    sheets: Sheets
     params: HierarchyParams
 
     @staticmethod
-    def of(names: Int32, tallies: Sequence[Tally], stuff: Bool, mounds: Mounds, params: HierarchyParams) -> _Pieces:
+    def of(
+        names: Int32, tallies: Sequence[Tally], stuff: Bool, mounds: Mounds, sheets: Sheets, params: HierarchyParams
+    ) -> _Pieces:
         """Each label on its own."""
         seen, held, quality = [], [], []
         for tally in {_content(tally): tally for tally in tallies}.values():  # a second copy of a view says nothing
@@ -143,7 +151,7 @@ class _Pieces:
             held.append(np.zeros((len(tally.held), len(names)), np.float32))
             held[-1][:, column] = tally.held
             quality.append(tally.quality.astype(np.float64))
-        return _Pieces(seen, held, quality, stuff, [(row,) for row in range(len(names))], mounds, params)
+        return _Pieces(seen, held, quality, stuff, [(row,) for row in range(len(names))], mounds, sheets, params)
 
     @functools.cached_property
     def views(self) -> list[_View]:
@@ -212,7 +220,9 @@ class _Pieces:
         """Which of these pieces stand on the others."""
         labels = [row for piece in members for row in self.labels[piece]]
         on_top = dict(zip(labels, self.mounds.standing(labels).tolist(), strict=True))
-        return {piece for piece in members if all(on_top[row] for row in self.labels[piece])}
+        on_sheet = self.sheets.standing([self.labels[piece] for piece in members])
+        risen = zip(members, on_sheet.tolist(), strict=True)
+        return {piece for piece, rises in risen if rises or all(on_top[row] for row in self.labels[piece])}
 
     def _agreement(self, sets: list[tuple[int, ...]]) -> Float64:
         """[S] share of the views that show each set of pieces as one, of those that see at least two of them: the mean

@@ -80,7 +80,7 @@ def find_mounds(
 
 def _ends(label: Int32, names: Int32, points: PointCloud) -> Bool:
     """[L] which labels do not go on smoothly into others along half of their border."""
-    at_border, _, touches = borders(label, points, TouchingParams())
+    at_border, _, _, touches = borders(label, points, TouchingParams())
     smooth = np.zeros(len(at_border), bool)
     smooth[touches[0][touches[1] > 0]] = True
     of = np.searchsorted(names, label[at_border])

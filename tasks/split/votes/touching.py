@@ -65,7 +65,7 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
     order = np.argsort(first)
     names = names[order]
     label = np.argsort(order).astype(np.int32)[inverse[1:]]
-    rows, beside, touches = borders(label, cloud, params)
+    rows, beside, _, touches = borders(label, cloud, params)
     bins = _bins(cloud.colors)
     colors: dict[int, Float32] = {}
     united = np.arange(len(names), dtype=np.int32)
@@ -88,11 +88,11 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
             return lowest[united][label]
 
 
-def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> tuple[Int32, Int32, Int32]:
+def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> tuple[Int32, Int32, Int32, Int32]:
     """Where labels end, and where they go on into another.
 
     label: [N], 0 = none. Returns the labelled points that have some of another label, or of none, beside them [R]; the
-    points beside each [R, _BESIDE]; and touches [2, T], which of the R touches which label without an edge.
+    points beside each [R, _BESIDE]; which of the R touches which other label [2, T]; and which does so without an edge.
     """
     from scipy.spatial import cKDTree
 
@@ -117,8 +117,9 @@ def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> tuple[In
     for end in (i, j):
         even &= np.abs(np.einsum("tc,tc->t", normal[end], ahead)) <= np.sin(np.radians(params.angle))
     names = int(label.max()) + 1
-    touches = np.unique(i[even] * names + label[rows[j[even]]])
-    return rows, beside, np.stack(np.divmod(touches, names)).astype(np.int32)
+    touches = i * names + label[rows[j]]
+    some, smooth = (np.stack(np.divmod(np.unique(of), names)).astype(np.int32) for of in (touches, touches[even]))
+    return rows, beside, some, smooth
 
 
 def _nearest(tree: cKDTree, rows: Int32, count: int, reach: float) -> Int32:

@@ -1,0 +1,106 @@
+"""What lies flat in the surface of something larger, as a page on a table does: what rises from it is no part of it.
+
+A mug on a page is in nearly every mask of the page. But the page goes on into the table without an edge, and the mug
+does not. Beyond Split&Splat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ss_flow.tasks.artifacts import Bool, Float64, PointCloud, PointLabels
+from ss_flow.tasks.geometry.clustering import rows_by_label
+from ss_flow.tasks.geometry.shape import box_diagonal, plane_through, thinned
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
+
+_FEW = 20
+"""Points at its border with which the share of it that goes on counts half: of so short a border little is known."""
+_FLAT = 0.9
+"""Share of its points that must lie on one plane."""
+_THICKNESS = 2.0
+"""Distance from the plane up to which they do, in multiples of the cloud's spacing."""
+_RISES = 3.0
+"""Distance, in the same, that what stands on a sheet rises from it at least."""
+_TRIM = 0.02
+"""Share of the points, on every side, that an extent leaves out."""
+_MOST = 2000
+"""So many points of a piece tell."""
+
+
+@dataclass(frozen=True)
+class Sheets:
+    """How labels go on into each other; L labels, those that occur, ascending."""
+
+    smooth: Float64
+    """[L, L] points at the border of each that touch each other one without an edge."""
+    meets: Float64
+    """[L, L] points at the border of each that touch each other one at all."""
+    border: Float64
+    """[L] points that touch any other."""
+    rows: list[NDArray[np.intp]]
+    """L x the points of each."""
+    points: PointCloud
+    flush: float
+    """Least share of its border, less the share that goes on into the set, along which a sheet goes on into larger
+    labels outside of the set."""
+    height: float
+    """How far something must rise from the sheet to stand on it, as a share of its extent."""
+
+    def standing(self, pieces: Sequence[tuple[int, ...]]) -> Bool:
+        """Which pieces, each some labels (rows), rise from another one that is a sheet in something larger: [P]."""
+        stands = np.zeros(len(pieces), bool)
+        for sheet in np.flatnonzero(self._outwards(pieces) > self.flush):
+            own = self._places(pieces[sheet])
+            centre, normal = _plane(own)
+            reach = self.points.spacing
+            if (np.abs((own - centre) @ normal) <= _THICKNESS * reach).mean() < _FLAT:
+                continue
+            for i in np.flatnonzero(np.arange(len(pieces)) != sheet):
+                other = self._places(pieces[i])
+                rises = np.quantile(np.abs((other - centre) @ normal), 0.9)
+                stands[i] |= bool(rises >= max(self.height * box_diagonal(other, _TRIM), _RISES * reach))
+        return stands
+
+    def _outwards(self, pieces: Sequence[tuple[int, ...]]) -> Float64:
+        """[P] share of the border of each piece that goes on into larger labels of none of the pieces, less the share
+        that goes on into the other pieces."""
+        member = np.zeros((len(pieces), len(self.border)))
+        for row, labels in enumerate(pieces):
+            member[row, list(labels)] = 1
+        size = np.array([len(rows) for rows in self.rows], np.float64)
+        within = ((member @ self.meets) * member).sum(axis=1)  # between the labels of a piece is no border
+        border = np.maximum(member @ self.border - within, 1)
+        goes_on, any_piece = member @ self.smooth, member.sum(axis=0)
+        larger = size >= (member @ size)[:, None]
+        inside = np.minimum((goes_on * (any_piece - member)).sum(axis=1) / border, 1)
+        outside = np.minimum((goes_on * (1 - any_piece) * larger).sum(axis=1) / border, 1)
+        return (outside - inside) * border / (border + _FEW)
+
+    def _places(self, labels: tuple[int, ...]) -> Float64:
+        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])], _MOST)
+
+
+def find_sheets(points: PointCloud, labels: PointLabels, *, flush: float, height: float) -> Sheets:
+    """How the labels of `points` go on into each other; flush, height: see `Sheets`."""
+    names = np.unique(labels.label[labels.label > 0])
+    if not len(names):
+        return Sheets(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), [], points, flush, height)
+    at_border, _, touches, smooth = borders(labels.label, points, TouchingParams())
+    own = np.searchsorted(names, labels.label[at_border])
+    between = [np.zeros((len(names), len(names))) for _ in range(2)]
+    for count, (point, other) in zip(between, (smooth, touches), strict=True):
+        np.add.at(count, (own[point], np.searchsorted(names, other)), 1)
+    border = np.bincount(own[np.unique(touches[0])], minlength=len(names)).astype(np.float64)
+    rows_of = rows_by_label(labels.label)
+    return Sheets(*between, border, [rows_of[name] for name in names.tolist()], points, flush, height)
+
+
+def _plane(places: Float64) -> tuple[Float64, Float64]:
+    """The plane through some points [N, 3], without the tenth that is farthest from it."""
+    centre, normal = plane_through(places)
+    distance = np.abs((places - centre) @ normal)
+    return plane_through(places[distance <= np.quantile(distance, 0.9)])

@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+
+from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
+from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+from ss_flow.tasks.split.sheets import Sheets, find_sheets
+
+STEP = 0.01
+TABLE, PAGE, MUG = 0, 1, 2
+
+
+def lying(width: float, depth: float, height: float = 0.0) -> np.ndarray:
+    """[N, 3] points of a rectangle about the z axis."""
+    x, y = np.meshgrid(np.arange(-width / 2, width / 2, STEP), np.arange(-depth / 2, depth / 2, STEP))
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+
+
+def within(places: np.ndarray, half: float) -> np.ndarray:
+    return (np.abs(places[:, :2]) < half - 1e-6).all(axis=1)
+
+
+def block(height: float) -> np.ndarray:
+    """[N, 3] the top and the sides of a block of 8 cm x 8 cm about the z axis."""
+    top = lying(0.08, 0.08, height)
+    rim = top[(np.abs(top[:, :2]) > 0.033).any(axis=1)]
+    sides = [rim * (1, 1, 0) + (0, 0, z) for z in np.arange(STEP, height, STEP)]
+    return np.concatenate([top, *sides])
+
+
+def scene(page: float = 0.0, mug: float = 0.1, table: float = 0.8) -> tuple[PointCloud, PointLabels]:
+    """A table (label 1) so wide, on it a page (2) so thick, and on this a mug (3) so high; metres."""
+    top = lying(table, table)
+    sheet = lying(0.24, 0.24, page)
+    pieces = [top[~within(top, 0.12)], sheet[~within(sheet, 0.04)], block(mug) + np.array([0, 0, page])]
+    places = np.concatenate(pieces).astype(np.float32)
+    label = np.repeat(np.arange(1, 4, dtype=np.int32), [len(piece) for piece in pieces])
+    nothing = np.zeros(0, np.int32)
+    labels = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing, np.zeros(0))
+    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, STEP)
+    return cloud, labels
+
+
+def on_table(flush: float = 0.6, **sizes: float) -> Sheets:
+    return find_sheets(*scene(**sizes), flush=flush, height=0.09)
+
+
+def test_a_mug_stands_on_the_page_that_lies_on_a_table():
+    assert on_table().standing([(PAGE,), (MUG,)]).tolist() == [False, True]
+
+
+def test_within_a_set_that_holds_the_table_the_page_is_no_sheet():
+    assert not on_table().standing([(TABLE,), (PAGE,), (MUG,)]).any()
+    assert not on_table().standing([(TABLE,), (PAGE, MUG)]).any()
+
+
+@pytest.mark.parametrize(("thickness", "stands"), [(0.0, True), (0.06, False)])
+def test_what_has_an_edge_all_round_is_no_sheet(thickness, stands):
+    assert on_table(page=thickness).standing([(PAGE,), (MUG,)]).any() == stands
+
+
+def test_what_lies_in_the_page_does_not_stand_on_it():
+    assert not on_table(mug=0.01).standing([(PAGE,), (MUG,)]).any()
+
+
+def test_a_page_lies_in_nothing_smaller():
+    assert not on_table(table=0.26).standing([(PAGE,), (MUG,)]).any()
+
+
+def test_a_threshold_of_one_finds_no_sheets():
+    assert not on_table(flush=1.0).standing([(PAGE,), (MUG,)]).any()
+
+
+def test_the_order_of_the_pieces_does_not_matter():
+    assert on_table().standing([(MUG,), (PAGE,)]).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(("flush", "agreement"), [(0.6, 0.5), (1.0, 1.0)])
+def test_views_that_show_page_and_mug_as_one_show_a_group(flush, agreement):
+    cloud, labels = scene()
+    pose = np.diag([1.0, -1, -1, 1])
+    pose[:3, 3] = (0, 0, 2)
+    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
+    seen = np.bincount(labels.label)[1:].astype(np.int32)
+    both = np.array([[0, seen[1], seen[2]]], np.int32)
+    view = Tally("a", np.arange(1, 4, dtype=np.int32), seen, both, np.zeros((3, 3), np.int32), np.ones(1, np.float32))
+    tree = hierarchy(cloud, cameras, labels, [view], params=HierarchyParams(prior=0.0, flush=flush))
+    assert tree.parent.tolist() == [0, 4, 4, 0]
+    assert tree.agreement[3] == pytest.approx(agreement)
