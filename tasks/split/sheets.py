@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Float64, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import Bool, Float64, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, plane_through, thinned
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
@@ -91,12 +91,23 @@ def find_sheets(points: PointCloud, labels: PointLabels, *, flush: float, height
         return Sheets(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), [], points, flush, height)
     at_border, _, touches, smooth = borders(labels.label, points, TouchingParams())
     own = np.searchsorted(names, labels.label[at_border])
-    between = [np.zeros((len(names), len(names))) for _ in range(2)]
-    for count, (point, other) in zip(between, (smooth, touches), strict=True):
-        np.add.at(count, (own[point], np.searchsorted(names, other)), 1)
-    border = np.bincount(own[np.unique(touches[0])], minlength=len(names)).astype(np.float64)
     rows_of = rows_by_label(labels.label)
-    return Sheets(*between, border, [rows_of[name] for name in names.tolist()], points, flush, height)
+    return Sheets(
+        smooth=_counts(own, names, smooth),
+        meets=_counts(own, names, touches),
+        border=np.bincount(own[np.unique(touches[0])], minlength=len(names)).astype(np.float64),
+        rows=[rows_of[name] for name in names.tolist()],
+        points=points,
+        flush=flush,
+        height=height,
+    )
+
+
+def _counts(own: NDArray[np.intp], names: Int32, touches: Int32) -> Float64:
+    """[L, L] how many points of each label touch each label. own: [R] label (row) of each point. touches: [2, T] which
+    of the points touches which label."""
+    pair = own[touches[0]] * len(names) + np.searchsorted(names, touches[1])
+    return np.bincount(pair, minlength=len(names) ** 2).reshape(len(names), -1).astype(np.float64)
 
 
 def _plane(places: Float64) -> tuple[Float64, Float64]:
