@@ -53,13 +53,13 @@ class Sheets:
     def standing(self, pieces: Sequence[tuple[int, ...]]) -> Bool:
         """Which pieces, each some labels (rows), rise from another one that is a sheet in something larger: [P]."""
         stands = np.zeros(len(pieces), bool)
-        for sheet in np.flatnonzero(self._outwards(pieces) > self.flush):
+        for sheet in np.flatnonzero(self._outwards(pieces) > self.flush).tolist():
             own = self._places(pieces[sheet])
             centre, normal = _plane(own)
             reach = self.points.spacing
             if (np.abs((own - centre) @ normal) <= _THICKNESS * reach).mean() < _FLAT:
                 continue
-            for i in np.flatnonzero(np.arange(len(pieces)) != sheet):
+            for i in set(range(len(pieces))) - {sheet}:
                 other = self._places(pieces[i])
                 rises = np.quantile(np.abs((other - centre) @ normal), 0.9)
                 stands[i] |= bool(rises >= max(self.height * box_diagonal(other, _TRIM), _RISES * reach))
