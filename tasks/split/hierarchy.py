@@ -16,8 +16,10 @@ import numpy as np
 
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Hierarchy, Int32, PointCloud, PointLabels, Tally
+from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.mounds import Mounds, find_mounds
+from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 
@@ -61,6 +63,8 @@ class HierarchyParams:
     lies on a table is no part of the page. 1 = none does."""
     stuff: StuffParams = field(default_factory=StuffParams)
     """What is a wall or a floor rather than a thing."""
+    shadows: ShadowParams = field(default_factory=ShadowParams)
+    """What is one surface in light and shadow, whatever the masks say."""
 
 
 @task(name="split.hierarchy")
@@ -74,21 +78,22 @@ def hierarchy(
 ) -> Hierarchy:
     """The tree of what the labels make up.
 
-    labels: of `points`. tallies: one a view, of these labels. Round by round the sets of pieces with the highest
-    agreement are united, each piece once a round, until none reaches `min_agreement`; a thing and stuff never are. The
-    order of the views does not matter, nor that of the masks.
+    labels: of `points`. tallies: one a view, of these labels. What light alone parts is united first. Then, round by
+    round, the sets of pieces with the highest agreement are, each piece once a round, until none reaches
+    `min_agreement`; a thing and stuff never are. The order of the views does not matter, nor that of the masks.
     """
     names = np.unique(labels.label[labels.label > 0]).astype(np.int32)
-    is_stuff = find_stuff(points, cameras, labels, params.stuff)
+    surface = lit_surfaces(points, cameras, labels.label, params.shadows)
+    _, surface_of = np.unique(surface[names], return_inverse=True)
+    is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, around=params.around, height=params.bulge)
     sheets = find_sheets(points, labels, flush=params.flush, height=params.bulge)
     pieces = _Pieces.of(names, tallies, is_stuff, mounds, sheets, params)
     node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
     top = list(range(len(names)))  # the tree's row of each piece
-    while True:
-        united = pieces.best_unions()
-        if not united:
-            break
+    lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
+    united = [(members, params.shadows.agreement) for members in lit] or pieces.best_unions()
+    while united:
         for members, share in united:
             row = len(node)
             node.append(labels.num_labels + 1 + row - len(names))
@@ -101,6 +106,7 @@ def hierarchy(
         left = sorted(set(range(len(top))) - {piece for members, _ in united for piece in members})
         pieces = pieces.united([members for members, _ in united])
         top = [top[piece] for piece in left]
+        united = pieces.best_unions()
     return Hierarchy(
         np.array(node, np.int32), np.array(parent, np.int32), np.array(agreement, np.float32), np.array(stuff, bool)
     )

@@ -1,0 +1,235 @@
+"""Which labels are one surface, part of it in the light and part in a shadow. Beyond Split&Splat.
+
+A segmenter cuts at a hard shadow as at the edge of a print. One lamp lights the whole scene, though: of each colour of
+light, a shadow leaves a share that depends on how a surface is turned towards lamp and sky, and not on its own colour
+(Lambert). So a step that parallel surfaces of different colours show alike is a shadow's; paint would have to be
+darker by the same factor on both. Where no step repeats so, nothing is presumed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, UInt8
+from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
+from ss_flow.tasks.ranges import Count, Fraction
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
+
+_GAMMA = 2.2
+_DARKEST = 4
+"""8-bit step below which a colour is noise."""
+_NEAR = 40
+"""Nearest points that tell the colours on both sides of a border."""
+_DEPTH = (0.3, 1.6)
+"""By how much a shadow darkens at least and at most: the mean of the natural logarithms of R, G and B, linear light."""
+_TINT = 0.35
+"""Difference between these logarithms, as a share of their mean, up to which a step may be a shadow's."""
+_UNEVEN = 0.25
+"""Median deviation along a border, in each logarithm, up to which it is one step."""
+_SAME = 0.12
+"""Difference between two steps, in each logarithm, up to which they are the same."""
+_OTHER = 0.3
+"""Difference between two lit colours, in one logarithm, from which on their surfaces are of different colours."""
+_PARALLEL = 0.95
+"""Cosine of the normals of surfaces on which a shadow makes the same step."""
+_REST = 0.15
+"""By how much a change of colour may differ, in each logarithm, from a share of a shadow's step."""
+_SHARE = (-0.2, 1.25)
+"""Least and greatest such share: where labels do not end at the shadow itself, the change is less than the step."""
+_ACROSS = 2
+"""How many points beside one carry another label where its own label ends, as in `votes.touching`."""
+_TRIM = 0.02
+"""Share of the points, on every side, that an extent leaves out."""
+_MOST = 2000
+"""So many points of a label tell its plane."""
+_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class ShadowParams:
+    """When two labels are one surface across the border of a shadow."""
+
+    agreement: Fraction = 0.6
+    """What this counts as beside the agreement of views (see `split.granularity`); 0 = shadows are not looked for."""
+    alike: Fraction = 0.75
+    """Share of their common border at which the colour stays, or changes as into a shadow."""
+    contact: Fraction = 0.03
+    """Share of the border of one of them along which they touch without an edge: not much of a table's top is left
+    between the things that stand on it."""
+    flat: Fraction = 0.6
+    """Share of the points of each that must lie on one plane."""
+    thickness: Fraction = 0.01
+    """Distance from the plane up to which they do, as a share of the extent of the larger one."""
+    min_points: Count = 10
+    """Points on both sides at which two labels must touch."""
+
+
+@dataclass(frozen=True)
+class _Step:
+    """How the colour changes where two labels touch."""
+
+    change: Float64
+    """[3] from the lit side to the dark one: natural logarithms of R, G and B, linear light."""
+    lit: Float64
+    """[3] the lit side's colour, in the same."""
+    normal: Float64
+    """[3] of the surface there, towards the cameras."""
+
+    def repeats(self, other: _Step) -> bool:
+        """Whether parallel surfaces of different colours show the same step."""
+        same = (np.abs(self.change - other.change) <= _SAME).all()
+        different = (np.abs(self.lit - other.lit) >= _OTHER).any()
+        return bool(same and different and self.normal @ other.normal >= _PARALLEL)
+
+
+@dataclass(frozen=True)
+class _Touches:
+    """Where labels touch without an edge, and whether light alone tells them apart there."""
+
+    rows: Int32
+    """[R] points at the border of their label."""
+    beside: Int32
+    """[R, B] the points beside each."""
+    point: Int32
+    """[T] which of the R touches another label."""
+    touched: Int32
+    """[T] that label."""
+    alike: Bool
+    """[T] whether the colour stays there, or changes as into a shadow."""
+
+
+def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, params: ShadowParams) -> Int32:
+    """[L + 1] the lowest label of the surface that each label is a piece of; itself where no shadow parts it.
+
+    label: [N] of the cloud's points, 0 = none. Round by round, the labels are united that lie in one plane and touch
+    without an edge where light alone tells them apart: those that do so along the largest share of a border first, each
+    once a round.
+    """
+    surface = np.arange(int(label.max(initial=0)) + 1, dtype=np.int32)
+    if not params.agreement or not label.any():
+        return surface
+    touches = _touches(cloud, cameras, label, params)
+    while touches.alike.any():
+        taken: set[int] = set()
+        for a, b in _meeting(touches, surface, label, params):
+            if taken & {a, b}:
+                continue
+            of = surface[label]
+            if _in_one_plane(cloud.points[of == a], cloud.points[of == b], params):
+                taken |= {a, b}
+                surface[surface == b] = a
+        if not taken:
+            break
+    return surface
+
+
+def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, params: ShadowParams) -> _Touches:
+    """Compare the colours on both sides of all borders, learn which steps are a shadow's, and look for these."""
+    rows, beside, (point, touched) = borders(label, cloud, TouchingParams())
+    change, color, near = _across(cloud, label, rows[point], touched)
+    own, eye = label[rows[point]], middle_of(cameras)
+    low, high = np.minimum(own, touched), np.maximum(own, touched)
+    change[own == high] *= -1  # from the lower label to the higher one
+    order = np.lexsort((high, low))
+    ends = np.flatnonzero(np.diff(low[order]) | np.diff(high[order])) + 1
+    contacts = np.split(order, ends) if len(order) else []
+    normals: list[Float64] = []
+    steps: list[_Step] = []
+    for here in contacts:
+        around = np.unique(near[here])
+        centre, normal = plane_through(cloud.points[around[around >= 0]].astype(np.float64))
+        normals.append(towards(normal, centre, eye))
+        step = _step(change[here], color[here], (own == low)[here], normals[-1])
+        if step is not None and len(here) >= params.min_points:
+            steps.append(step)
+    shadows = [step for step in steps if any(step.repeats(other) for other in steps)]
+    alike = np.zeros(len(point), bool)
+    for here, normal in zip(contacts, normals, strict=True):
+        for step in shadows:
+            shaded = _shaded(change[here], step.change)
+            if step.normal @ normal >= _PARALLEL and shaded.sum() > alike[here].sum():
+                alike[here] = shaded
+    return _Touches(rows, beside, point, touched, alike)
+
+
+def _across(cloud: PointCloud, label: Int32, rows: Int32, touched: Int32) -> tuple[Float64, Float64, Int32]:
+    """How the colour changes from points [T] to the labels that they touch [T, 3]; the colour on the points' own side
+    [T, 3]; and the points near to each, of the two labels, that tell so [T, _NEAR], -1 for none."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(cloud.points)
+    reach = TouchingParams().reach * cloud.spacing
+    _, near = tree.query(cloud.points[rows], k=np.arange(1, _NEAR + 1), distance_upper_bound=reach)
+    found = near < tree.n
+    near = np.where(found, near, 0).astype(np.int32)
+    color = _logarithms(cloud.colors)[near]
+    sides = [found & (label[near] == of[:, None]) for of in (label[rows], touched)]
+    own, other = (np.einsum("tk,tkc->tc", side, color) / np.maximum(side.sum(axis=1), 1)[:, None] for side in sides)
+    return other - own, own, np.where(sides[0] | sides[1], near, -1)
+
+
+def _logarithms(colors: UInt8) -> Float64:
+    """Natural logarithms of colours [N, 3] in linear light."""
+    return np.asarray(_GAMMA * np.log(np.maximum(colors, _DARKEST) / 255))
+
+
+def _step(change: Float64, color: Float64, first: Bool, normal: Float64) -> _Step | None:
+    """The step between two labels, if it may be a shadow's.
+
+    change: [T, 3] from the first label to the second. color: [T, 3] of one side, which is the first label's where
+    `first` [T].
+    """
+    step = np.median(change, axis=0)
+    lit = first
+    if step.mean() > 0:
+        step, change, lit = -step, -change, ~first
+    depth = -float(step.mean())
+    if not _DEPTH[0] <= depth <= _DEPTH[1] or np.ptp(step) > _TINT * depth or not lit.any():
+        return None
+    if (np.median(np.abs(change - step), axis=0) > _UNEVEN).any():
+        return None
+    return _Step(step, np.median(color[lit], axis=0), normal)
+
+
+def _shaded(change: Float64, step: Float64) -> Bool:
+    """[T] which changes of colour are a share of a shadow's step, all of them into the shadow or all out of it."""
+    share = change @ step / (step @ step)
+    near = (np.abs(change - share[:, None] * step) <= _REST).all(axis=1)
+    into, out = (near & (sign * share >= _SHARE[0]) & (sign * share <= _SHARE[1]) for sign in (1, -1))
+    return into if into.sum() >= out.sum() else out
+
+
+def _meeting(touches: _Touches, surface: Int32, label: Int32, params: ShadowParams) -> list[tuple[int, int]]:
+    """The pairs of surfaces that light alone tells apart, those that touch along the largest share of a border first.
+
+    surface: [L + 1] of each label. label: [N] of the points.
+    """
+    own = surface[label[touches.rows]]
+    at_border = (surface[label[touches.beside]] != own[:, None]).sum(axis=1) >= _ACROSS
+    length = np.bincount(own[at_border], minlength=len(surface))
+    a, b = own[touches.point], surface[touches.touched]
+    kept = np.flatnonzero(at_border[touches.point] & (a != b))
+    pairs, of = np.unique(np.sort(np.stack([a[kept], b[kept]]), axis=0), axis=1, return_inverse=True)
+    found = []
+    for number, (low, high) in enumerate(pairs.T.tolist()):
+        here = kept[of.ravel() == number]
+        if len(here) < params.min_points or touches.alike[here].mean() < params.alike:
+            continue
+        share = max(len(np.unique(touches.point[here[a[here] == name]])) / max(length[name], 1) for name in (low, high))
+        if share >= params.contact:
+            found.append((-share, low, high))
+    return [(low, high) for _, low, high in sorted(found)]
+
+
+def _in_one_plane(a: Float32, b: Float32, params: ShadowParams) -> bool:
+    """Whether most of two sets of points [., 3] lies on the plane of the larger one."""
+    larger, smaller = (thinned(part, _MOST) for part in sorted((a, b), key=len, reverse=True))
+    thickness = params.thickness * box_diagonal(larger, _TRIM)
+    near = np.ones(len(larger), bool)
+    for _ in range(_ROUNDS):
+        centre, normal = plane_through(larger[near])
+        distance = np.abs((larger - centre) @ normal)
+        near = distance <= max(thickness, float(np.median(distance)))
+    return all((np.abs((part - centre) @ normal) <= thickness).mean() >= params.flat for part in (larger, smaller))

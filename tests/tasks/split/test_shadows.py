@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+
+from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels
+from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
+
+STEP = 0.02
+SHADE = np.array([0.5, 0.53, 0.58])
+"""What a shadow leaves of R, G and B, linear light."""
+BROWN, GREY, WHITE, RED = (
+    np.array(color) for color in ((0.3, 0.16, 0.08), (0.25, 0.26, 0.27), (0.8, 0.8, 0.8), (0.5, 0.1, 0.1))
+)
+Patch = tuple[np.ndarray, np.ndarray]
+
+
+def patch(color: np.ndarray, x: float, y: float, z: float = 0.0, width: float = 0.5) -> Patch:
+    """A horizontal rectangle, half a metre deep, with a corner at a place: points and linear colours."""
+    u, v = np.meshgrid(np.arange(0, width, STEP), np.arange(0, 0.5, STEP))
+    places = np.stack([x + u.ravel(), y + v.ravel(), np.full(u.size, z)], axis=1)
+    return places, np.tile(color, (len(places), 1))
+
+
+def scene(*patches: Patch) -> tuple[PointCloud, Cameras, np.ndarray]:
+    """Patches seen from above by a grainy camera, and their points' labels, 1.. in their order."""
+    light = np.concatenate([color for _, color in patches])
+    light = light * np.random.default_rng(0).normal(1, 0.02, (len(light), 1))
+    colors = np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    places = np.concatenate([places for places, _ in patches]).astype(np.float32)
+    label = np.repeat(np.arange(1, len(patches) + 1, dtype=np.int32), [len(color) for _, color in patches])
+    pose = np.diag([1.0, -1, -1, 1])
+    pose[:3, 3] = (0.5, 0.5, 3)
+    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
+    return PointCloud(places, colors, 1.0, STEP), cameras, label
+
+
+def surfaces(*patches: Patch, **changes) -> list[int]:
+    """The surface of each patch."""
+    return lit_surfaces(*scene(*patches), ShadowParams(**changes))[1:].tolist()
+
+
+def floor(shade: np.ndarray = SHADE) -> list[Patch]:
+    """A grey floor, half of it darker."""
+    return [patch(GREY, 0, 2), patch(shade * GREY, 0.5, 2)]
+
+
+def table(x: float = 0.5, y: float = 0.0, z: float = 0.7) -> list[Patch]:
+    """A brown table, and a dark half of it, which starts at a place."""
+    return [patch(BROWN, 0, y, 0.7), patch(SHADE * BROWN, x, y, z)]
+
+
+def test_a_step_that_parallel_surfaces_of_other_colours_repeat_is_a_shadow():
+    assert surfaces(*floor(), *table()) == [1, 1, 3, 3]
+
+
+def test_a_step_that_nothing_repeats_may_be_paint():
+    assert surfaces(*table()) == [1, 2]
+    assert surfaces(*floor(0.5 * SHADE), *table()) == [1, 2, 3, 4]
+
+
+def test_a_step_that_only_surfaces_of_the_same_colour_repeat_may_be_a_print():
+    assert surfaces(*table(), *table(y=2)) == [1, 2, 3, 4]
+
+
+def test_a_step_of_another_tint_is_no_shadow():
+    blue = np.array([0.3, 0.5, 0.9])
+    assert surfaces(*floor(blue), patch(BROWN, 0, 0), patch(blue * BROWN, 0.5, 0)) == [1, 2, 3, 4]
+
+
+def test_a_step_twice_as_deep_is_not_that_shadow():
+    assert surfaces(*floor(), *table(y=4), patch(BROWN, 0, 0), patch(SHADE**2 * BROWN, 0.5, 0)) == [1, 1, 3, 3, 5, 6]
+
+
+def test_a_shadow_on_a_wall_tells_nothing_about_a_table():
+    wall = [(places[:, [0, 2, 1]], color) for places, color in floor()]
+    assert surfaces(*wall, *table()) == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("color", [WHITE, RED, GREY])
+def test_another_colour_stays_apart_beside_a_shadow(color):
+    assert surfaces(*floor(), *table(), patch(color, 0, 0.5, 0.7)) == [1, 1, 3, 3, 5]
+
+
+@pytest.mark.parametrize("height", [0.72, 0.8])
+def test_what_lies_higher_is_not_of_the_same_surface(height):
+    assert surfaces(*floor(), *table(y=4), *table(z=height)) == [1, 1, 3, 3, 5, 6]
+
+
+def test_what_does_not_touch_is_not_of_the_same_surface():
+    assert surfaces(*floor(), *table(y=4), *table(x=0.7)) == [1, 1, 3, 3, 5, 6]
+
+
+def test_a_label_half_in_the_shadow_goes_with_both_sides():
+    half = patch(np.sqrt(SHADE) * BROWN, 1.0, 0, 0.7, width=0.1)
+    assert surfaces(*floor(), *table(), half) == [1, 1, 3, 3, 3]
+
+
+def tree(agreement: float) -> Hierarchy:
+    """A floor and a table, both in light and shadow, of which no view has a mask."""
+    cloud, cameras, label = scene(*floor(), *table())
+    nothing = np.zeros(0, np.int32)
+    labels = PointLabels(label, np.ones(len(label)), 4, nothing, nothing, nothing, np.zeros(0))
+    return hierarchy(cloud, cameras, labels, [], params=HierarchyParams(shadows=ShadowParams(agreement=agreement)))
+
+
+def test_the_tree_unites_what_light_alone_parts():
+    found = tree(0.6)
+    assert found.node.tolist() == [1, 2, 3, 4, 5, 6]
+    assert found.parent.tolist() == [5, 5, 6, 6, 0, 0]
+    assert found.agreement.tolist() == pytest.approx([1, 1, 1, 1, 0.6, 0.6])
+
+
+def test_shadows_need_not_be_looked_for():
+    assert tree(0.0).node.tolist() == [1, 2, 3, 4]
