@@ -2,7 +2,8 @@
 
 A segmenter shows the box, its faces and the label printed on it, and often the box with what stands beside it. The
 level that is a thing is the one that the views repeat: most views which see two pieces of it have a mask with just
-these pieces, and the segmenter is as sure of that mask as of those of the pieces. Beyond Split&Splat.
+these pieces, and the segmenter is as sure of that mask as of those of the pieces. Two things are known without masks:
+what light alone parts is one surface, and what touches nothing but walls and floors stands alone. Beyond Split&Splat.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Hierarchy, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
-from ss_flow.tasks.split.mounds import Mounds, find_mounds
+from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
 from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
@@ -33,6 +34,10 @@ _BALANCED = 0.1
 """Share of the smaller pieces in what a view sees of all, from which on the view counts in full."""
 _ON_TOP = 0.5
 """What is left of an agreement when one piece stands on the others: the views show a group."""
+_ALONE = 0.5
+"""Share of what pieces touch, other than stuff, that must be of their own set for it to begin to stand alone."""
+_TOUCH = 10.0
+"""Border points of other things that are presumed, so that a faint touch proves nothing."""
 _MOST_SETS = 2000
 """Sets of pieces that are weighed in a round: those that the most masks show."""
 
@@ -65,6 +70,9 @@ class HierarchyParams:
     """What is a wall or a floor rather than a thing."""
     shadows: ShadowParams = field(default_factory=ShadowParams)
     """What is one surface in light and shadow, whatever the masks say."""
+    alone: Fraction = 0.3
+    """Share by which an agreement rises towards 1 where the pieces touch each other and stuff, and nothing else: a
+    chair on a floor. Less where they touch other things, down to nothing at half of what they touch."""
 
 
 @task(name="split.hierarchy")
@@ -87,8 +95,9 @@ def hierarchy(
     _, surface_of = np.unique(surface[names], return_inverse=True)
     is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, around=params.around, height=params.bulge)
+    contact = find_contact(points, labels.label)
     sheets = find_sheets(points, labels, flush=params.flush, height=params.bulge)
-    pieces = _Pieces.of(names, tallies, is_stuff, mounds, sheets, params)
+    pieces = _Pieces.of(names, tallies, is_stuff, contact, mounds, sheets, params)
     node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
     top = list(range(len(names)))  # the tree's row of each piece
     lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
@@ -138,6 +147,8 @@ class _Pieces:
     """K x [M] how sure the segmenter is of each mask."""
     stuff: Bool
     """[G]."""
+    contact: Float32
+    """[G, G] points at which each touches each other one, from both sides."""
     labels: list[tuple[int, ...]]
     """G x the labels (rows) that each is made of."""
     mounds: Mounds
@@ -146,7 +157,13 @@ class _Pieces:
 
     @staticmethod
     def of(
-        names: Int32, tallies: Sequence[Tally], stuff: Bool, mounds: Mounds, sheets: Sheets, params: HierarchyParams
+        names: Int32,
+        tallies: Sequence[Tally],
+        stuff: Bool,
+        contact: Float32,
+        mounds: Mounds,
+        sheets: Sheets,
+        params: HierarchyParams,
     ) -> _Pieces:
         """Each label on its own."""
         seen, held, quality = [], [], []
@@ -157,7 +174,8 @@ class _Pieces:
             held.append(np.zeros((len(tally.held), len(names)), np.float32))
             held[-1][:, column] = tally.held
             quality.append(tally.quality.astype(np.float64))
-        return _Pieces(seen, held, quality, stuff, [(row,) for row in range(len(names))], mounds, sheets, params)
+        own = [(row,) for row in range(len(names))]
+        return _Pieces(seen, held, quality, stuff, contact, own, mounds, sheets, params)
 
     @functools.cached_property
     def views(self) -> list[_View]:
@@ -185,6 +203,7 @@ class _Pieces:
             seen=[seen @ joined for seen in self.seen],
             held=[held @ joined for held in self.held],
             stuff=self.stuff[[members[0] for members in groups]],
+            contact=(joined.T @ self.contact @ joined * ~np.eye(len(groups), dtype=bool)).astype(np.float32),
             labels=[tuple(row for piece in members for row in self.labels[piece]) for members in groups],
         )
 
@@ -193,7 +212,12 @@ class _Pieces:
         sets, group = self._sets()
         if not sets:
             return []
-        agreement = np.round(self._agreement(sets) * np.where(group, _ON_TOP, 1.0), 6)
+        member = np.zeros((len(sets), len(self.stuff)), np.float32)
+        for row, members in enumerate(sets):
+            member[row, list(members)] = 1
+        agreement = self._agreement(member)
+        agreement += (1 - agreement) * self.params.alone * self._alone(member)
+        agreement = np.round(agreement * np.where(group, _ON_TOP, 1.0), 6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
@@ -230,13 +254,17 @@ class _Pieces:
         risen = zip(members, on_sheet.tolist(), strict=True)
         return {piece for piece, rises in risen if rises or all(on_top[row] for row in self.labels[piece])}
 
-    def _agreement(self, sets: list[tuple[int, ...]]) -> Float64:
-        """[S] share of the views that show each set of pieces as one, of those that see at least two of them: the mean
-        of the share's posterior, as a beta distribution with the prior."""
-        member = np.zeros((len(sets), len(self.stuff)), np.float32)
-        for row, members in enumerate(sets):
-            member[row, list(members)] = 1
-        agreed, asked = np.zeros(len(sets)), np.zeros(len(sets))
+    def _alone(self, member: Float32) -> Float64:
+        """[S] how far each set of pieces [S, G] stands alone, 0..1: whether it touches nothing but itself and stuff."""
+        inside = np.einsum("sg,gh,sh->s", member, self.contact, member, optimize=True) / 2
+        outside = np.einsum("sg,gh,sh->s", member, self.contact, (1 - member) * ~self.stuff, optimize=True)
+        things = (member @ self.stuff) == 0
+        return things * _ramp(inside / (inside + outside + _TOUCH), _ALONE, 1.0)
+
+    def _agreement(self, member: Float32) -> Float64:
+        """[S] share of the views that show each set of pieces [S, G] as one, of those that see at least two of them:
+        the mean of the share's posterior, as a beta distribution with the prior."""
+        agreed, asked = np.zeros(len(member)), np.zeros(len(member))
         for view in self.views:
             seen = member * view.seen
             total, largest = seen.sum(axis=1), seen.max(axis=1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Int32, PointCloud, PointLabels, Tally
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
@@ -76,6 +76,25 @@ def find_mounds(
         rises = np.quantile((own - centre) @ towards(normal, centre, eye), 0.9)
         bulges[row] = rises >= max(height * box_diagonal(own, _TRIM), 2 * points.spacing)
     return Mounds(share, size.astype(np.int32), bulges, around)
+
+
+def find_contact(points: PointCloud, label: Int32) -> Float32:
+    """[L, L] at how many points, on both sides, the labels that occur, ascending, touch each other in space.
+
+    label: [N] of the points, 0 = none.
+    """
+    names = np.unique(label[label > 0])
+    contact = np.zeros((len(names), len(names)), np.float32)
+    if len(names):
+        at_border, beside, _ = borders(label, points, TouchingParams())
+        big = int(names[-1]) + 1
+        point = np.arange(len(at_border), dtype=np.int64)[:, None]
+        number, other = np.divmod(np.unique(point * big + label[beside]), big)
+        own = label[at_border[number]]
+        touches = (other > 0) & (other != own)
+        pair = np.searchsorted(names, own[touches]), np.searchsorted(names, other[touches])
+        np.add.at(contact, pair, 1)
+    return contact + contact.T
 
 
 def _ends(label: Int32, names: Int32, points: PointCloud) -> Bool:

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels, Tally
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+from ss_flow.tasks.split.stuff import StuffParams
 
 NO_BORDERS = np.zeros((9, 9), np.int32)
 SEES = 100
@@ -140,3 +141,28 @@ def test_a_second_copy_of_all_views_changes_nothing(views):
     once = [tally([(m & sees, q) for m, q in of if m & sees], sees) for of, sees in views]
     before, after = tree(once, 5), tree([*once, *once], 5)
     assert before.parent.tolist() == after.parent.tolist() and np.array_equal(before.agreement, after.agreement)
+
+
+def agreement_beside(neighbour: float, alone: float = 0.3) -> float:
+    """How sure the union of two halves of a seat is that one view of two shows, with something else (3) at a distance
+    from the first."""
+    half = np.stack(np.meshgrid(np.arange(0, 1, 0.02), np.arange(0, 0.5, 0.02)), axis=-1).reshape(-1, 2)
+    half = np.concatenate([half, np.zeros((len(half), 1))], axis=1)
+    places = np.concatenate([half, half + np.array([0, 0.5, 0]), half - np.array([0, 0.5 + neighbour, 0])]).astype(
+        np.float32
+    )
+    label = np.repeat(np.arange(1, 4, dtype=np.int32), len(half))
+    nothing = np.zeros(0, np.int32)
+    given = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing, np.zeros(0))
+    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), np.eye(4)[None], True)
+    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.02)
+    views = [tally([({1, 2}, 0.9)], {1, 2, 3}), tally([({1}, 0.9), ({2}, 0.9)], {1, 2, 3})]
+    stuff = StuffParams(extent=1.0)  # nothing is
+    found = hierarchy(cloud, cameras, given, views, params=HierarchyParams(prior=0.0, alone=alone, stuff=stuff))
+    return dict(zip(found.node.tolist(), found.agreement.tolist(), strict=True))[4]
+
+
+def test_what_touches_nothing_else_is_one_thing_rather():
+    assert agreement_beside(1.0, alone=0.0) == pytest.approx(0.5)
+    assert 0.6 < agreement_beside(1.0) < 0.65
+    assert agreement_beside(0.0) == pytest.approx(0.5)
