@@ -53,6 +53,8 @@ class ShadowParams:
 
     agreement: Fraction = 0.6
     """What this counts as beside the agreement of views (see `split.granularity`); 0 = shadows are not looked for."""
+    repeats: Count = 2
+    """Other borders, on parallel surfaces of other colours, that must show the same step: one may be chance."""
     alike: Fraction = 0.75
     """Share of their common border at which the colour stays, or changes as into a shadow."""
     contact: Fraction = 0.03
@@ -144,7 +146,7 @@ def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, params: ShadowPa
         step = _step(change[here], color[here], (own == low)[here], normals[-1])
         if step is not None and len(here) >= params.min_points:
             steps.append(step)
-    shadows = [step for step in steps if any(step.repeats(other) for other in steps)]
+    shadows = [step for step in steps if sum(step.repeats(other) for other in steps) >= params.repeats]
     alike = np.zeros(len(point), bool)
     for here, normal in zip(contacts, normals, strict=True):
         for step in shadows:

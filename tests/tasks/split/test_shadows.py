@@ -36,7 +36,7 @@ def scene(*patches: Patch) -> tuple[PointCloud, Cameras, np.ndarray]:
 
 def surfaces(*patches: Patch, **changes) -> list[int]:
     """The surface of each patch."""
-    return lit_surfaces(*scene(*patches), ShadowParams(**changes))[1:].tolist()
+    return lit_surfaces(*scene(*patches), ShadowParams(**{"repeats": 1, **changes}))[1:].tolist()
 
 
 def floor(shade: np.ndarray = SHADE) -> list[Patch]:
@@ -56,6 +56,11 @@ def test_a_step_that_parallel_surfaces_of_other_colours_repeat_is_a_shadow():
 def test_a_step_that_nothing_repeats_may_be_paint():
     assert surfaces(*table()) == [1, 2]
     assert surfaces(*floor(0.5 * SHADE), *table()) == [1, 2, 3, 4]
+
+
+def test_a_step_that_too_few_borders_repeat_may_be_chance():
+    assert surfaces(*floor(), *table(), repeats=2) == [1, 2, 3, 4]
+    assert surfaces(*floor(), *[(p + np.array([0, 2, 0]), c) for p, c in floor()], *table(), repeats=2)[4:] == [5, 5]
 
 
 def test_a_step_that_only_surfaces_of_the_same_colour_repeat_may_be_a_print():
@@ -100,7 +105,9 @@ def tree(agreement: float) -> Hierarchy:
     cloud, cameras, label = scene(*floor(), *table())
     nothing = np.zeros(0, np.int32)
     labels = PointLabels(label, np.ones(len(label)), 4, nothing, nothing, nothing, np.zeros(0))
-    return hierarchy(cloud, cameras, labels, [], params=HierarchyParams(shadows=ShadowParams(agreement=agreement)))
+    return hierarchy(
+        cloud, cameras, labels, [], params=HierarchyParams(shadows=ShadowParams(agreement=agreement, repeats=1))
+    )
 
 
 def test_the_tree_unites_what_light_alone_parts():
