@@ -16,6 +16,7 @@ from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, looking
 from ss_flow.tasks.geometry.clustering import nearest_spacing
+from ss_flow.tasks.geometry.sampling import sphere
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _FAINTEST = 0.05
@@ -103,9 +104,7 @@ def cameras_beside(
     seen = np.stack([camera.center - centre for camera in cameras])
     distances = np.linalg.norm(seen, axis=1)
     seen /= distances[:, None]
-    step = np.arange(_DIRECTIONS) + 0.5
-    polar, turn = np.arccos(1 - 2 * step / _DIRECTIONS), np.pi * (1 + np.sqrt(5)) * step
-    directions = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
+    directions = sphere(_DIRECTIONS)
     off = np.degrees(np.arccos(np.clip((directions @ seen.T).max(axis=1), -1, 1)))
     ring = directions[np.abs(off - degrees) < 2]
     if not len(ring):

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Float32, Gaussians, Int32, UInt8
+from ss_flow.tasks.artifacts import Float32, Float64, Gaussians, Int32, UInt8
 from ss_flow.tasks.geometry.shape import box_diagonal
 
 SH_ZERO = 0.28209479177387814
@@ -42,15 +42,12 @@ def initialise(
     The standard deviation is the root of the mean squared distance to the three nearest other points.
     Raises ValueError when the shapes do not fit.
     """
-    from scipy.spatial import cKDTree
-
     n = len(points)
     if n == 0 or points.shape != (n, 3) or colors.shape != (n, 3):
         raise ValueError(f"points {points.shape} and colors {colors.shape} must both be [N, 3] with N >= 1")
     spread = np.full(n, 0.01)
     if n > 1:
-        near, _ = cKDTree(points).query(points, k=min(4, n), workers=1)
-        spread = np.sqrt(np.square(np.asarray(near)[:, 1:]).mean(axis=1))
+        spread = neighbour_spread(points)
         # Coincident points would give a scale of 0, a logarithm without end.
         spread = np.maximum(spread, 1e-3 * max(float(np.median(spread)), 1e-6))
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
@@ -65,6 +62,14 @@ def initialise(
         instance_conf=np.broadcast_to(np.asarray(confidence, np.float32), (n,)).copy(),
         part_id=np.broadcast_to(np.asarray(part_id, np.int32), (n,)).copy(),
     )
+
+
+def neighbour_spread(points: Float32) -> Float64:
+    """[N] the root of the mean squared distance of each point to the three nearest others. points: [N, 3], N >= 2."""
+    from scipy.spatial import cKDTree
+
+    near, _ = cKDTree(points).query(points, k=min(4, len(points)), workers=1)
+    return np.asarray(np.sqrt(np.square(np.asarray(near)[:, 1:]).mean(axis=1)))
 
 
 def laid_flat(gaussians: Gaussians, thickness: float, neighbours: int = 12) -> Gaussians:

@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
 from ss_flow.tasks.artifacts import Float32, Gaussians
-from ss_flow.tasks.gaussians.backends import AdamStep, Array, Backend, backend_for
+from ss_flow.tasks.gaussians.backends import AdamStep, Array, Backend, Values, backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecord, Schedule, Seen
 from ss_flow.tasks.gaussians.native_pass import Settings
-from ss_flow.tasks.gaussians.objective import Objective, Target, decayed
+from ss_flow.tasks.gaussians.objective import Objective, Target, Weights, decayed
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.gaussians.render import channels_of
@@ -77,6 +77,8 @@ class TrainParams:
     """When "classic" clones and splits."""
     max_gaussians: Natural = 30_000
     """Densification ends at this number; 0 = never."""
+    part_weight: NonNegative = 0.0
+    """Weight of the mean absolute error of alpha in the views of parts, of which each step sees one."""
     prune_opacity: Fraction = 0.005
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
@@ -84,6 +86,17 @@ class TrainParams:
     max_scale: NonNegative = 0.0
     """No standard deviation exceeds this share of the extent, or the largest it starts with where that is more; 0 = no
     limit."""
+
+
+@dataclass(frozen=True)
+class PartView:
+    """What some of the Gaussians alone, without the others, should cover; only the target's alpha counts."""
+
+    start: int
+    """The first row of these Gaussians."""
+    stop: int
+    """The row behind the last."""
+    target: Target
 
 
 @dataclass(frozen=True)
@@ -104,16 +117,18 @@ def train(
     extent: float | Float32,
     seed: int,
     label_ids: Sequence[int] = (),
+    parts: Sequence[PartView] = (),
     backend: Backend | None = None,
 ) -> TrainResult:
     """Fit Gaussians to views with Adam (Kerbl et al. 2023, Sec. 5; spec P1, P4).
 
     extent: size of what is trained, world units, or [N] of what each Gaussian is part of: scales the learning rate of
-    the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. backend: where it
-    happens; by default, that of `device_here`. On the CPU the number of threads changes no byte, and neither does a
-    kill: a later try goes on from the last checkpoint.
-    Raises ValueError when there are no views or Gaussians or an array does not fit its camera, TrainingDiverged when
-    numbers blow up. The result has no Gaussians when all were pruned.
+    the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. parts: what some rows of
+    `initial` should look like alone, with `part_weight`, where nothing is cloned or split. backend: where it happens;
+    by default, that of `device_here`. On the CPU the number of threads changes no byte, and neither does a kill: a
+    later try goes on from the last checkpoint.
+    Raises ValueError when there are no views or Gaussians, an array does not fit its camera, or rows of parts would
+    move, TrainingDiverged when numbers blow up. The result has no Gaussians when all were pruned.
     """
     if len(initial) == 0 or len(views) == 0:
         raise ValueError(f"training needs Gaussians and views, but got {len(initial)} and {len(views)}")
@@ -127,9 +142,11 @@ def train(
     ):
         if value not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {value!r}")
+    if parts and params.densify != "none":
+        raise ValueError("views of parts need Gaussians whose rows stay, so densify must be none")
     backend = backend or backend_for(device_here(), cores())
     with backend.stream():
-        return _Training(initial, views, params, extents, seed, label_ids, backend).run()
+        return _Training(initial, views, params, extents, seed, label_ids, parts, backend).run()
 
 
 class _Training:
@@ -143,12 +160,18 @@ class _Training:
         extents: Float32,
         seed: int,
         label_ids: Sequence[int],
+        parts: Sequence[PartView],
         backend: Backend,
     ) -> None:
         num_labels = len(label_ids) if params.mask_weight else 0
         self._initial, self._params, self._num_labels, self._backend = initial, params, num_labels, backend
         self._targets = [Target.of(view, params.objective, num_labels) for view in views]
         self._there = [backend.target(target, num_labels) for target in self._targets]
+        self._parts = (
+            [(slice(p.start, p.stop), backend.target(p.target, 0)) for p in parts] if params.part_weight else []
+        )
+        # An order of its own that every step can look up: it moves no other draw, and a later try need not know it.
+        self._turns = np.random.default_rng(seed).permutation(len(self._parts))
         self._generator = np.random.default_rng(seed)
         self._given_degree = round(initial.sh.shape[1] ** 0.5) - 1
         last = min(params.sh_degree, params.iterations // 1000) if params.iterations >= 2000 else 0
@@ -198,7 +221,10 @@ class _Training:
         settings = Settings(behind, self._num_labels, degree, winners=False)
         weights = params.objective.at(done_share, params.mask_weight)
         labels = None if self._channels is None else self._channels[parameters.origin]
+        rows, towards_part = self._part(settings)
         found = self._backend.descent(parameters.values, labels, self._there[view], settings, weights)
+        for name, gradient in towards_part.items():
+            found.gradients[name][rows] += gradient
         self._losses[self.step - 1] = found.loss
         pace = decayed(params.rates.position, params.rates.position_final, done_share)
         rates = _by_name(params.rates, pace * self._extents[parameters.origin])
@@ -208,6 +234,16 @@ class _Training:
         if self._control is not None:
             seen = Seen(found.gradients["centers"], found.radii, self._targets[view].pixels)
             self._control.after(self.step, parameters, seen, self._generator)
+
+    def _part(self, settings: Settings) -> tuple[slice, Values]:
+        """The rows of the part whose turn it is, and the gradients of its alpha; nothing where there are no parts."""
+        if not self._parts:
+            return slice(0), {}
+        rows, there = self._parts[self._turns[self.step % len(self._turns)]]
+        own = {name: value[rows] for name, value in self.parameters.values.items()}
+        alone = replace(settings, background=(0.0, 0.0, 0.0), num_labels=0)
+        found = self._backend.descent(own, None, there, alone, Weights(ssim=0.0, alpha=1.0, depth=0.0, mask=0.0))
+        return rows, {name: self._params.part_weight * found.gradients[name] for name in own}
 
     def losses(self) -> Float32:
         """Of the steps so far. Raises TrainingDiverged when one of them or a parameter is not finite.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Float32, Float64, Int32
+from ss_flow.tasks.artifacts import Float32, Float64, Int32, Int64
 
 
 def greedy_farthest(points: Float32 | Float64, count: int, *, alpha: float = 0.3, drop_hull: bool = True) -> Int32:
@@ -42,11 +42,24 @@ def first_of_each_cube(points: Float32, side: float) -> Int32:
 
     points: [N, 3], N >= 1; side: of the cubes, in the points' unit.
     """
+    return np.sort(np.unique(cube_of_each(points, side), return_index=True)[1]).astype(np.int32)
+
+
+def cube_of_each(points: Float32, side: float) -> Int64:
+    """[N] the cube of that grid which each point lies in, by a number of its own."""
     cell = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
     # One number a cube: rows of three are compared many times more slowly.
     x, y, z = cell.T
     size = cell.max(axis=0) + 1
-    return np.sort(np.unique((x * size[1] + y) * size[2] + z, return_index=True)[1]).astype(np.int32)
+    return np.asarray((x * size[1] + y) * size[2] + z)
+
+
+def sphere(count: int) -> Float64:
+    """Directions evenly spread over the sphere, [N, 3] of length 1: each turned by the golden angle, steps of equal
+    area from pole to pole along z."""
+    step = np.arange(count) + 0.5
+    polar, turn = np.arccos(1 - 2 * step / count), np.pi * (1 + np.sqrt(5)) * step
+    return np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
 
 
 def _hull_vertices(points: Float64) -> np.ndarray:

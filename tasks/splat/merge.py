@@ -31,6 +31,7 @@ from ss_flow.tasks.geometry.cameras import camera_extent, pixels_in_view
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import group_box
+from ss_flow.tasks.splat.side_views import side_views
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,11 @@ class MergeParams:
     """The same for the last pass."""
     global_mask_weight: NonNegative = 0.25
     """w_mask of the last pass."""
+    side_weight: NonNegative = 0.05
+    """Weight, in the last pass, of the mean alpha where an instance, seen alone from anywhere, has no surface near; 0 =
+    only photos count."""
+    side_views: Count = 24
+    """Views of each instance that this is looked at from; a step sees one of one instance."""
     reset_opacity: bool = False
     """Whether what collides starts from opacities of at most 0.01, as in the paper."""
     prune_opacity: Fraction = 0.005
@@ -228,19 +234,22 @@ def global_pass(
     """A last, short training of the whole scene with its background, on whole photos (spec P4, A22).
 
     scene: as `assemble` gives it. masks: exclusive label maps of all views. Opacities are kept and nothing is split or
-    cloned. The loss is `global_objective` and `global_mask_weight` times the mask loss; the guard of `merge_pair` holds
-    here too.
+    cloned. The loss is `global_objective`, `global_mask_weight` times the mask loss, and `side_weight` times what an
+    instance covers beside its surface (`side_views`); the guard of `merge_pair` holds here too.
     """
     if not len(scene) or not params.global_iterations:
         return scene
     ids = np.unique(scene.instance_id)
-    seen = _whole_views(views.compared(VisibilityParams()), masks, ids, params.crop.max_side)
+    compared = views.compared(VisibilityParams())
+    seen = _whole_views(compared, masks, ids, params.crop.max_side)
+    parts = side_views(compared, scene, masks, params.side_views) if params.side_weight else []
     settings = TrainParams(
         iterations=params.global_iterations,
         sh_degree=params.sh_degree,
         objective=params.global_objective,
         densify="none",
         mask_weight=params.global_mask_weight,
+        part_weight=params.side_weight,
         prune_opacity=params.prune_opacity,
         prune_contribution=params.prune_contribution,
         max_scale=params.max_scale,
@@ -253,6 +262,7 @@ def global_pass(
         extent=_extent(scene, seen, params),
         seed=params.seed << 32,
         label_ids=ids.tolist(),
+        parts=parts,
     ).gaussians
     return _guarded(scene, refined, seen, ids, params)
 

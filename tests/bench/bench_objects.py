@@ -139,7 +139,7 @@ def look(found: Outcome, degrees: float) -> UInt8:
         if not instance.instance_id or len(own) < 10 or not instance.views:
             continue
         rows = [found.cameras.names.index(name) for name in instance.views]
-        sizes = instance.dense().sum(axis=(1, 2))
+        sizes = instance.areas()
         best = int(sizes.argmax())
         y, x = np.nonzero(instance.mask(best))
         box = x.min(), y.min(), x.max() + 1, y.max() + 1

@@ -251,7 +251,7 @@ def look(found: Outcome, plainly: Gaussians | None, place: Path) -> None:
     for instance in found.instances:
         own = select(found.scene, found.scene.instance_id == instance.instance_id)
         if instance.instance_id and len(own) and instance.views:
-            row = int(instance.dense().sum(axis=(1, 2)).argmax())
+            row = int(instance.areas().argmax())
             largest, mask = found.cameras.names.index(instance.views[row]), instance.mask(row)
             y, x = np.nonzero(mask)
             margin = 20

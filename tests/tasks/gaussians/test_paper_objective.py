@@ -73,7 +73,8 @@ def asked_by(task: str, small: SmallScene, monkeypatch: pytest.MonkeyPatch) -> A
     """Run a task with the paper's parameters up to its training."""
     heard: list[Asked] = []
 
-    def listening(initial, views, *, params, extent, seed, label_ids=()):
+    def listening(initial, views, *, params, extent, seed, label_ids=(), parts=()):
+        assert not parts
         heard.append(Asked(initial, list(views), params, extent, tuple(label_ids)))
         return TrainResult(initial, 0, np.zeros(0, np.float32))
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from ss_flow.running import Surroundings, running
+from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians.backends import NativeBackend
 from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify, rotations
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, laid_flat, select
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
-from ss_flow.tasks.gaussians.objective import Objective
+from ss_flow.tasks.gaussians.objective import Objective, Target
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainingDiverged, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import LearningRates, PartView, TrainingDiverged, TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
 
@@ -56,6 +57,10 @@ def ball_points(n: int = 300):
     points = np.random.default_rng(0).normal(size=(n, 3))
     points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
     return initialise(points.astype(np.float32), (255 * color_at(points)).astype(np.uint8), 4, 0.5)
+
+
+def same_bytes(a: Gaussians, b: Gaussians) -> bool:
+    return all(getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in PARAMETERS)
 
 
 def test_training_finds_colours_shape_and_depth_of_a_ball():
@@ -310,8 +315,9 @@ def test_the_number_of_threads_changes_no_byte():
 
 @pytest.mark.parametrize("strategy", ["classic", "none"])
 def test_a_training_that_was_interrupted_goes_on_to_the_same_bytes(strategy, tmp_path):
-    params = TrainParams(iterations=320, densify=strategy)
-    alone = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1)
+    params = TrainParams(iterations=320, densify=strategy, part_weight=0.1)
+    parts = [part_view(0, 200, angle) for angle in (0.3, 0.9, 1.8)] if strategy == "none" else []
+    alone = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1, parts=parts)
 
     class Interrupted(Exception):
         pass
@@ -325,14 +331,63 @@ def test_a_training_that_was_interrupted_goes_on_to_the_same_bytes(strategy, tmp
 
     here = Surroundings(stop_at_150, checkpoint=tmp_path / "kept.npz")
     with running(here), pytest.raises(Interrupted):
-        train(ball_points(), VIEWS, params=params, extent=1.6, seed=1)
+        train(ball_points(), VIEWS, params=params, extent=1.6, seed=1, parts=parts)
     steps = []
     with running(replace(here, listener=lambda done, total, note: steps.append(done))):
-        resumed = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1)
+        resumed = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1, parts=parts)
     assert steps == [200, 250, 300, 320] and first_steps == [50, 100, 150]
     assert resumed.gaussians.means.tobytes() == alone.gaussians.means.tobytes()
     assert resumed.gaussians.sh.tobytes() == alone.gaussians.sh.tobytes()
     assert resumed.loss.tobytes() == alone.loss.tobytes()
+
+
+def part_view(start: int, stop: int, angle: float) -> PartView:
+    """Of these rows nothing may reach beyond the ball's outline."""
+    view = ball_view(angle)
+    image = np.zeros_like(view.image)
+    empty = replace(view, image=image, inside=np.zeros_like(view.inside))
+    return PartView(start, stop, Target.of(empty, Objective(), 0))
+
+
+def test_what_no_photo_shows_goes_where_it_is_seen_alone_from_the_side():
+    ball, behind = ball_points(), np.array([[0, 0, 1.3]], np.float32)
+    hidden = initialise(np.repeat(behind, 5, axis=0), np.zeros((5, 3), np.uint8), 4, 0.5, opacity=0.9)
+    hidden = replace(hidden, log_scales=np.full((5, 3), np.log(0.1), np.float32))
+    both, front = concatenate([ball, hidden]), VIEWS[:1]
+    params = TrainParams(iterations=150, densify="none", part_weight=0.5, prune_contribution=0.0)
+    side = ball_view(np.pi / 2)
+
+    def beside(gaussians) -> float:
+        return float(render(gaussians, side.camera).alpha[~side.inside].mean())
+
+    parts = [part_view(0, len(both), np.pi / 2)]
+    with_parts = train(both, front, params=params, extent=1.6, seed=1, parts=parts).gaussians
+    without = train(both, front, params=replace(params, part_weight=0.0), extent=1.6, seed=1, parts=parts).gaussians
+    assert same_bytes(without, train(both, front, params=params, extent=1.6, seed=1).gaussians)
+    assert beside(with_parts) < 0.3 * beside(without)
+
+
+def test_a_part_is_seen_without_the_others_and_moves_them_by_nothing():
+    ball = ball_points()
+    params = TrainParams(iterations=1, densify="none", part_weight=0.5, prune_contribution=0.0, prune_opacity=0.0)
+    alone = train(ball, VIEWS, params=params, extent=1.6, seed=1, parts=[part_view(0, 300, 0.3)]).gaussians
+    none = train(ball, VIEWS, params=params, extent=1.6, seed=1).gaussians
+    out_of_sight = initialise(np.full((1, 3), 50, np.float32), np.zeros((1, 3), np.uint8), 5, 0.5)
+    for both, rows, others in (
+        (concatenate([ball, out_of_sight]), slice(0, 300), slice(300, 301)),
+        (concatenate([out_of_sight, ball]), slice(1, 301), slice(0, 1)),
+    ):
+        part = part_view(rows.start, rows.stop, 0.3)
+        found = train(both, VIEWS, params=params, extent=1.6, seed=1, parts=[part]).gaussians
+        assert same_bytes(select(found, np.arange(len(both))[rows]), alone)
+        assert np.array_equal(found.log_scales[others], both.log_scales[others])
+    assert not np.array_equal(alone.log_scales, none.log_scales)
+    assert np.array_equal(alone.sh, none.sh)  # its colours do not count
+
+
+def test_views_of_parts_need_rows_that_stay():
+    with pytest.raises(ValueError, match="densify must be none"):
+        train(ball_points(), VIEWS, params=TrainParams(iterations=1), extent=1.6, seed=1, parts=[part_view(0, 9, 0.3)])
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, -1, 0), (0.3, -0.5, -0.8)])

@@ -1,0 +1,128 @@
+"""What the instances of a scene should cover from where no photo was taken."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int64, LabelMap
+from ss_flow.tasks.gaussians.initialise import neighbour_spread
+from ss_flow.tasks.gaussians.objective import Target
+from ss_flow.tasks.gaussians.trainer import PartView
+from ss_flow.tasks.gaussians.views import SceneViews, sample_depth
+from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, project, surface_of_pixels
+from ss_flow.tasks.geometry.sampling import cube_of_each, sphere
+
+FEWEST = 20
+"""Gaussians from which an instance has a shape."""
+MOST_PIXELS = 96
+"""Side of a view, if its pixels need not be smaller than half a spacing."""
+GAP = 2.5
+"""Spacings between points that still belong to one surface: narrower gaps are closed."""
+RIM = 0.5
+"""Spacings by which the surface goes on beyond its last points."""
+SURFACE_PIXELS = 2_000_000
+"""Pixels of all views together whose surface points are looked at."""
+LEAST_SHARE = 1 / 3
+"""Share of a cube's pixels that show an instance from which the cube may be its surface."""
+
+
+def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], count: int) -> list[PartView]:
+    """For each instance but the background, views of it alone from directions all over the sphere, from below too.
+
+    Photos do not tell what they cannot see: Gaussians grow into the floor below a thing, or off its surface along the
+    line of sight. But the surface is known, as points: the centres of the Gaussians that come from the labelled points,
+    and the surface points of the pixels that show the instance. Alpha is to be 0 where no point is near; what lies
+    nearer than half a spacing, and gaps between points, count for nothing.
+
+    scene: ordered by instance, not yet trained together. masks: exclusive label maps of all views. count: views of each
+    instance. Returns targets whose alpha counts alone.
+    """
+    ids, starts = np.unique(scene.instance_id, return_index=True)
+    stops = np.append(starts[1:], len(scene))
+    shaped = (ids > 0) & (stops - starts >= FEWEST)
+    if not shaped.any():
+        return []
+    centres = [scene.means[a:b] for a, b in zip(starts[shaped], stops[shaped], strict=True)]
+    spacings = [float(np.median(neighbour_spread(own))) for own in centres]
+    surfaces = shown_surfaces(views, masks, float(np.median(spacings)))
+    found = []
+    rows = zip(ids[shaped].tolist(), starts[shaped].tolist(), stops[shaped].tolist(), strict=True)
+    for (instance, start, stop), own, spacing in zip(rows, centres, spacings, strict=True):
+        points = np.concatenate([own, surfaces.get(instance, own[:0])])
+        for camera in cameras_around(points, spacing, count):
+            found.append(PartView(start, stop, _target(camera, empty(camera, points, spacing))))
+    return found
+
+
+def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) -> dict[int, Float32]:
+    """By instance: surface points of pixels that show it, [N, 3] world, one for each cube of space a good part of whose
+    pixels, of all views, do so.
+
+    side: of the cubes, world units.
+    """
+    every = max(1, round(np.sqrt(sum(m.ids.size for m in masks) / SURFACE_PIXELS)))
+    places: list[Float32] = []
+    shown_there: list[Int64] = []
+    for camera, depth, shown in zip(views.cameras, views.depths, masks, strict=True):
+        z = sample_depth(depth, camera, camera)[::every, ::every]
+        row, column = np.nonzero(z > 0)
+        surface = surface_of_pixels(every * column, every * row, z[row, column], camera)
+        places.append(surface.astype(np.float32))
+        shown_there.append(shown.ids[::every, ::every][row, column].astype(np.int64))
+    points, ids = np.concatenate(places), np.concatenate(shown_there)
+    if not len(points):
+        return {}
+    _, cube = np.unique(cube_of_each(points, side), return_inverse=True)
+    most = int(ids.max()) + 1
+    pair, first, held = np.unique(cube * most + ids, return_index=True, return_counts=True)
+    good = (held >= 2) & (held >= LEAST_SHARE * np.bincount(cube)[pair // most])
+    pair, first = pair[good] % most, first[good]
+    return {int(i): points[first[pair == i]] for i in np.unique(pair)}
+
+
+def cameras_around(points: Float32, spacing: float, count: int) -> Iterator[Camera]:
+    """Cameras that show points whole from directions evenly spread over the sphere, at twice the diagonal of their box,
+    with pixels of half a spacing where that needs no more than MOST_PIXELS."""
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2 + GAP * spacing
+    size = int(np.clip(np.ceil(4 * radius / spacing), 16, MOST_PIXELS))
+    focal = size / 2 * np.sqrt(15.0)  # a sphere seen from four of its radii
+    for direction in sphere(count):
+        pose = looking(middle + 4 * radius * direction, -direction, np.array([0.0, 0.0, 1.0]))
+        yield Camera(size, size, focal, focal, size / 2, size / 2, pose)
+
+
+def empty(camera: Camera, points: Float32, spacing: float) -> Bool:
+    """[h, w] the pixels that lie wholly beyond the outline of points.
+
+    The outline is that of the discs of radius GAP about the points, less GAP - RIM (both in spacings): gaps narrower
+    than twice GAP close, and the rim stays narrow.
+    """
+    import cv2
+
+    fine = camera.scaled(2 * camera.width, 2 * camera.height)
+    pixels = spacing * fine.fx / float(project(points, camera)[1].mean())
+    _, column, row, _ = pixels_in_view(points, fine)
+    border = int(np.ceil(GAP * pixels)) + 1  # what lies outside of the picture is empty, too
+    free = np.pad(np.ones((fine.height, fine.width), np.uint8), border, constant_values=1)
+    free[row + border, column + border] = 0
+    away = cv2.distanceTransform(free, cv2.DIST_L2, 5) > GAP * pixels
+    back = cv2.distanceTransform((~away).astype(np.uint8), cv2.DIST_L2, 5) <= (GAP - RIM) * pixels
+    inner = back[border:-border, border:-border]
+    return np.asarray(inner.reshape(camera.height, 2, camera.width, 2).all(axis=(1, 3)))
+
+
+def _target(camera: Camera, free: Bool) -> Target:
+    """Alpha towards 0 where nothing is; all that does not count is shared by all views."""
+    blank, ones, image = _blank(camera.height, camera.width)
+    judged = (free / free.size).astype(np.float32)
+    return Target(camera, image, blank, blank, judged, ones, blank, None, None)
+
+
+@functools.lru_cache(maxsize=MOST_PIXELS)
+def _blank(height: int, width: int) -> tuple[Float32, Float32, Float32]:
+    blank = np.zeros((height, width), np.float32)
+    return blank, np.ones_like(blank), np.zeros((height, width, 3), np.float32)

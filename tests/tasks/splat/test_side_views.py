@@ -1,0 +1,101 @@
+"""What instances should cover from where no photo was taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_and_box import BALL as CENTRE
+from ball_and_box import RADIUS, SmallScene
+
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, neighbour_spread
+from ss_flow.tasks.gaussians.views import SceneViews
+from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view
+from ss_flow.tasks.geometry.sampling import first_of_each_cube, sphere
+from ss_flow.tasks.geometry.visibility import VisibilityParams
+from ss_flow.tasks.splat.side_views import FEWEST, GAP, RIM, cameras_around, empty, shown_surfaces, side_views
+
+BOX, BALL = 1, 2
+
+
+@pytest.fixture(scope="module")
+def small() -> SmallScene:
+    return SmallScene()
+
+
+def compared(small: SmallScene) -> SceneViews:
+    return small.views.compared(VisibilityParams())
+
+
+def distance_of_rays(camera: Camera, place: np.ndarray) -> np.ndarray:
+    """[h, w] how far the ray through each pixel passes by a place."""
+    towards = backproject(np.ones((camera.height, camera.width), np.float32), camera) - camera.center
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    away = place - camera.center
+    return np.linalg.norm(away - (towards @ away)[:, None] * towards, axis=1).reshape(camera.height, camera.width)
+
+
+def test_what_lies_beyond_the_rim_of_points_is_empty_from_all_directions():
+    ball = (0.5 * sphere(2000)).astype(np.float32)
+    spacing = float(np.median(neighbour_spread(ball)))
+    cameras = list(cameras_around(ball, spacing, 6))
+    assert len({tuple(np.round(camera.center, 6)) for camera in cameras}) == 6
+    for camera in cameras:
+        passes = distance_of_rays(camera, np.zeros(3))
+        assert np.linalg.norm(camera.center) == pytest.approx(4 * (np.sqrt(3) * 0.5 + GAP * spacing), rel=0.01)
+        free = empty(camera, ball, spacing)
+        assert not free[passes < 0.5].any()
+        assert free[passes > 0.5 + (RIM + 1) * spacing].all()  # pixels are half a spacing wide
+        assert free[[0, 0, -1, -1], [0, -1, 0, -1]].all()
+
+
+@pytest.mark.parametrize(("width", "closed"), [(1.5 * GAP, True), (3 * GAP, False)])
+def test_narrow_gaps_between_points_close_and_wide_ones_stay_empty(width, closed):
+    across, up = (axis.ravel() for axis in np.meshgrid(np.arange(-20, 21), np.arange(-20, 21)))
+    sheet = np.stack([across, up, np.zeros(len(up))], axis=1).astype(np.float32)
+    sheet = sheet[np.abs(sheet[:, 0]) >= width / 2]
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 60
+    above = Camera(120, 120, 120.0, 120.0, 60.0, 60.0, pose)
+    assert empty(above, sheet, 1.0)[40:80, 60].any() != closed
+
+
+def test_a_surface_is_what_a_good_part_of_the_pixels_there_shows(small):
+    found = shown_surfaces(compared(small), small.maps, 0.03)
+    off = np.abs(np.linalg.norm(found[BALL] - CENTRE, axis=1) - RADIUS)
+    assert off.max() < 1e-3
+    assert len(found[BALL]) > 200
+    missed = [replace(m, ids=np.where(m.ids == BALL, 0, m.ids)) if k % 4 == 0 else m for k, m in enumerate(small.maps)]
+    wrong = [replace(m, ids=np.where(m.ids == BALL, BOX, m.ids)) if k == 0 else m for k, m in enumerate(small.maps)]
+    assert len(shown_surfaces(compared(small), missed, 0.03)[BALL]) > 0.75 * len(found[BALL])
+    more = len(shown_surfaces(compared(small), wrong, 0.03)[BOX]) - len(found[BOX])
+    assert more < 0.4 * len(found[BALL])
+
+
+def test_unknown_depth_shows_no_surface(small):
+    blind = [replace(depth, depth=np.zeros_like(depth.depth)) for depth in small.depths]
+    assert shown_surfaces(replace(compared(small), depths=blind), small.maps, 0.03) == {}
+
+
+def test_only_instances_that_have_a_shape_are_looked_at(small):
+    few, many = (small.points[small.labels == i] for i in (BOX, BALL))
+    few, many = few[: FEWEST - 1], many[first_of_each_cube(many, 0.03)]
+    scene = concatenate([
+        initialise(points, np.zeros((len(points), 3), np.uint8), i, 1.0)
+        for i, points in ((0, small.points[small.labels == 0][::50]), (BOX, few), (BALL, many))
+    ])  # fmt: skip
+    found = side_views(compared(small), scene, small.maps, 8)
+    assert [(view.start, view.stop) for view in found] == 8 * [(len(scene) - len(many), len(scene))]
+    for view in found:
+        passes = distance_of_rays(view.target.camera, CENTRE)
+        _, column, row, _ = pixels_in_view(many, view.target.camera)
+        assert not view.target.judged[row, column].any()
+        assert (view.target.judged[passes > RADIUS + 0.1] == np.float32(1 / view.target.judged.size)).all()
+        assert not view.target.inside.any() and not view.target.counted.any() and not view.target.known.any()
+
+
+def test_a_scene_of_background_alone_has_no_sides(small):
+    floor = small.points[small.labels == 0][::50]
+    scene = initialise(floor, np.zeros((len(floor), 3), np.uint8), 0, 1.0)
+    assert side_views(compared(small), scene, small.maps, 4) == []
