@@ -15,7 +15,7 @@ from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, extent
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import LearningRates, PartView, TrainParams, train
 from ss_flow.tasks.gaussians.views import (
     IGNORED,
     NONE_OF_MINE,
@@ -56,7 +56,7 @@ class MergeParams:
     """Weight, in the last pass, of the mean alpha where an instance, seen alone from anywhere, has no surface near; 0 =
     only photos count."""
     side_views: Count = 24
-    """Views of each instance that this is looked at from; a step sees one of one instance."""
+    """Views of each instance that this is looked at from, of which a step sees one; no more in all than steps."""
     reset_opacity: bool = False
     """Whether what collides starts from opacities of at most 0.01, as in the paper."""
     prune_opacity: Fraction = 0.005
@@ -242,7 +242,9 @@ def global_pass(
     ids = np.unique(scene.instance_id)
     compared = views.compared(VisibilityParams())
     seen = _whole_views(compared, masks, ids, params.crop.max_side)
-    parts = side_views(compared, scene, masks, params.side_views) if params.side_weight else []
+    parts: list[PartView] = []
+    if params.side_weight:
+        parts = side_views(compared, scene, masks, params.side_views, params.global_iterations)
     settings = TrainParams(
         iterations=params.global_iterations,
         sh_degree=params.sh_degree,

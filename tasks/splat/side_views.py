@@ -25,49 +25,53 @@ RIM = 0.5
 """Spacings by which the surface goes on beyond its last points."""
 SURFACE_PIXELS = 2_000_000
 """Pixels of all views together whose surface points are looked at."""
+LEAST_KNOWN = 0.9
+"""Share of an instance's pixels whose depth is known from which its surface is."""
 LEAST_SHARE = 1 / 3
 """Share of a cube's pixels that show an instance from which the cube may be its surface."""
 
 
-def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], count: int) -> list[PartView]:
+def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], count: int, most: int) -> list[PartView]:
     """For each instance but the background, views of it alone from directions all over the sphere, from below too.
 
     Photos do not tell what they cannot see: Gaussians grow into the floor below a thing, or off its surface along the
     line of sight. But the surface is known, as points: the centres of the Gaussians that come from the labelled points,
     and the surface points of the pixels that show the instance. Alpha is to be 0 where no point is near; what lies
-    nearer than half a spacing, and gaps between points, count for nothing.
+    nearer than half a spacing, and gaps between points, count for nothing. Where the depth of an instance is unknown in
+    a tenth of its pixels or more, points do not tell where it ends: it has no such views.
 
     scene: ordered by instance, not yet trained together. masks: exclusive label maps of all views. count: views of each
-    instance. Returns targets whose alpha counts alone.
+    instance; fewer, where all instances together would have more than `most`. Returns targets whose alpha counts alone.
     """
-    ids, starts = np.unique(scene.instance_id, return_index=True)
-    stops = np.append(starts[1:], len(scene))
-    shaped = (ids > 0) & (stops - starts >= FEWEST)
-    if not shaped.any():
+    own = {int(i): scene.means[scene.instance_id == i] for i in np.unique(scene.instance_id) if i}
+    spacings = {i: float(np.median(neighbour_spread(centres))) for i, centres in own.items() if len(centres) >= FEWEST}
+    if not spacings:
         return []
-    centres = [scene.means[a:b] for a, b in zip(starts[shaped], stops[shaped], strict=True)]
-    spacings = [float(np.median(neighbour_spread(own))) for own in centres]
-    surfaces = shown_surfaces(views, masks, float(np.median(spacings)))
+    surfaces = shown_surfaces(views, masks, float(np.median(list(spacings.values()))))
+    shaped = sorted(spacings.keys() & surfaces.keys())
     found = []
-    rows = zip(ids[shaped].tolist(), starts[shaped].tolist(), stops[shaped].tolist(), strict=True)
-    for (instance, start, stop), own, spacing in zip(rows, centres, spacings, strict=True):
-        points = np.concatenate([own, surfaces.get(instance, own[:0])])
-        for camera in cameras_around(points, spacing, count):
-            found.append(PartView(start, stop, _target(camera, empty(camera, points, spacing))))
+    for instance in shaped:
+        start = int(np.searchsorted(scene.instance_id, instance))
+        stop = start + len(own[instance])
+        points = np.concatenate([own[instance], surfaces[instance]])
+        for camera in cameras_around(points, spacings[instance], min(count, -(-most // len(shaped)))):
+            found.append(PartView(start, stop, _target(camera, empty(camera, points, spacings[instance]))))
     return found
 
 
 def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) -> dict[int, Float32]:
     """By instance: surface points of pixels that show it, [N, 3] world, one for each cube of space a good part of whose
-    pixels, of all views, do so.
+    pixels, of all views, do so. Instances with too many pixels of unknown depth are left out.
 
     side: of the cubes, world units.
     """
     every = max(1, round(np.sqrt(sum(m.ids.size for m in masks) / SURFACE_PIXELS)))
     places: list[Float32] = []
     shown_there: list[Int64] = []
+    area = np.zeros(np.iinfo(np.uint16).max + 1, np.int64)
     for camera, depth, shown in zip(views.cameras, views.depths, masks, strict=True):
         z = sample_depth(depth, camera, camera)[::every, ::every]
+        area += np.bincount(shown.ids[::every, ::every].ravel(), minlength=len(area))
         row, column = np.nonzero(z > 0)
         surface = surface_of_pixels(every * column, every * row, z[row, column], camera)
         places.append(surface.astype(np.float32))
@@ -80,7 +84,8 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
     pair, first, held = np.unique(cube * most + ids, return_index=True, return_counts=True)
     good = (held >= 2) & (held >= LEAST_SHARE * np.bincount(cube)[pair // most])
     pair, first = pair[good] % most, first[good]
-    return {int(i): points[first[pair == i]] for i in np.unique(pair)}
+    known = np.bincount(ids, minlength=len(area)) >= LEAST_KNOWN * area
+    return {int(i): points[first[pair == i]] for i in np.unique(pair) if known[i]}
 
 
 def cameras_around(points: Float32, spacing: float, count: int) -> Iterator[Camera]:

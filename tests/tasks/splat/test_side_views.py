@@ -78,6 +78,20 @@ def test_unknown_depth_shows_no_surface(small):
     assert shown_surfaces(replace(compared(small), depths=blind), small.maps, 0.03) == {}
 
 
+def test_an_instance_with_much_unknown_depth_has_no_known_surface(small):
+    def found(share: float) -> set[int]:
+        depths = []
+        for depth, ids in zip(small.depths, small.ids, strict=True):
+            z, (row, column) = depth.depth.copy(), np.nonzero(ids == BALL)
+            lost = np.arange(len(row)) < share * len(row)
+            z[row[lost], column[lost]] = 0
+            depths.append(replace(depth, depth=z))
+        return set(shown_surfaces(replace(compared(small), depths=depths), small.maps, 0.03))
+
+    assert found(0.05) == {0, BOX, BALL}
+    assert found(0.2) == {0, BOX}
+
+
 def test_only_instances_that_have_a_shape_are_looked_at(small):
     few, many = (small.points[small.labels == i] for i in (BOX, BALL))
     few, many = few[: FEWEST - 1], many[first_of_each_cube(many, 0.03)]
@@ -85,7 +99,8 @@ def test_only_instances_that_have_a_shape_are_looked_at(small):
         initialise(points, np.zeros((len(points), 3), np.uint8), i, 1.0)
         for i, points in ((0, small.points[small.labels == 0][::50]), (BOX, few), (BALL, many))
     ])  # fmt: skip
-    found = side_views(compared(small), scene, small.maps, 8)
+    found = side_views(compared(small), scene, small.maps, 8, 100)
+    assert len(side_views(compared(small), scene, small.maps, 8, 5)) == 5
     assert [(view.start, view.stop) for view in found] == 8 * [(len(scene) - len(many), len(scene))]
     for view in found:
         passes = distance_of_rays(view.target.camera, CENTRE)
@@ -98,4 +113,4 @@ def test_only_instances_that_have_a_shape_are_looked_at(small):
 def test_a_scene_of_background_alone_has_no_sides(small):
     floor = small.points[small.labels == 0][::50]
     scene = initialise(floor, np.zeros((len(floor), 3), np.uint8), 0, 1.0)
-    assert side_views(compared(small), scene, small.maps, 4) == []
+    assert side_views(compared(small), scene, small.maps, 4, 100) == []
