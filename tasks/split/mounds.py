@@ -86,7 +86,7 @@ def find_contact(points: PointCloud, label: Int32) -> Float32:
     names = np.unique(label[label > 0])
     contact = np.zeros((len(names), len(names)), np.float32)
     if len(names):
-        at_border, beside, _ = borders(label, points, TouchingParams())
+        at_border, beside, _, _ = borders(label, points, TouchingParams())
         big = int(names[-1]) + 1
         point = np.arange(len(at_border), dtype=np.int64)[:, None]
         number, other = np.divmod(np.unique(point * big + label[beside]), big)

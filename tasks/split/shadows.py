@@ -129,7 +129,7 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, params: Shad
 
 def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, params: ShadowParams) -> _Touches:
     """Compare the colours on both sides of all borders, learn which steps are a shadow's, and look for these."""
-    rows, beside, (point, touched) = borders(label, cloud, TouchingParams())
+    rows, beside, _, (point, touched) = borders(label, cloud, TouchingParams())
     change, color, near = _across(cloud, label, rows[point], touched)
     own, eye = label[rows[point]], middle_of(cameras)
     low, high = np.minimum(own, touched), np.maximum(own, touched)
