@@ -174,7 +174,7 @@ class _Pieces:
             held.append(np.zeros((len(tally.held), len(names)), np.float32))
             held[-1][:, column] = tally.held
             quality.append(tally.quality.astype(np.float64))
-        own = [(row,) for row in range(len(names))]
+        own: list[tuple[int, ...]] = [(row,) for row in range(len(names))]
         return _Pieces(seen, held, quality, stuff, contact, own, mounds, sheets, params)
 
     @functools.cached_property
