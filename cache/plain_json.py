@@ -20,8 +20,8 @@ def from_json(content: bytes) -> Any:
 
 
 def as_json(value: Any) -> bytes:
-    """A document of one line. Numbers must be finite."""
+    """A document of one line, spaced as the standard library does. Numbers must be finite."""
     try:
-        return _write(value)
+        return msgspec.json.format(_write(value), indent=0)
     except UnicodeEncodeError:  # the name of a file may hold bytes that are no text
         return json.dumps(value).encode()

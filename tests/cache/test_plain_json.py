@@ -26,6 +26,11 @@ def test_what_the_standard_library_writes_is_read(value: object):
     assert from_json(json.dumps(value).encode()) == value
 
 
+def test_a_line_is_spaced_as_by_the_standard_library():
+    value = {"event": "started", "inputs": {"a": ["b", 1], "c": {}}, "warnings": []}
+    assert as_json(value) == json.dumps(value).encode()
+
+
 def test_infinity_is_read():
     assert from_json(b'{"limit": Infinity, "least": -Infinity}') == {"limit": float("inf"), "least": float("-inf")}
 
