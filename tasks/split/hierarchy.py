@@ -23,6 +23,7 @@ from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
 from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 _IOU = (0.5, 0.8)
 """IoU of a mask with the pieces from which on it begins to show them as one, and from which it does."""
@@ -91,12 +92,13 @@ def hierarchy(
     `min_agreement`; a thing and stuff never are. The order of the views does not matter, nor that of the masks.
     """
     names = np.unique(labels.label[labels.label > 0]).astype(np.int32)
-    surface = lit_surfaces(points, cameras, labels.label, params.shadows)
+    ends = borders(labels.label, points, TouchingParams())
+    surface = lit_surfaces(points, cameras, labels.label, ends, params.shadows)
     _, surface_of = np.unique(surface[names], return_inverse=True)
     is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)[surface_of]
-    mounds = find_mounds(points, cameras, labels, tallies, around=params.around, height=params.bulge)
-    contact = find_contact(points, labels.label)
-    sheets = find_sheets(points, labels, flush=params.flush, height=params.bulge)
+    mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)
+    contact = find_contact(ends, labels.label)
+    sheets = find_sheets(points, labels, ends, flush=params.flush, height=params.bulge)
     pieces = _Pieces.of(names, tallies, is_stuff, contact, mounds, sheets, params)
     node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
     top = list(range(len(names)))  # the tree's row of each piece

@@ -10,7 +10,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
-from ss_flow.tasks.split.votes.touching import TouchingParams, borders
+from ss_flow.tasks.split.votes.touching import Borders
 
 _FOOT = 0.3
 """Share of a label's points, those nearest to what surrounds it, that are its foot."""
@@ -47,13 +47,20 @@ class Mounds:
 
 
 def find_mounds(
-    points: PointCloud, cameras: Cameras, labels: PointLabels, tallies: Sequence[Tally], *, around: float, height: float
+    points: PointCloud,
+    cameras: Cameras,
+    labels: PointLabels,
+    tallies: Sequence[Tally],
+    ends: Borders,
+    *,
+    around: float,
+    height: float,
 ) -> Mounds:
     """Which labels bulge out of what surrounds them, as a bag on a sofa does and a label printed on a box does not.
 
-    around: see `Mounds`. A label bulges when a tenth of its points lie in front of the plane of its foot (the points
-    nearest to its neighbours) by at least the share `height` of its extent, and it does not go on smoothly into its
-    neighbours along half of its border, as a part of something round does.
+    ends: the borders of the labels. around: see `Mounds`. A label bulges when a tenth of its points lie in front of the
+    plane of its foot (the points nearest to its neighbours) by at least the share `height` of its extent, and it does
+    not go on smoothly into its neighbours along half of its border, as a part of something round does.
     """
     from scipy.spatial import cKDTree
 
@@ -66,9 +73,9 @@ def find_mounds(
     bulges = np.zeros(len(names), bool)
     if not len(names):
         return Mounds(share, size.astype(np.int32), bulges, around)
-    ends = _ends(labels.label, names, points)
+    apart = _ends(labels.label, names, ends)
     rows_of, eye = rows_by_label(labels.label), middle_of(cameras)
-    for row in np.flatnonzero((size >= _FEW) & ends & (share > _BESIDE).any(axis=1)):
+    for row in np.flatnonzero((size >= _FEW) & apart & (share > _BESIDE).any(axis=1)):
         own = thinned(points.points[rows_of[int(names[row])]], _MOST)
         rest = np.sort(np.concatenate([rows_of[name] for name in names[share[row] > _BESIDE].tolist()]))
         distance, _ = cKDTree(points.points[rest]).query(own)
@@ -78,30 +85,28 @@ def find_mounds(
     return Mounds(share, size.astype(np.int32), bulges, around)
 
 
-def find_contact(points: PointCloud, label: Int32) -> Float32:
+def find_contact(ends: Borders, label: Int32) -> Float32:
     """[L, L] at how many points, on both sides, the labels that occur, ascending, touch each other in space.
 
-    label: [N] of the points, 0 = none.
+    ends: the borders of the labels [N], 0 = none.
     """
     names = np.unique(label[label > 0])
     contact = np.zeros((len(names), len(names)), np.float32)
     if len(names):
-        at_border, beside, _, _ = borders(label, points, TouchingParams())
         big = int(names[-1]) + 1
-        point = np.arange(len(at_border), dtype=np.int64)[:, None]
-        number, other = np.divmod(np.unique(point * big + label[beside]), big)
-        own = label[at_border[number]]
+        point = np.arange(len(ends.rows), dtype=np.int64)[:, None]
+        number, other = np.divmod(np.unique(point * big + label[ends.beside]), big)
+        own = label[ends.rows[number]]
         touches = (other > 0) & (other != own)
         pair = np.searchsorted(names, own[touches]), np.searchsorted(names, other[touches])
         np.add.at(contact, pair, 1)
     return contact + contact.T
 
 
-def _ends(label: Int32, names: Int32, points: PointCloud) -> Bool:
+def _ends(label: Int32, names: Int32, ends: Borders) -> Bool:
     """[L] which labels do not go on smoothly into others along half of their border."""
-    at_border, _, _, touches = borders(label, points, TouchingParams())
-    smooth = np.zeros(len(at_border), bool)
-    smooth[touches[0][touches[1] > 0]] = True
-    of = np.searchsorted(names, label[at_border])
+    smooth = np.zeros(len(ends.rows), bool)
+    smooth[ends.smooth[0][ends.smooth[1] > 0]] = True
+    of = np.searchsorted(names, label[ends.rows])
     length = np.bincount(of, minlength=len(names))
     return 2 * np.bincount(of, smooth, len(names)) < np.maximum(length, 1)

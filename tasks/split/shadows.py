@@ -15,7 +15,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, UInt8
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
 from ss_flow.tasks.ranges import Count, Fraction
-from ss_flow.tasks.split.votes.touching import TouchingParams, borders
+from ss_flow.tasks.split.votes.touching import Borders, TouchingParams
 
 _GAMMA = 2.2
 _DARKEST = 4
@@ -102,17 +102,17 @@ class _Touches:
     """[T] whether the colour stays there, or changes as into a shadow."""
 
 
-def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, params: ShadowParams) -> Int32:
+def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, params: ShadowParams) -> Int32:
     """[L + 1] the lowest label of the surface that each label is a piece of; itself where no shadow parts it.
 
-    label: [N] of the cloud's points, 0 = none. Round by round, the labels are united that lie in one plane and touch
-    without an edge where light alone tells them apart: those that do so along the largest share of a border first, each
-    once a round.
+    label: [N] of the cloud's points, 0 = none; ends: their borders. Round by round, the labels are united that lie in
+    one plane and touch without an edge where light alone tells them apart: those that do so along the largest share of
+    a border first, each once a round.
     """
     surface = np.arange(int(label.max(initial=0)) + 1, dtype=np.int32)
     if not params.agreement or not label.any():
         return surface
-    touches = _touches(cloud, cameras, label, params)
+    touches = _touches(cloud, cameras, label, ends, params)
     while touches.alike.any():
         taken: set[int] = set()
         for a, b in _meeting(touches, surface, label, params):
@@ -127,16 +127,16 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, params: Shad
     return surface
 
 
-def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, params: ShadowParams) -> _Touches:
+def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, params: ShadowParams) -> _Touches:
     """Compare the colours on both sides of all borders, learn which steps are a shadow's, and look for these."""
-    rows, beside, _, (point, touched) = borders(label, cloud, TouchingParams())
+    rows, beside, _, (point, touched) = ends
     change, color, near = _across(cloud, label, rows[point], touched)
     own, eye = label[rows[point]], middle_of(cameras)
     low, high = np.minimum(own, touched), np.maximum(own, touched)
     change[own == high] *= -1  # from the lower label to the higher one
     order = np.lexsort((high, low))
-    ends = np.flatnonzero(np.diff(low[order]) | np.diff(high[order])) + 1
-    contacts = np.split(order, ends) if len(order) else []
+    starts = np.flatnonzero(np.diff(low[order]) | np.diff(high[order])) + 1
+    contacts = np.split(order, starts) if len(order) else []
     normals: list[Float64] = []
     steps: list[_Step] = []
     for here in contacts:

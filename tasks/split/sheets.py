@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ss_flow.tasks.artifacts import Bool, Float64, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, plane_through, thinned
-from ss_flow.tasks.split.votes.touching import TouchingParams, borders
+from ss_flow.tasks.split.votes.touching import Borders
 
 _FEW = 20
 """Points at its border with which the share of it that goes on counts half: of so short a border little is known."""
@@ -84,18 +84,17 @@ class Sheets:
         return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])], _MOST)
 
 
-def find_sheets(points: PointCloud, labels: PointLabels, *, flush: float, height: float) -> Sheets:
-    """How the labels of `points` go on into each other; flush, height: see `Sheets`."""
+def find_sheets(points: PointCloud, labels: PointLabels, ends: Borders, *, flush: float, height: float) -> Sheets:
+    """How the labels of `points`, with these borders, go on into each other; flush, height: see `Sheets`."""
     names = np.unique(labels.label[labels.label > 0])
     if not len(names):
         return Sheets(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), [], points, flush, height)
-    at_border, _, touches, smooth = borders(labels.label, points, TouchingParams())
-    own = np.searchsorted(names, labels.label[at_border])
+    own = np.searchsorted(names, labels.label[ends.rows])
     rows_of = rows_by_label(labels.label)
     return Sheets(
-        smooth=_counts(own, names, smooth),
-        meets=_counts(own, names, touches),
-        border=np.bincount(own[np.unique(touches[0])], minlength=len(names)).astype(np.float64),
+        smooth=_counts(own, names, ends.smooth),
+        meets=_counts(own, names, ends.touches),
+        border=np.bincount(own[np.unique(ends.touches[0])], minlength=len(names)).astype(np.float64),
         rows=[rows_of[name] for name in names.tolist()],
         points=points,
         flush=flush,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
@@ -88,12 +88,21 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
             return lowest[united][label]
 
 
-def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> tuple[Int32, Int32, Int32, Int32]:
-    """Where labels end, and where they go on into another.
+class Borders(NamedTuple):
+    """Where labels end, and where they go on into another."""
 
-    label: [N], 0 = none. Returns the labelled points that have some of another label, or of none, beside them [R]; the
-    points beside each [R, _BESIDE]; which of the R touches which other label [2, T]; and which does so without an edge.
-    """
+    rows: Int32
+    """[R] the labelled points that have some of another label, or of none, beside them."""
+    beside: Int32
+    """[R, _BESIDE] the points beside each."""
+    touches: Int32
+    """[2, T] which of the R touches which other label."""
+    smooth: Int32
+    """[2, S] which does so without an edge."""
+
+
+def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> Borders:
+    """The borders of labels [N] of a cloud's points, 0 = none."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(cloud.points)
@@ -116,10 +125,10 @@ def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> tuple[In
     even = np.abs(np.einsum("tc,tc->t", normal[i], normal[j])) >= np.cos(np.radians(params.angle))
     for end in (i, j):
         even &= np.abs(np.einsum("tc,tc->t", normal[end], ahead)) <= np.sin(np.radians(params.angle))
-    names = int(label.max()) + 1
+    names = int(label.max(initial=0)) + 1
     touches = i * names + label[rows[j]]
     some, smooth = (np.stack(np.divmod(np.unique(of), names)).astype(np.int32) for of in (touches, touches[even]))
-    return rows, beside, some, smooth
+    return Borders(rows, beside, some, smooth)
 
 
 def _nearest(tree: cKDTree, rows: Int32, count: int, reach: float) -> Int32:

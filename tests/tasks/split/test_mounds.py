@@ -3,6 +3,7 @@ import pytest
 
 from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
 from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 STEP = 0.02
 
@@ -33,7 +34,8 @@ def on_seat(height: float) -> Mounds:
     beside = np.array([[0, 40], [40, 0]], np.int32)
     seen = Tally("a", both, np.bincount(label)[1:].astype(np.int32), np.zeros((0, 2), np.int32), beside, np.zeros(0))
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, STEP)
-    return find_mounds(cloud, cameras, labels, [seen], around=0.8, height=0.09)
+    ends = borders(labels.label, cloud, TouchingParams())
+    return find_mounds(cloud, cameras, labels, [seen], ends, around=0.8, height=0.09)
 
 
 @pytest.mark.parametrize(("height", "stands"), [(0.0, False), (0.12, True), (0.2, True)])
@@ -53,7 +55,7 @@ def test_labels_touch_where_their_points_lie_side_by_side():
     places = np.concatenate([strip, *(strip + np.array(at) for at in ((0.2, 0, 0), (0.6, 0, 0), (0.4, 0, 0.5)))])
     label = np.repeat(np.array([1, 3, 0, 4], np.int32), len(strip))
     cloud = PointCloud(places.astype(np.float32), np.zeros((len(places), 3), np.uint8), 1.0, STEP)
-    contact = find_contact(cloud, label)
+    contact = find_contact(borders(label, cloud, TouchingParams()), label)
     assert contact.tolist() == contact.T.tolist()
     assert contact[0, 1] >= 2 * 50  # a row of points on either side
     assert not contact[[0, 1, 2, 0, 1], [0, 1, 2, 2, 2]].any()
@@ -61,4 +63,5 @@ def test_labels_touch_where_their_points_lie_side_by_side():
 
 def test_of_no_labels_none_touch():
     cloud = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), 1.0, STEP)
-    assert find_contact(cloud, np.zeros(1, np.int32)).shape == (0, 0)
+    nothing = np.zeros(1, np.int32)
+    assert find_contact(borders(nothing, cloud, TouchingParams()), nothing).shape == (0, 0)

@@ -4,6 +4,7 @@ import pytest
 from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
 from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 STEP = 0.02
 SHADE = np.array([0.5, 0.53, 0.58])
@@ -36,7 +37,9 @@ def scene(*patches: Patch) -> tuple[PointCloud, Cameras, np.ndarray]:
 
 def surfaces(*patches: Patch, **changes) -> list[int]:
     """The surface of each patch."""
-    return lit_surfaces(*scene(*patches), ShadowParams(**{"repeats": 1, **changes}))[1:].tolist()
+    cloud, cameras, label = scene(*patches)
+    params = ShadowParams(**{"repeats": 1, **changes})
+    return lit_surfaces(cloud, cameras, label, borders(label, cloud, TouchingParams()), params)[1:].tolist()
 
 
 def floor(shade: np.ndarray = SHADE) -> list[Patch]:

@@ -4,6 +4,7 @@ import pytest
 from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 STEP = 0.01
 TABLE, PAGE, MUG = 0, 1, 2
@@ -41,7 +42,8 @@ def scene(page: float = 0.0, mug: float = 0.1, table: float = 0.8) -> tuple[Poin
 
 
 def on_table(flush: float = 0.6, **sizes: float) -> Sheets:
-    return find_sheets(*scene(**sizes), flush=flush, height=0.09)
+    cloud, labels = scene(**sizes)
+    return find_sheets(cloud, labels, borders(labels.label, cloud, TouchingParams()), flush=flush, height=0.09)
 
 
 def test_a_mug_stands_on_the_page_that_lies_on_a_table():
