@@ -94,11 +94,12 @@ class _Encoder:
         self._pending += content
 
     def _add_items(self, value: list[Any] | tuple[Any, ...]) -> None:
-        self._pending += b"l" + _LENGTH(len(value))
+        pending = self._pending  # the same one after `self.add`, which clears it at most
+        pending += b"l" + _LENGTH(len(value))
         for item in value:  # most are digests and names, or pairs with them
             if type(item) is str:
                 content = item.encode()
-                self._pending += b"s" + _LENGTH(len(content)) + content
+                pending += b"s" + _LENGTH(len(content)) + content
             elif type(item) is tuple:
                 self._add_items(item)
             else:

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
-_read = msgspec.json.Decoder().decode
+T = TypeVar("T")
+
 _write = msgspec.json.Encoder().encode
 
 
-def from_json(content: bytes) -> Any:
-    """What a document holds. Raises ValueError for what is no JSON."""
+def from_json(content: bytes, kind: type[T]) -> T:
+    """What a document holds: a `kind`, say a dataclass of plain data. Raises ValueError for anything else."""
     try:
-        return _read(content)
+        return _reader(kind).decode(content)
+    except msgspec.ValidationError:
+        raise
     except msgspec.DecodeError:  # the standard library also reads what it writes itself: NaN and Infinity
-        return json.loads(content)
+        return msgspec.convert(json.loads(content), kind)
+
+
+@functools.cache
+def _reader(kind: type[T]) -> msgspec.json.Decoder[T]:
+    return msgspec.json.Decoder(kind)
 
 
 def as_json(value: Any) -> bytes:

@@ -41,7 +41,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -70,7 +70,8 @@ class Entry:
     bytes: int
 
 
-class Action(NamedTuple):
+@dataclass(frozen=True)
+class Action:
     """The record of one computation: what went in (the key's components) and what came out."""
 
     key: str
@@ -258,8 +259,10 @@ class Store:
         path = f"{self._actions}/{key[:2]}/{key}.json"
         try:
             content, modified = read_stamped(path)
-            action = _action_of(from_json(content), key)
-        except (FileNotFoundError, ValueError, TypeError, KeyError):  # not there, or not one of ours
+            action = from_json(content, Action)
+        except (FileNotFoundError, ValueError):  # not there, or not one of ours
+            return None
+        if action.key != key or not _is_sound(action):
             return None
         if not whole:
             return action
@@ -273,7 +276,7 @@ class Store:
 
     def record(self, action: Action) -> None:
         """Publish an action; its outputs must be stored already."""
-        self._write(self.action_path(action.key), json.dumps(action._asdict(), separators=(",", ":")))
+        self._write(self.action_path(action.key), json.dumps(vars(action), separators=(",", ":")))
 
     def put_part(self, name: str, part: Any) -> None:
         """Keep what a digest in the components of actions stands for, once for all of them; plain data."""
@@ -349,15 +352,9 @@ def _records(folder: str) -> Iterator[Entry]:
             yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)
 
 
-def _action_of(record: dict[str, Any], key: str) -> Action:
-    """Raises ValueError, TypeError or KeyError for what is not the record of this key."""
-    record["outputs"], record["warnings"] = tuple(record["outputs"]), tuple(record["warnings"])
-    action = Action(**record)
-    if action.key != key or not isinstance(action.components, dict) or not all(map(DIGEST.fullmatch, action.outputs)):
-        raise ValueError(f"not the record of {key}")
-    if not action.is_list and len(action.outputs) != 1:
-        raise ValueError(f"one output is due, not {len(action.outputs)}")
-    return action
+def _is_sound(action: Action) -> bool:
+    """Whether the outputs are digests, which lead nowhere out of the store, and one where one is due."""
+    return all(map(DIGEST.fullmatch, action.outputs)) and (action.is_list or len(action.outputs) == 1)
 
 
 def verified(folder: Path, object_digest: str) -> Any:

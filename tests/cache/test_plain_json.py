@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -18,12 +20,12 @@ def test_what_is_written_is_what_the_standard_library_reads(value: object):
     line = as_json(value)
     assert b"\n" not in line
     assert json.loads(line) == value
-    assert from_json(line) == value
+    assert from_json(line, Any) == value
 
 
 @given(DOCUMENTS)
 def test_what_the_standard_library_writes_is_read(value: object):
-    assert from_json(json.dumps(value).encode()) == value
+    assert from_json(json.dumps(value).encode(), Any) == value
 
 
 def test_a_line_is_spaced_as_by_the_standard_library():
@@ -32,10 +34,32 @@ def test_a_line_is_spaced_as_by_the_standard_library():
 
 
 def test_infinity_is_read():
-    assert from_json(b'{"limit": Infinity, "least": -Infinity}') == {"limit": float("inf"), "least": float("-inf")}
+    assert from_json(b'{"limit": Infinity, "least": -Infinity}', Any) == {"limit": float("inf"), "least": float("-inf")}
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b'{"a": 1} more', b"\x00" * 100])
 def test_what_is_no_document_is_a_value_error(content: bytes):
     with pytest.raises(ValueError):
-        from_json(content)
+        from_json(content, Any)
+
+
+@dataclass(frozen=True)
+class Reading:
+    name: str
+    values: tuple[float, ...]
+    note: str = ""
+
+
+def test_a_document_of_a_kind():
+    reading = Reading("depth", (1.5, 2.0))
+    assert from_json(b'{"name": "depth", "values": [1.5, 2]}', Reading) == reading
+    assert from_json(json.dumps(vars(reading)).encode(), Reading) == reading
+    assert from_json(b'{"name": "depth", "values": [Infinity]}', Reading).values == (float("inf"),)
+
+
+@pytest.mark.parametrize(
+    "content", [b'{"name": "depth"}', b'{"name": 1, "values": []}', b"[]", b'{"name": 1, "values": [NaN]}']
+)
+def test_a_document_of_another_kind_is_a_value_error(content: bytes):
+    with pytest.raises(ValueError):
+        from_json(content, Reading)
