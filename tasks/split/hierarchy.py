@@ -63,7 +63,8 @@ class HierarchyParams:
     around: Fraction = 0.8
     """Share of its border with other labels along which a piece is surrounded by what it stands on."""
     bulge: Fraction = 0.09
-    """How far it must rise from there, as a share of its extent: a bag on a sofa is no part of the sofa."""
+    """How far it must rise from there, as a share of its extent, where its colours are half like those around it; the
+    farther, the more they are alike. A bag on a sofa is no part of the sofa, but its arm is."""
     flush: Fraction = 0.6
     """Share of its border along which a flat piece goes on without an edge into something larger: a mug on a page that
     lies on a table is no part of the page. 1 = none does."""

@@ -10,7 +10,8 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
-from ss_flow.tasks.split.votes.touching import Borders
+from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
+from ss_flow.tasks.split.votes.touching import Borders, TouchingParams
 
 _FOOT = 0.3
 """Share of a label's points, those nearest to what surrounds it, that are its foot."""
@@ -24,6 +25,8 @@ _TRIM = 0.02
 """Share of the points, on every side, that an extent leaves out."""
 _MOST = 2000
 """So many points of a label tell."""
+_LEAST = 0.5
+"""Share of the height that is asked for at least, however much the colours differ."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,10 @@ def find_mounds(
     """Which labels bulge out of what surrounds them, as a bag on a sofa does and a label printed on a box does not.
 
     ends: the borders of the labels. around: see `Mounds`. A label bulges when a tenth of its points lie in front of the
-    plane of its foot (the points nearest to its neighbours) by at least the share `height` of its extent, and it does
-    not go on smoothly into its neighbours along half of its border, as a part of something round does.
+    plane of its foot (the points nearest to its neighbours) far enough, and it does not go on smoothly into its
+    neighbours along half of its border, as a part of something round does. Far enough is the share `height` of its
+    extent where its colours are half like those of its neighbours; twice as far where they are the same, since the arm
+    of a sofa rises from its seat too, and down to half as far where they differ.
     """
     from scipy.spatial import cKDTree
 
@@ -74,14 +79,18 @@ def find_mounds(
     if not len(names):
         return Mounds(share, size.astype(np.int32), bulges, around)
     apart = _ends(labels.label, names, ends)
-    rows_of, eye = rows_by_label(labels.label), middle_of(cameras)
+    rows_of, eye, bins = rows_by_label(labels.label), middle_of(cameras), bins_of(points.colors)
+    spread = TouchingParams().color_spread
     for row in np.flatnonzero((size >= _FEW) & apart & (share > _BESIDE).any(axis=1)):
-        own = thinned(points.points[rows_of[int(names[row])]], _MOST)
+        inside = rows_of[int(names[row])]
+        own = thinned(points.points[inside], _MOST)
         rest = np.sort(np.concatenate([rows_of[name] for name in names[share[row] > _BESIDE].tolist()]))
         distance, _ = cKDTree(points.points[rest]).query(own)
         centre, normal = plane_through(own[distance <= np.quantile(distance, _FOOT)])
         rises = np.quantile((own - centre) @ towards(normal, centre, eye), 0.9)
-        bulges[row] = rises >= max(height * box_diagonal(own, _TRIM), 2 * points.spacing)
+        alike = likeness(histogram(bins[inside], spread), histogram(bins[rest], spread))
+        enough = height * max(2 * alike, _LEAST) * box_diagonal(own, _TRIM)
+        bulges[row] = rises >= max(enough, 2 * points.spacing)
     return Mounds(share, size.astype(np.int32), bulges, around)
 
 

@@ -7,14 +7,14 @@ and have the same colours.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, Int32, PointCloud, UInt8
+from ss_flow.tasks.artifacts import Bool, Float32, Int32, PointCloud
 from ss_flow.tasks.ranges import Fraction, Positive, Range
+from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -29,10 +29,6 @@ _FEW = 4
 """Points of its label, itself among them, below which a point has no normal."""
 _AT_ONCE = 1 << 16
 """Points whose normals are found at once."""
-_BIN = 8.0
-"""Edge of a bin of the histograms, in CIELAB units."""
-_BINS = (13, 32, 32)
-"""Bins of L* from 0 on, and of a* and b* from -128 on."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,7 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
     names = names[order]
     label = np.argsort(order).astype(np.int32)[inverse[1:]]
     rows, beside, _, touches = borders(label, cloud, params)
-    bins = _bins(cloud.colors)
+    bins = bins_of(cloud.colors)
     colors: dict[int, Float32] = {}
     united = np.arange(len(names), dtype=np.int32)
     while True:
@@ -77,8 +73,8 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
             if taken & {a, b}:
                 continue
             for name in {a, b} - colors.keys():
-                colors[name] = _histogram(bins[label == name], params.color_spread)
-            if _cosine(colors[a], colors[b]) >= params.similarity:
+                colors[name] = histogram(bins[label == name], params.color_spread)
+            if likeness(colors[a], colors[b]) >= params.similarity:
                 taken |= {a, b}
                 united[united == b] = a
                 colors[a] += colors.pop(b)
@@ -151,23 +147,6 @@ def _normals(points: Float32, rows: Int32, near: Int32, label: Int32) -> Float32
     return np.where(count >= _FEW, axes[:, :, 0], 0).astype(np.float32)
 
 
-def _bins(colors: UInt8) -> Int32:
-    """The bin of each colour [N, 3], as a flat index: [N]."""
-    import cv2
-
-    lab = cv2.cvtColor(colors[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
-    bins = ((lab + np.array([0, 128, 128], np.float32)) / _BIN).astype(np.int32)
-    return np.ravel_multi_index(tuple(bins.T), _BINS).astype(np.int32)
-
-
-def _histogram(bins: Int32, spread: float) -> Float32:
-    """How often each bin occurs, smoothed: [B]."""
-    from scipy.ndimage import gaussian_filter
-
-    count = np.bincount(bins, minlength=math.prod(_BINS)).reshape(_BINS).astype(np.float32)
-    return np.asarray(gaussian_filter(count, spread / _BIN, mode="constant")).ravel()
-
-
 def _meeting(own: Int32, at_border: Bool, point: Int32, touched: Int32, contact: float) -> list[tuple[int, int]]:
     """The pairs of labels that touch along enough of the border of one of them, the largest share first.
 
@@ -183,7 +162,3 @@ def _meeting(own: Int32, at_border: Bool, point: Int32, touched: Int32, contact:
     order = np.lexsort((high, low, -share))
     order = order[share[order] >= contact]
     return list(zip(low[order].tolist(), high[order].tolist(), strict=True))
-
-
-def _cosine(a: Float32, b: Float32) -> float:
-    return float(a @ b / np.sqrt((a @ a) * (b @ b)))

@@ -6,6 +6,7 @@ from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 STEP = 0.02
+BEIGE, RED = (200, 180, 150), (150, 20, 40)
 
 
 def grid(width: float, depth: float) -> np.ndarray:
@@ -17,8 +18,8 @@ SEAT = grid(1.2, 0.8)
 HOLE = (np.abs(SEAT[:, :2]) < 0.15).all(axis=1)
 
 
-def on_seat(height: float) -> Mounds:
-    """A seat (label 1), seen from above, with something of this height in the middle of it (label 2)."""
+def on_seat(height: float, color: tuple[int, int, int]) -> Mounds:
+    """A beige seat (label 1), seen from above, with something of this height and colour in the middle (label 2)."""
     top = grid(0.3, 0.3) + np.array([0, 0, height])
     steps = np.arange(STEP, height, STEP)
     rim = top[(np.abs(top[:, :2]) > 0.13).any(axis=1)]
@@ -33,14 +34,18 @@ def on_seat(height: float) -> Mounds:
     both = np.array([1, 2], np.int32)
     beside = np.array([[0, 40], [40, 0]], np.int32)
     seen = Tally("a", both, np.bincount(label)[1:].astype(np.int32), np.zeros((0, 2), np.int32), beside, np.zeros(0))
-    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, STEP)
+    colors = np.array([BEIGE, color], np.uint8)[label - 1]
+    cloud = PointCloud(places, colors, 1.0, STEP)
     ends = borders(labels.label, cloud, TouchingParams())
     return find_mounds(cloud, cameras, labels, [seen], ends, around=0.8, height=0.09)
 
 
-@pytest.mark.parametrize(("height", "stands"), [(0.0, False), (0.12, True), (0.2, True)])
-def test_a_bag_on_a_seat_stands_on_it_and_a_patch_sewn_on_does_not(height, stands):
-    assert on_seat(height).standing([0, 1]).tolist() == [False, stands]
+@pytest.mark.parametrize(
+    ("height", "color", "stands"),
+    [(0.0, RED, False), (0.12, BEIGE, False), (0.12, RED, True), (0.3, BEIGE, True), (0.3, RED, True)],
+)
+def test_a_bag_on_a_seat_stands_on_it_and_a_patch_sewn_on_or_a_fold_of_it_does_not(height, color, stands):
+    assert on_seat(height, color).standing([0, 1]).tolist() == [False, stands]
 
 
 def test_nothing_stands_on_something_smaller_or_on_what_does_not_surround_it():
