@@ -25,8 +25,9 @@ _TRIM = 0.02
 """Share of the points, on every side, that an extent leaves out."""
 _MOST = 2000
 """So many points of a label tell."""
-_LEAST = 0.5
-"""Share of the height that is asked for at least, however much the colours differ."""
+_LEAST = 2 / 3
+"""Share of the height that is asked for at least, however much the colours differ: what is printed on a far wall rises
+from it by half as much, in the noise of the depth."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def find_mounds(
     plane of its foot (the points nearest to its neighbours) far enough, and it does not go on smoothly into its
     neighbours along half of its border, as a part of something round does. Far enough is the share `height` of its
     extent where its colours are half like those of its neighbours; twice as far where they are the same, since the arm
-    of a sofa rises from its seat too, and down to half as far where they differ.
+    of a sofa rises from its seat too, and down to two thirds as far where they differ.
     """
     from scipy.spatial import cKDTree
 
