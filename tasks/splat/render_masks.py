@@ -10,14 +10,15 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Gaussians, LabelMap
+from ss_flow.tasks.artifacts import Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.geometry.images import at_diagonal, decode_valid, depth_at_frame_size
+from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid, depth_at_frame_size
 from ss_flow.tasks.ranges import Fraction
+from ss_flow.tasks.splat.photo_borders import near_border, settled_by_photo
 
 _LABELS_AT_ONCE = 16
 """So many mask images are held at once."""
@@ -39,6 +40,9 @@ class RenderMasksParams:
     background: Literal["fringe", "anywhere"] = "fringe"
     """Where the background may take a pixel of a mask: "fringe" - near the mask's border, if the depth is known there,
     as what an instance lacks Gaussians for shows background too; or "anywhere"."""
+    strips: Literal["photo", "scene"] = "photo"
+    """Whose the thin strips are that the scene would take off a mask: "photo" - that one's of the two whose borders lie
+    where the photo changes; or the "scene"'s, as in the paper."""
 
 
 @task(
@@ -57,7 +61,8 @@ def render_masks(
 
     0 where that is the background, where the scene leaves a hole, and where a frame is not valid. A pixel keeps its
     refined id where that weighs half as much or more, and where `params` holds the other instance or the background
-    off; an instance that has masks but no Gaussians keeps what the scene calls background.
+    off; an instance that has masks but no Gaussians keeps what the scene calls background. Where depth and colour are
+    some pixels apart, so are Gaussians and photo: thin strips are settled by the photo.
 
     views: all of the scene. refined: their exclusive masks after refinement.
     """
@@ -65,23 +70,17 @@ def render_masks(
     maps = []
     for view, (frame, depth, known) in enumerate(zip(views.frames, views.depths, refined, strict=True)):
         ids = _ids_of_view(scene, views.cameras[view], known, params.share)
+        reach = round(at_diagonal(_FRINGE, *known.ids.shape))
         keeps = np.isin(known.ids, absent)
         if params.background == "fringe":
-            keeps |= ~(_at_border(known.ids) & (depth_at_frame_size(depth, frame) > 0))
+            keeps |= ~(near_border(known.ids, reach) & (depth_at_frame_size(depth, frame) > 0))
         ids = np.where((ids == 0) & keeps, known.ids, ids)
+        if params.strips == "photo":
+            ids = settled_by_photo(decode_rgb(frame), known.ids, ids, reach)
         ids[~decode_valid(frame)] = 0
         maps.append(LabelMap(known.name, ids))
         progress(view + 1, len(refined), known.name)
     return tuple(maps)
-
-
-def _at_border(ids: np.ndarray) -> Bool:
-    """[H, W] which pixels have another id within `_FRINGE` of them."""
-    import cv2
-
-    reach = round(at_diagonal(_FRINGE, *ids.shape))
-    window = np.ones((2 * reach + 1,) * 2, np.uint8)
-    return cv2.erode(ids, window) != cv2.dilate(ids, window)
 
 
 def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap, share: float) -> np.ndarray:
