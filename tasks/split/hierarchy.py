@@ -3,7 +3,8 @@
 A segmenter shows the box, its faces and the label printed on it, and often the box with what stands beside it. The
 level that is a thing is the one that the views repeat: most views which see two pieces of it have a mask with just
 these pieces, and the segmenter is as sure of that mask as of those of the pieces. Two things are known without masks:
-what light alone parts is one surface, and what touches nothing but walls and floors stands alone. Beyond Split&Splat.
+what light alone or nothing parts is one surface, and what touches nothing but walls and floors stands alone. Beyond
+Split&Splat.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class HierarchyParams:
     stuff: StuffParams = field(default_factory=StuffParams)
     """What is a wall or a floor rather than a thing."""
     shadows: ShadowParams = field(default_factory=ShadowParams)
-    """What is one surface in light and shadow, whatever the masks say."""
+    """What is one surface, in light and shadow or without a border that can be seen, whatever the masks say."""
     alone: Fraction = 0.3
     """Share by which an agreement rises towards 1 where the pieces touch each other and stuff, and nothing else: a
     chair on a floor. Less where they touch other things, down to nothing at half of what they touch."""
@@ -88,8 +89,8 @@ def hierarchy(
 ) -> Hierarchy:
     """The tree of what the labels make up.
 
-    labels: of `points`. tallies: one a view, of these labels. What light alone parts is united first. Then, round by
-    round, the sets of pieces with the highest agreement are, each piece once a round, until none reaches
+    labels: of `points`. tallies: one a view, of these labels. What light alone or nothing parts is united first. Then,
+    round by round, the sets of pieces with the highest agreement are, each piece once a round, until none reaches
     `min_agreement`; a thing and stuff never are. The order of the views does not matter, nor that of the masks.
     """
     names = np.unique(labels.label[labels.label > 0]).astype(np.int32)

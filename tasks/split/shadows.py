@@ -1,9 +1,10 @@
-"""Which labels are one surface, part of it in the light and part in a shadow. Beyond Split&Splat.
+"""Which labels are one surface: parted by a shadow, or by nothing that can be seen. Beyond Split&Splat.
 
 A segmenter cuts at a hard shadow as at the edge of a print. One lamp lights the whole scene, though: of each colour of
 light, a shadow leaves a share that depends on how a surface is turned towards lamp and sky, and not on its own colour
 (Lambert). So a step that parallel surfaces of different colours show alike is a shadow's; paint would have to be
-darker by the same factor on both. Where no step repeats so, nothing is presumed.
+darker by the same factor on both. Where no step repeats so, no shadow is presumed. And where the colour does not change
+at all from one label to the other, the views' masks end somewhere, but nothing ends there.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _UNEVEN = 0.25
 _SAME = 0.12
 """Difference between two steps, in each logarithm, up to which they are the same."""
 _OTHER = 0.3
-"""Difference between two lit colours, in one logarithm, from which on their surfaces are of different colours."""
+"""Difference between two colours, in one logarithm, from which on their surfaces are of different colours."""
 _PARALLEL = 0.95
 """Cosine of the normals of surfaces on which a shadow makes the same step."""
 _REST = 0.15
@@ -49,10 +50,10 @@ _ROUNDS = 8
 
 @dataclass(frozen=True)
 class ShadowParams:
-    """When two labels are one surface across the border of a shadow."""
+    """When two labels are one surface, across the border of a shadow or without a border that can be seen."""
 
     agreement: Fraction = 0.6
-    """What this counts as beside the agreement of views (see `split.granularity`); 0 = shadows are not looked for."""
+    """What this counts as beside the agreement of views (see `split.granularity`); 0 = surfaces are not looked for."""
     repeats: Count = 2
     """Other borders, on parallel surfaces of other colours, that must show the same step: one may be chance."""
     alike: Fraction = 0.75
@@ -128,7 +129,8 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Border
 
 
 def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, params: ShadowParams) -> _Touches:
-    """Compare the colours on both sides of all borders, learn which steps are a shadow's, and look for these."""
+    """Compare the colours on both sides of all borders, learn which steps are a shadow's, and look for these and for
+    none at all."""
     rows, beside, _, (point, touched) = ends
     change, color, near = _across(cloud, label, rows[point], touched)
     own, eye = label[rows[point]], middle_of(cameras)
@@ -147,7 +149,7 @@ def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, p
         if step is not None and len(here) >= params.min_points:
             steps.append(step)
     shadows = [step for step in steps if sum(step.repeats(other) for other in steps) >= params.repeats]
-    alike = np.zeros(len(point), bool)
+    alike = (np.abs(change) < _OTHER).all(axis=1)
     for here, normal in zip(contacts, normals, strict=True):
         for step in shadows:
             shaded = _shaded(change[here], step.change)

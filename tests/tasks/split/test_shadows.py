@@ -103,6 +103,17 @@ def test_a_label_half_in_the_shadow_goes_with_both_sides():
     assert surfaces(*floor(), *table(), half) == [1, 1, 3, 3, 3]
 
 
+def test_where_the_colour_does_not_change_nothing_ends():
+    assert surfaces(patch(BROWN, 0, 0), patch(BROWN, 0.5, 0)) == [1, 1]
+    assert surfaces(patch(BROWN, 0, 0), patch(BROWN, 0.6, 0)) == [1, 2]
+    assert surfaces(patch(BROWN, 0, 0), patch(BROWN, 0.5, 0, 0.1)) == [1, 2]
+
+
+def test_faces_of_one_colour_that_meet_in_an_edge_stay_apart():
+    places, color = patch(BROWN, 0, 0)
+    assert surfaces((places, color), (places[:, [2, 1, 0]], color)) == [1, 2]
+
+
 def tree(agreement: float) -> Hierarchy:
     """A floor and a table, both in light and shadow, of which no view has a mask."""
     cloud, cameras, label = scene(*floor(), *table())
