@@ -28,7 +28,8 @@ from ss_flow.tasks.artifacts import Float64
 GAZE = 0.8
 """Height that the views round the room look at, metres: between the table and what hangs on the wall."""
 
-_TABLE = 1.3, 0.85, 0.5
+TABLE = 1.3, 0.85, 0.5
+"""Width, depth and height, metres."""
 _CABINET = 0.9, 0.36, 0.62
 _MOTIF = 0.34
 """Distance between the motifs of the wallpaper, metres."""
@@ -59,8 +60,8 @@ def furnish_composites(rng: np.random.Generator) -> tuple[tuple[Thing, ...], tup
     x, y, turn = rng.uniform(-0.12, 0.12), 0.2 + rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
     front = [cup(c[0], c[8], "white"), printed_box(c[2:], rng), brick(c[1], "grey", rng)]
     back = [book(c[3], c[4]), Composite(f"{c[5]} vase", (Piece("vase", vase(0.1, 0.32), paint(c[5])),))]
-    on_table = [*_in_a_row(front, -0.19, rng), *_in_a_row(back, 0.22, rng)]
-    on_table = [thing.moved(0, 0, _TABLE[2]).turned(turn).moved(x, y, 0) for thing in on_table]
+    on_table = [*in_a_row(front, -0.19, rng), *in_a_row(back, 0.22, rng)]
+    on_table = [thing.moved(0, 0, TABLE[2]).turned(turn).moved(x, y, 0) for thing in on_table]
     side = rng.choice([-1.0, 1.0])
     chair_at = side * rng.uniform(1.1, 1.3), y + rng.uniform(-0.8, -0.5)
     chair = slatted_chair(c[6], "umber").turned(rng.uniform(0, 2 * np.pi)).moved(*chair_at, 0)
@@ -102,7 +103,7 @@ def close_up(station: Station, rng: np.random.Generator) -> tuple[Float64, Float
     return target + distance * out, target + rng.uniform(-0.05, 0.05, 3)
 
 
-def _in_a_row(things: list[Composite], y: float, rng: np.random.Generator) -> list[Composite]:
+def in_a_row(things: list[Composite], y: float, rng: np.random.Generator) -> list[Composite]:
     """Things in random order along x, each a little turned and at most 2 cm from the next."""
     placed: list[Composite] = []
     edge = 0.0
@@ -116,7 +117,7 @@ def _in_a_row(things: list[Composite], y: float, rng: np.random.Generator) -> li
 
 def table() -> Composite:
     """A table: a top on four legs."""
-    width, depth, height = _TABLE
+    width, depth, height = TABLE
     x, y, thick, leg = width / 2 - 0.08, depth / 2 - 0.08, 0.05, 0.08
     legs = [box(leg, leg, height - thick).moved(i * x, j * y, 0) for i in (-1, 1) for j in (-1, 1)]
     return Composite(

@@ -82,7 +82,7 @@ class Views:
     rgb: UInt8
     """[K, H, W, 3]."""
     depth: Float32
-    """[K, H, W] exact z-depth at pixel centres, metres; known everywhere."""
+    """[K, H, W] z-depth at pixel centres, metres, exact and known everywhere but on a desk."""
     ids: NDArray[np.uint16]
     """[K, H, W] exact instance ids at pixel centres; 0 = structure (walls, floor, ceiling)."""
     parts: UInt8
@@ -132,11 +132,16 @@ def generate(params: RoomParams) -> Room:
     extra = np.array([_pose(t, phase, np.zeros(2), gaze) for t in between]).reshape(-1, 4, 4)
     if stations:
         for i in range(1, params.views, 2):
-            poses[i] = _looking(*close_up(stations[i // 2 % len(stations)], rng))
-    views = _photograph(renderer, poses, params, rng)
-    held_out = _photograph(renderer, extra, params, rng)
+            poses[i] = looking_at(*close_up(stations[i // 2 % len(stations)], rng))
+    views = photographed(renderer, poses, params, rng)
+    held_out = photographed(renderer, extra, params, rng)
     if params.gripper:
         views, held_out = _gripped(views, params, rng), _gripped(held_out, params, rng)
+    return furnished_room(views, held_out, things)
+
+
+def furnished_room(views: Views, held_out: Views, things: tuple[Thing, ...]) -> Room:
+    """The room of these views, which shows these things."""
     structure, *objects = _objects(things)
     return Room(**vars(views), held_out=held_out, objects=tuple(objects), structure=structure, **_points(views))
 
@@ -197,16 +202,17 @@ def _pose(turn: float, phase: Float64, jitter: Float64, gaze: float) -> Float64:
     height = 1.55 + 0.25 * np.sin(3 * angle + phase[1]) + 0.03 * jitter[1]
     eye = radius * outwards + (0, 0, height)
     target = -(0.5 + 0.6 * (1.2 - radius)) * outwards + (0, 0, gaze + 0.08 * np.sin(5 * angle + phase[2]))
-    return _looking(eye, target)
+    return looking_at(eye, target)
 
 
-def _looking(eye: Float64, target: Float64) -> Float64:
+def looking_at(eye: Float64, target: Float64) -> Float64:
     """World-to-camera of an upright camera at `eye` that looks at `target`."""
     forward = target - eye
     return looking(eye, forward / np.linalg.norm(forward), np.array([0.0, 0.0, 1.0]))
 
 
-def _photograph(renderer: Renderer, poses: Float64, params: RoomParams, rng: np.random.Generator) -> Views:
+def photographed(renderer: Renderer, poses: Float64, params: RoomParams, rng: np.random.Generator) -> Views:
+    """Photos from poses [K, 4, 4], world-to-camera, of the size that `params` tell."""
     h, w, k = params.height, params.width, len(poses)
     cameras = Cameras(
         names=tuple(f"{i:04d}" for i in range(k)),

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.flows.generated import Room, RoomParams, generate, write_scene
-from ss_flow.flows.generated.composite_room import _in_a_row, furnish_composites
+from ss_flow.flows.generated.composite_room import furnish_composites, in_a_row
 from ss_flow.flows.generated.composites import Composite, Piece, book, brick, cup, paint, printed_box, stood_up, tube
 from ss_flow.flows.generated.layout import COLORS
 from ss_flow.flows.generated.prints import FACES, PRINTS, ellipse, face_size, on_face, rectangle, sheet
@@ -114,7 +114,7 @@ def test_ids_and_parts_of_one_view_agree_with_those_of_the_others(room: Room) ->
 def test_things_in_a_row_are_neighbours_that_do_not_run_into_each_other(seed: int) -> None:
     rng = np.random.default_rng(seed)
     colors = list(COLORS)
-    row = _in_a_row([cup("red", "blue", "white"), printed_box(colors, rng), brick("green", "grey", rng)], 0.1, rng)
+    row = in_a_row([cup("red", "blue", "white"), printed_box(colors, rng), brick("green", "grey", rng)], 0.1, rng)
     bounds = np.array([thing.bounds[:, 0] for thing in row])
     gaps = bounds[1:, 0] - bounds[:-1, 1]
     assert ((gaps >= 0.002 - 1e-9) & (gaps <= 0.02 + 1e-9)).all()
