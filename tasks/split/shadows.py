@@ -149,7 +149,8 @@ def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, p
         if step is not None and len(here) >= params.min_points:
             steps.append(step)
     shadows = [step for step in steps if sum(step.repeats(other) for other in steps) >= params.repeats]
-    alike = (np.abs(change) < _OTHER).all(axis=1)
+    seen = (color > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1)  # black tells nothing
+    alike = np.asarray(seen & (np.abs(change) < _OTHER).all(axis=1))
     for here, normal in zip(contacts, normals, strict=True):
         for step in shadows:
             shaded = _shaded(change[here], step.change)

@@ -109,6 +109,10 @@ def test_where_the_colour_does_not_change_nothing_ends():
     assert surfaces(patch(BROWN, 0, 0), patch(BROWN, 0.5, 0, 0.1)) == [1, 2]
 
 
+def test_in_the_dark_nothing_is_known():
+    assert surfaces(patch(0 * BROWN, 0, 0), patch(0 * BROWN, 0.5, 0)) == [1, 2]
+
+
 def test_faces_of_one_colour_that_meet_in_an_edge_stay_apart():
     places, color = patch(BROWN, 0, 0)
     assert surfaces((places, color), (places[:, [2, 1, 0]], color)) == [1, 2]
