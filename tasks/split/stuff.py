@@ -9,7 +9,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
-from ss_flow.tasks.ranges import Fraction
+from ss_flow.tasks.ranges import Count, Fraction
 
 _ROUNDS = 4
 _TRIM = 0.02
@@ -18,6 +18,8 @@ _FEW = 10
 """Points below which a label has no plane."""
 _MOST = 4000
 """So many points of a label, and ten times as many of the scene, tell."""
+_PATCHES = 50
+"""So many places of a label are looked at for a plane, each with as large a share of the points round it."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +34,16 @@ class StuffParams:
     """Distance from the plane up to which they do, as a share of the label's extent."""
     behind: Fraction = 0.1
     """Share of the scene's points that may lie behind the plane, more than twice that distance away."""
+    planes: Count = 3
+    """How many such planes its points may lie on: two walls of one colour, or a wall and a ceiling, are often one mask.
+    """
 
 
 def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params: StuffParams) -> Bool:
     """[L] which of the labels that occur, ascending, are stuff.
 
     Stuff is large and flat, and has (nearly) nothing of the scene behind it: a wall, a floor, a ceiling, the top of a
-    table that the capture never looks beyond. A poster on a wall is a thing.
+    table that the capture never looks beyond. A poster on a wall is a thing. Two walls that meet are stuff, too.
     """
     names = np.unique(labels.label[labels.label > 0])
     scene, eye = thinned(points.points, 10 * _MOST), middle_of(cameras)
@@ -50,11 +55,46 @@ def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params
         if (extent := box_diagonal(own, _TRIM)) < least or len(own) < _FEW:
             continue
         thickness = params.thickness * extent
-        centre, normal = _plane(own, thickness)
-        flat = (np.abs((own - centre) @ normal) <= thickness).mean() >= params.flat
-        in_front = (scene - centre) @ towards(normal, centre, eye)
-        stuff[row] = flat and (in_front < -2 * thickness).mean() <= params.behind
+        planes = _planes(own, thickness, params)
+        in_front = [(scene - centre) @ towards(normal, centre, eye) for centre, normal in planes]
+        stuff[row] = bool(planes) and all((ahead < -2 * thickness).mean() <= params.behind for ahead in in_front)
     return stuff
+
+
+def _planes(places: Float64, thickness: float, params: StuffParams) -> list[tuple[Float64, Float64]]:
+    """The planes that enough of some points [N, 3] lie on: one, or else one after the other, each with as many as it
+    can of those that are left; none if there would have to be too many."""
+    one = _plane(places, thickness)
+    if _near(places, one, thickness).mean() >= params.flat:
+        return [one]
+    planes: list[tuple[Float64, Float64]] = []
+    rest = places
+    while 1 < params.planes > len(planes) and len(rest) > (1 - params.flat) * len(places):
+        planes.append(_largest_plane(rest, thickness))
+        rest = rest[~_near(rest, planes[-1], thickness)]
+    return planes if len(rest) <= (1 - params.flat) * len(places) else []
+
+
+def _largest_plane(places: Float64, thickness: float) -> tuple[Float64, Float64]:
+    """The plane, of those through small patches of some points [N, 3], that most of the points lie on."""
+    from scipy.spatial import cKDTree
+
+    count = max(len(places) // _PATCHES, min(_FEW, len(places)))
+    _, near = cKDTree(places).query(places[:: max(1, len(places) // _PATCHES)], k=count)
+    patches = [plane_through(places[rows]) for rows in np.reshape(near, (-1, count))]
+    best = max(patches, key=lambda plane: _near(places, plane, thickness).sum())
+    for _ in range(_ROUNDS):
+        near = _near(places, best, thickness)
+        if near.sum() < _FEW:
+            break
+        best = plane_through(places[near])
+    return best
+
+
+def _near(places: Float64, plane: tuple[Float64, Float64], thickness: float) -> Bool:
+    """[N] which points lie on a plane."""
+    centre, normal = plane
+    return np.asarray(np.abs((places - centre) @ normal) <= thickness)
 
 
 def _plane(places: Float64, thickness: float) -> tuple[Float64, Float64]:

@@ -11,7 +11,7 @@ def plane(low, high, count: int = 400):
     return RNG.uniform(low, high, (count, 3))
 
 
-def kinds(*pieces) -> list[bool]:
+def kinds(*pieces, **values) -> list[bool]:
     """Which of these pieces of a scene, seen from (0, 0, 1.5), are stuff."""
     places = np.concatenate(pieces).astype(np.float32)
     label = np.repeat(np.arange(1, len(pieces) + 1, dtype=np.int32), [len(p) for p in pieces])
@@ -21,7 +21,7 @@ def kinds(*pieces) -> list[bool]:
     pose[:3, 3] = (0, 0, -1.5)
     cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.05)
-    return find_stuff(cloud, cameras, labels, StuffParams()).tolist()
+    return find_stuff(cloud, cameras, labels, StuffParams(**values)).tolist()
 
 
 FLOOR = plane((-2, -2, 0), (2, 2, 0.01), 2000)
@@ -43,3 +43,23 @@ def test_a_large_thing_that_is_not_flat_is_a_thing():
     hill = plane((-2, -2, 0), (2, 2, 0))
     hill[:, 2] = 0.5 * np.cos(hill[:, 0])
     assert kinds(hill) == [False]
+
+
+OTHER_WALL = plane((-2, 2, 0), (2, 2.01, 2.5), 2000)
+CORNER = np.concatenate([WALL, OTHER_WALL])
+
+
+def test_two_walls_that_are_one_piece_are_stuff():
+    assert kinds(FLOOR, CORNER, TABLE) == [True, True, False]
+    assert kinds(FLOOR, CORNER, TABLE, planes=1) == [True, False, False]
+    assert kinds(np.concatenate([FLOOR, CORNER]), TABLE, planes=2) == [False, False]
+    assert kinds(np.concatenate([FLOOR, CORNER]), TABLE, planes=3) == [True, False]
+
+
+def test_two_sides_of_a_cabinet_with_the_room_behind_it_are_a_thing():
+    sides = plane((-1, -1, 0), (1, -0.99, 1.5)), plane((0.99, -1, 0), (1, 1, 1.5))
+    assert kinds(FLOOR, CORNER, np.concatenate(sides)) == [True, True, False]
+
+
+def test_a_wall_and_a_thing_before_it_in_one_piece_are_no_stuff():
+    assert kinds(FLOOR, np.concatenate([WALL, plane((1, -1, 0), (1.01, 1, 1.5), 1500)])) == [True, False]
