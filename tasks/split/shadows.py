@@ -12,11 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, UInt8
+from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Int32, PointCloud, UInt8
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
 from ss_flow.tasks.ranges import Count, Fraction
-from ss_flow.tasks.split.votes.touching import Borders, TouchingParams
+from ss_flow.tasks.split.votes.smoothing import smooth
+from ss_flow.tasks.split.votes.touching import Borders, TouchingParams, borders
 
 _GAMMA = 2.2
 _DARKEST = 4
@@ -46,6 +48,8 @@ _TRIM = 0.02
 _MOST = 2000
 """So many points of a label tell its plane."""
 _ROUNDS = 8
+_FILLED = 30
+"""How often points without a label take that of their neighbours, to tell which labels touch."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,8 @@ class ShadowParams:
     flat: Fraction = 0.6
     """Share of the points of each that must lie on one plane."""
     thickness: Fraction = 0.01
-    """Distance from the plane up to which they do, as a share of the extent of the larger one."""
+    """Distance from the plane up to which they do, as a share of the extent of the smaller one: a book lies on a table,
+    not in it. At least the cloud's spacing."""
     min_points: Count = 10
     """Points on both sides at which two labels must touch."""
 
@@ -85,6 +90,22 @@ class _Step:
         same = (np.abs(self.change - other.change) <= _SAME).all()
         different = (np.abs(self.lit - other.lit) >= _OTHER).any()
         return bool(same and different and self.normal @ other.normal >= _PARALLEL)
+
+
+@dataclass(frozen=True)
+class _Contact:
+    """Where two labels touch."""
+
+    of: NDArray[np.intp]
+    """[C] which of the touches."""
+    normal: Float64
+    """[3] of the surface there, towards the cameras."""
+    change: Float64
+    """[C, 3] of the colour there, from the lower label to the higher one."""
+    stays: Bool
+    """[C] whether there is none that can be seen."""
+    step: _Step | None
+    """What it is along the border, if it may be a shadow's."""
 
 
 @dataclass(frozen=True)
@@ -113,14 +134,19 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Border
     surface = np.arange(int(label.max(initial=0)) + 1, dtype=np.int32)
     if not params.agreement or not label.any():
         return surface
-    touches = _touches(cloud, cameras, label, ends, params)
+    eye = middle_of(cameras)
+    steps = [contact.step for contact in _contacts(cloud, label, ends, eye, params) if contact.step is not None]
+    shadows = [step for step in steps if sum(step.repeats(other) for other in steps) >= params.repeats]
+    # Between the things that stand on a table, and along shadows, its points have no label: masks do not agree there.
+    filled = smooth(label, label == 0, cloud.points, cloud.spacing, _FILLED)
+    touches = _touches(cloud, filled, eye, shadows, params)
     while touches.alike.any():
         taken: set[int] = set()
-        for a, b in _meeting(touches, surface, label, params):
+        for a, b in _meeting(touches, surface, filled, params):
             if taken & {a, b}:
                 continue
             of = surface[label]
-            if _in_one_plane(cloud.points[of == a], cloud.points[of == b], params):
+            if _in_one_plane(cloud, np.flatnonzero(of == a), np.flatnonzero(of == b), params):
                 taken |= {a, b}
                 surface[surface == b] = a
         if not taken:
@@ -128,35 +154,38 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Border
     return surface
 
 
-def _touches(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, params: ShadowParams) -> _Touches:
-    """Compare the colours on both sides of all borders, learn which steps are a shadow's, and look for these and for
-    none at all."""
-    rows, beside, _, (point, touched) = ends
+def _contacts(cloud: PointCloud, label: Int32, ends: Borders, eye: Float64, params: ShadowParams) -> list[_Contact]:
+    """How the colours change where each two labels touch without an edge."""
+    rows, _, _, (point, touched) = ends
     change, color, near = _across(cloud, label, rows[point], touched)
-    own, eye = label[rows[point]], middle_of(cameras)
+    own = label[rows[point]]
     low, high = np.minimum(own, touched), np.maximum(own, touched)
     change[own == high] *= -1  # from the lower label to the higher one
+    seen = (color > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1)  # black tells nothing
+    stays = np.asarray(seen & (np.abs(change) < _OTHER).all(axis=1))
     order = np.lexsort((high, low))
     starts = np.flatnonzero(np.diff(low[order]) | np.diff(high[order])) + 1
-    contacts = np.split(order, starts) if len(order) else []
-    normals: list[Float64] = []
-    steps: list[_Step] = []
-    for here in contacts:
+    contacts = []
+    for here in np.split(order, starts) if len(order) else []:
         around = np.unique(near[here])
         centre, normal = plane_through(cloud.points[around[around >= 0]].astype(np.float64))
-        normals.append(towards(normal, centre, eye))
-        step = _step(change[here], color[here], (own == low)[here], normals[-1])
-        if step is not None and len(here) >= params.min_points:
-            steps.append(step)
-    shadows = [step for step in steps if sum(step.repeats(other) for other in steps) >= params.repeats]
-    seen = (color > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1)  # black tells nothing
-    alike = np.asarray(seen & (np.abs(change) < _OTHER).all(axis=1))
-    for here, normal in zip(contacts, normals, strict=True):
+        normal = towards(normal, centre, eye)
+        step = _step(change[here], color[here], (own == low)[here], normal) if len(here) >= params.min_points else None
+        contacts.append(_Contact(here, normal, change[here], stays[here], step))
+    return contacts
+
+
+def _touches(cloud: PointCloud, label: Int32, eye: Float64, shadows: list[_Step], params: ShadowParams) -> _Touches:
+    """Where labels touch without an edge, and where the colour stays there or changes as into one of the shadows."""
+    ends = borders(label, cloud, TouchingParams())
+    alike = np.zeros(ends.smooth.shape[1], bool)
+    for contact in _contacts(cloud, label, ends, eye, params):
+        alike[contact.of] = contact.stays
         for step in shadows:
-            shaded = _shaded(change[here], step.change)
-            if step.normal @ normal >= _PARALLEL and shaded.sum() > alike[here].sum():
-                alike[here] = shaded
-    return _Touches(rows, beside, point, touched, alike)
+            shaded = _shaded(contact.change, step.change)
+            if step.normal @ contact.normal >= _PARALLEL and shaded.sum() > alike[contact.of].sum():
+                alike[contact.of] = shaded
+    return _Touches(ends.rows, ends.beside, ends.smooth[0], ends.smooth[1], alike)
 
 
 def _across(cloud: PointCloud, label: Int32, rows: Int32, touched: Int32) -> tuple[Float64, Float64, Int32]:
@@ -228,10 +257,10 @@ def _meeting(touches: _Touches, surface: Int32, label: Int32, params: ShadowPara
     return [(low, high) for _, low, high in sorted(found)]
 
 
-def _in_one_plane(a: Float32, b: Float32, params: ShadowParams) -> bool:
-    """Whether most of two sets of points [., 3] lies on the plane of the larger one."""
-    larger, smaller = (thinned(part, _MOST) for part in sorted((a, b), key=len, reverse=True))
-    thickness = params.thickness * box_diagonal(larger, _TRIM)
+def _in_one_plane(cloud: PointCloud, a: NDArray[np.intp], b: NDArray[np.intp], params: ShadowParams) -> bool:
+    """Whether most of two sets of points (rows) lies on the plane of the larger one."""
+    larger, smaller = (thinned(cloud.points[part], _MOST) for part in sorted((a, b), key=len, reverse=True))
+    thickness = max(params.thickness * box_diagonal(smaller, _TRIM), cloud.spacing)
     near = np.ones(len(larger), bool)
     for _ in range(_ROUNDS):
         centre, normal = plane_through(larger[near])

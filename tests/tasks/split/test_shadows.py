@@ -22,22 +22,24 @@ def patch(color: np.ndarray, x: float, y: float, z: float = 0.0, width: float = 
     return places, np.tile(color, (len(places), 1))
 
 
-def scene(*patches: Patch) -> tuple[PointCloud, Cameras, np.ndarray]:
-    """Patches seen from above by a grainy camera, and their points' labels, 1.. in their order."""
+def scene(*patches: Patch, unlabelled: int = 0) -> tuple[PointCloud, Cameras, np.ndarray]:
+    """Patches seen from above by a grainy camera, and their points' labels, 1.. in their order; the last ones have
+    none."""
     light = np.concatenate([color for _, color in patches])
     light = light * np.random.default_rng(0).normal(1, 0.02, (len(light), 1))
     colors = np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8)
     places = np.concatenate([places for places, _ in patches]).astype(np.float32)
     label = np.repeat(np.arange(1, len(patches) + 1, dtype=np.int32), [len(color) for _, color in patches])
+    label[label > len(patches) - unlabelled] = 0
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = (0.5, 0.5, 3)
     cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
     return PointCloud(places, colors, 1.0, STEP), cameras, label
 
 
-def surfaces(*patches: Patch, **changes) -> list[int]:
-    """The surface of each patch."""
-    cloud, cameras, label = scene(*patches)
+def surfaces(*patches: Patch, unlabelled: int = 0, **changes) -> list[int]:
+    """The surface of each labelled patch."""
+    cloud, cameras, label = scene(*patches, unlabelled=unlabelled)
     params = ShadowParams(**{"repeats": 1, **changes})
     return lit_surfaces(cloud, cameras, label, borders(label, cloud, TouchingParams()), params)[1:].tolist()
 
@@ -96,6 +98,18 @@ def test_what_lies_higher_is_not_of_the_same_surface(height):
 
 def test_what_does_not_touch_is_not_of_the_same_surface():
     assert surfaces(*floor(), *table(y=4), *table(x=0.7)) == [1, 1, 3, 3, 5, 6]
+
+
+def test_points_without_label_between_them_part_no_surface():
+    between = patch(BROWN, 0.5, 0, 0.7, width=0.2)
+    assert surfaces(*floor(), *table(y=4), *table(x=0.7), between, unlabelled=1) == [1, 1, 3, 3, 5, 5]
+
+
+def test_a_book_on_a_table_is_not_of_its_surface_however_large_the_table():
+    wide = patch(BROWN, 0, 0, 0.7, width=4)
+    for height, surface in ((0.7, 5), (0.73, 6)):
+        book = patch(SHADE * BROWN, 4, 0, height, width=0.3)
+        assert surfaces(*floor(), *table(y=4), wide, book) == [1, 1, 3, 3, 5, surface]
 
 
 def test_a_label_half_in_the_shadow_goes_with_both_sides():
