@@ -122,8 +122,8 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         build=lambda visible, pool: observe(points, visible, pool, params=params.observe),
     )
     propagating, granularity = params.propagate, params.granularity
-    if capture.clicks is not None:  # what was clicked as two objects stays two
-        propagating, granularity = replace(propagating, touching_merge=False), 1.0
+    if capture.clicks is not None:  # what was clicked as two objects stays two, and what was clicked as one, one
+        propagating, granularity = replace(propagating, touching_merge=False, apart=False), 1.0
     pieces = propagate(points, seen, observed, params=propagating)
     counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
     tree = hierarchy(points, capture.cameras, pieces, counted, params=params.hierarchy)

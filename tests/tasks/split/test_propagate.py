@@ -344,3 +344,16 @@ def test_a_small_piece_of_a_label_stays_where_views_see_it_inside_of_masks(insid
     found = propagate(cloud, (), tuple(observations), params=PropagateParams(tau_piece=tau_piece))
     assert found.label[:100].all()
     assert found.label[100:].all() == found.label[100:].any() == stays
+
+
+@pytest.mark.parametrize(("apart", "floor"), [(True, 2), (False, 1)])
+def test_masks_show_the_piece_of_a_parted_label_that_they_hold_most_of(apart, floor):
+    table, below = [0, 1, 2, 3], [6, 7]
+    visible, masks = views_of([table + below], [table, below], [table, below])
+    kept = ClusterParams(eps=1.5, min_samples=1, keep_share=0.05)
+    found = run(points(8), visible, masks, replace(BARE, apart=apart, label_clusters=kept))
+    assert set(found.label[table].tolist()) == {1}
+    assert set(found.label[below].tolist()) == {floor}
+    assert found.num_labels == floor
+    shown = np.stack([found.match_view, found.match_mask, found.match_label], axis=1).tolist()
+    assert sorted(shown) == [[0, 0, 1], [1, 0, 1], [1, 1, floor], [2, 0, 1], [2, 1, floor]]
