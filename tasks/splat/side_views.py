@@ -117,7 +117,8 @@ def empty(camera: Camera, points: Float32, spacing: float) -> Bool:
     away = cv2.distanceTransform(free, cv2.DIST_L2, 5) > GAP * pixels
     back = cv2.distanceTransform((~away).astype(np.uint8), cv2.DIST_L2, 5) <= (GAP - RIM) * pixels
     inner = back[border:-border, border:-border]
-    return np.asarray(inner.reshape(camera.height, 2, camera.width, 2).all(axis=(1, 3)))
+    rows = inner[::2] & inner[1::2]
+    return np.asarray(rows[:, ::2] & rows[:, 1::2])
 
 
 def _target(camera: Camera, free: Bool) -> Target:
