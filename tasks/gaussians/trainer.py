@@ -17,7 +17,7 @@ from ss_flow.tasks.artifacts import Float32, Gaussians
 from ss_flow.tasks.gaussians.backends import AdamStep, Array, Backend, Values, backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecord, Schedule, Seen
 from ss_flow.tasks.gaussians.native_pass import Settings
-from ss_flow.tasks.gaussians.objective import Objective, Target, Weights, decayed
+from ss_flow.tasks.gaussians.objective import Objective, Target, Weights, along_cosine, decayed
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.gaussians.render import channels_of
@@ -39,7 +39,7 @@ class LearningRates:
     position: NonNegative = 3.2e-4
     """Of the means at the first step, times the extent of what is trained."""
     position_final: NonNegative = 3.2e-6
-    """Of the means at the last step, times the extent; the decay is exponential."""
+    """Of the means at the last step, times the extent."""
     color: NonNegative = 1e-2
     """Of the colours; a twentieth above degree 0."""
     opacity: NonNegative = 0.05
@@ -48,6 +48,25 @@ class LearningRates:
     """Of the logarithmic scales."""
     rotation: NonNegative = 3e-3
     """Of the quaternions."""
+    final_share: Fraction = 1.0
+    """What is left at the last step of the rates of colours, opacities, scales and quaternions; 1 = they stay, as in
+    3DGS."""
+    fall: Literal["exponential", "cosine"] = "exponential"
+    """How rates get from the first step's to the last one's: "exponential", as in 3DGS; or along half a "cosine", which
+    stays high for longer (Loshchilov and Hutter 2017)."""
+
+    def at(self, done_share: float) -> LearningRates:
+        """The rates of a step. done_share: 0 for the first, 1 for the last."""
+        fallen = decayed if self.fall == "exponential" else along_cosine
+        rest = fallen(1.0, self.final_share, done_share)
+        return replace(
+            self,
+            position=fallen(self.position, self.position_final, done_share),
+            color=rest * self.color,
+            opacity=rest * self.opacity,
+            scale=rest * self.scale,
+            rotation=rest * self.rotation,
+        )
 
 
 SLOW_RATES = LearningRates(position=1.6e-4, position_final=1.6e-6, scale=5e-3, rotation=1e-3)
@@ -62,7 +81,9 @@ class TrainParams:
     iterations: Count = 1000
     """Steps, one view each."""
     sh_degree: HarmonicsDegree = 3
-    """Highest degree of the colours; 0 is used below 2,000 iterations, otherwise one more every 1,000 steps."""
+    """Highest degree of the colours, which begin with 0."""
+    sh_every: Count = 1000
+    """Steps from one degree to the next; a training of less than two such spans keeps to 0."""
     rates: LearningRates = LearningRates()
     """How fast each parameter is learnt."""
     objective: Objective = Objective()
@@ -139,6 +160,7 @@ def train(
         ("densify", params.densify, ("classic", "none")),
         ("background", params.objective.background, ("random", "black")),
         ("depth_error", params.objective.depth_error, ("relative", "inverse")),
+        ("fall", params.rates.fall, ("exponential", "cosine")),
     ):
         if value not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {value!r}")
@@ -174,7 +196,8 @@ class _Training:
         self._turns = np.random.default_rng(seed).permutation(len(self._parts))
         self._generator = np.random.default_rng(seed)
         self._given_degree = round(initial.sh.shape[1] ** 0.5) - 1
-        last = min(params.sh_degree, params.iterations // 1000) if params.iterations >= 2000 else 0
+        spans = params.iterations // params.sh_every
+        last = min(params.sh_degree, spans) if spans >= 2 else 0
         self._last_degree = max(self._given_degree, last)
         self.parameters = Parameters(initial, self._last_degree, backend)
         if not self.parameters.finite():
@@ -216,7 +239,7 @@ class _Training:
         view = self._order.pop()
         done_share = self.step / max(params.iterations - 1, 1)
         self.step += 1
-        degree = max(self._given_degree, min(self._last_degree, self.step // 1000))
+        degree = max(self._given_degree, min(self._last_degree, self.step // params.sh_every))
         behind = params.objective.behind(self._generator)
         settings = Settings(behind, self._num_labels, degree, winners=False)
         weights = params.objective.at(done_share, params.mask_weight)
@@ -226,8 +249,8 @@ class _Training:
         for name, gradient in towards_part.items():
             found.gradients[name][rows] += gradient
         self._losses[self.step - 1] = found.loss
-        pace = decayed(params.rates.position, params.rates.position_final, done_share)
-        rates = _by_name(params.rates, pace * self._extents[parameters.origin])
+        now = params.rates.at(done_share)
+        rates = _by_name(now, now.position * self._extents[parameters.origin])
         parameters.step(found.gradients, AdamStep(self.step, rates, degree))
         if params.max_scale:
             parameters.limit_scale(self._longest[parameters.origin])

@@ -44,7 +44,7 @@ class MergeParams:
     """Fewest steps of a pair."""
     max_iterations: Count = 150
     """Most steps of a pair."""
-    global_iterations: Natural = 3000
+    global_iterations: Natural = 1500
     """Steps of the last pass over the whole scene; 0 leaves it out."""
     objective: Objective = Objective()
     """What the training of a pair makes small, besides w_mask times the mask loss."""
@@ -64,7 +64,9 @@ class MergeParams:
     prune_contribution: Fraction = 1 / 255
     """Gaussians that add no more than this to any pixel of any view are dropped in the end."""
     sh_degree: HarmonicsDegree = 2
-    """Highest degree of the colour's spherical harmonics; one more every 1,000 steps of the last pass."""
+    """Highest degree of the colour's spherical harmonics."""
+    sh_every: Count = 500
+    """Steps of the last pass from one degree to the next; a pass of less than two such spans keeps to 0."""
     ignore_occluded: bool = True
     """Whether pixels where something else is in front of a pair are left out; False calls them empty, as in the
     paper."""
@@ -78,8 +80,17 @@ class MergeParams:
     max_scale: NonNegative = 0.05
     """No Gaussian becomes longer (one standard deviation) than this share of the extent, or than it starts where that
     is more; 0 = any."""
-    rates: LearningRates = LearningRates()
-    """How fast each parameter is learnt."""
+    rates: LearningRates = LearningRates(
+        position=6.4e-4,
+        position_final=6.4e-6,
+        color=0.02,
+        opacity=0.15,
+        scale=0.06,
+        rotation=0.012,
+        final_share=0.1,
+        fall="cosine",
+    )
+    """How fast each parameter is learnt: first faster than leads to an end, then more and more slowly."""
     guard_iou: Fraction = 0.02
     """A refinement that lowers the mean IoU of the masks by more than this is undone."""
     guard_psnr: NonNegative = 1.0
@@ -248,6 +259,7 @@ def global_pass(
     settings = TrainParams(
         iterations=params.global_iterations,
         sh_degree=params.sh_degree,
+        sh_every=params.sh_every,
         objective=params.global_objective,
         densify="none",
         mask_weight=params.global_mask_weight,

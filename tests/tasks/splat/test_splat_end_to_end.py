@@ -137,7 +137,7 @@ def test_a_refinement_that_ruins_the_pair_is_undone_with_a_warning(built, monkey
 
     def ruined(*args, **options):
         result = trained(*args, **options)
-        return replace(result, gaussians=replace(result.gaussians, opacity_logits=result.gaussians.opacity_logits - 9))
+        return replace(result, gaussians=replace(result.gaussians, opacity_logits=result.gaussians.opacity_logits - 12))
 
     monkeypatch.setattr(module, "train", ruined)
     with pytest.warns(UserWarning, match="Refining instances 1, 2 together was undone"):
