@@ -48,7 +48,7 @@ class Capture:
     """The cameras one by one."""
     depths: tuple[DepthMap, ...]
     presumed: tuple[DepthMap, ...]
-    """The same; where views were compared, with what one view alone found. Split finds and sees points by it."""
+    """The same; where views were compared, with what one other view confirms. Split sees points by it."""
     unit: SceneUnit
     masks: tuple[MaskSet, ...] | None
     """Where the capture brought its own masks."""

@@ -15,6 +15,7 @@ from ss_flow.task import FileRef, Reference
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, Registration
 from ss_flow.tasks.capture import depth as steps
 from ss_flow.tasks.capture import recordings, sensor_depth, views
+from ss_flow.tasks.capture.depth import AgreementParams
 from ss_flow.tasks.capture.given_scene import rendered_depth
 from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.neighbors import Neighbors, neighbors
@@ -91,13 +92,11 @@ class Beside:
     def compared(self) -> tuple[Depths, Depths]:
         """The depth that several views agree on, and what is presumed besides."""
         found = self._each(self._swept)
-        agreed = self._confirmed(found)
+        agreed = self._confirmed(found, self.params.agreement)
         for _ in range(self.params.stereo.rounds):
             found = self._each(functools.partial(self._refined, found, agreed))
-            agreed = self._confirmed(found)
-        if not self.params.presume:
-            return agreed, agreed
-        return agreed, each(agreed, found, names=self.names, build=steps.presume)
+            agreed = self._confirmed(found, self.params.agreement)
+        return agreed, self._confirmed(found, self.params.presumed)
 
     def rendered(self, scene: Gaussians) -> Depths:
         """The depth that a scene shows, where neighbours confirm it: at outlines it lies between two surfaces."""
@@ -107,7 +106,8 @@ class Beside:
                 self.cameras,
                 names=self.names,
                 build=lambda frame, camera: rendered_depth(scene, frame, camera, params=self.params.given),
-            )
+            ),
+            self.params.agreement,
         )
 
     def predicted(self, agreed: Depths, cameras: Cameras, network: FileRef) -> Depths:
@@ -142,10 +142,10 @@ class Beside:
             params=self.params.stereo,
         )
 
-    def _confirmed(self, found: Depths) -> Depths:
+    def _confirmed(self, found: Depths, params: AgreementParams) -> Depths:
         def confirmed(view: int, near: Neighbors) -> DepthMap:
             around = near.around(view)
-            return steps.agree(pick(found, around), pick(self.cameras, around), params=self.params.agreement)
+            return steps.agree(pick(found, around), pick(self.cameras, around), params=params)
 
         return self._each(confirmed)
 

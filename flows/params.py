@@ -68,8 +68,9 @@ class CaptureParams:
     sweep: SweepParams = field(default_factory=SweepParams)
     agreement: AgreementParams = field(default_factory=AgreementParams)
     stereo: StereoParams = field(default_factory=StereoParams)
-    presume: bool = False
-    """Whether Split may find and see points by depth that one view alone found (only where views are compared)."""
+    presumed: AgreementParams = field(default_factory=lambda: AgreementParams(min_views=1))
+    """By which depth Split sees points where views are compared: one other view that agrees is enough, since the points
+    are confirmed by themselves. Nothing is trained on it."""
     registration: RegistrationParams = field(default_factory=RegistrationParams)
     mono: MonoParams = field(default_factory=MonoParams)
     given: GivenSceneParams = field(default_factory=GivenSceneParams)
@@ -87,6 +88,9 @@ class SplitParams:
     rgbd: SegmentRgbdParams = field(default_factory=SegmentRgbdParams)
     dense_source: Literal["depth", "splatting"] = "depth"
     """Where the dense points come from: all depth maps, or a short splatting of the whole scene, as in the paper."""
+    dense_presumed: bool = False
+    """Whether points come from presumed depth, too (`capture.presumed`): more things are found where photos hardly
+    overlap, and more crumbs where they do."""
     dense: DenseParams = field(default_factory=DenseParams)
     splatting: DenseSplattingParams = field(default_factory=DenseSplattingParams)
     visibility: VisibilityParams = field(default_factory=VisibilityParams)

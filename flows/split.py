@@ -85,7 +85,8 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
             *views, capture.depths, capture.unit, capture.colours, params=params.dense, splatting=params.splatting
         )
     else:
-        points = dense(*views, capture.presumed, capture.unit, params=params.dense)
+        sources = capture.presumed if params.dense_presumed else capture.depths
+        points = dense(*views, sources, capture.unit, params=params.dense)
     segmenter = networks.segmenter
     embeddings: tuple[Embedding, ...] = ()
     if segmenter is not None:

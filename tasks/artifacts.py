@@ -76,7 +76,7 @@ class DepthMap:
     depth: Float32
     """[h, w] z-depth in world units, 0 where unknown."""
     source: str
-    """Where it came from: "sensor", "mvs", "mono", or "presumed": "mvs" with what one view alone found."""
+    """Where it came from: "sensor", "mvs", "mono" or "rendered"."""
 
 
 @dataclass(frozen=True)

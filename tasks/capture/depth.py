@@ -120,17 +120,6 @@ def agree(
     return DepthMap(maps[0].name, depth, maps[0].source)
 
 
-@task(name="capture.presume")
-def presume(agreed: DepthMap, found: DepthMap) -> DepthMap:
-    """A view's agreed depth and, where no other view confirms any, its own, much of which is wrong.
-
-    Good enough to look for points, since `split.dense` drops those that other views contradict, and to tell which of
-    them a view sees; it proves nothing against a mask, and nothing is trained on it. Its `source` is "presumed".
-    """
-    depth = np.where(agreed.depth > 0, agreed.depth, found.depth)
-    return DepthMap(agreed.name, depth.astype(np.float32), "presumed")
-
-
 def photo_at_size(frame: Frame, camera: Camera, max_side: int) -> SweepView:
     """The gray photo of a view, scaled down to a longer side of `max_side` pixels, with its camera."""
     import cv2

@@ -288,5 +288,7 @@ def test_presumed_depth_changes_what_split_does_and_not_the_depth_itself(tmp_pat
     options = ["--cache", tmp_path / "store", "--until", "visibility", "--json", "--set", "capture.depth=mvs"]
     options += ["--set", "capture.sweep.planes=24"]
     assert ss_flow("run", scene, *options).code == 0
-    presuming = ss_flow("run", scene, *options, "--set", "capture.presume=true")
-    assert presuming.computed() == {"capture.presume": 22, "split.dense": 1, "split.visibility": 22}
+    sure = ss_flow("run", scene, *options, "--set", "capture.presumed.min_views=2")
+    assert sure.computed() == {"split.visibility": 22}
+    more = ss_flow("run", scene, *options, "--set", "split.dense_presumed=true")
+    assert more.computed() == {"split.dense": 1, "split.visibility": 22}

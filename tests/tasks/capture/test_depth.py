@@ -6,7 +6,7 @@ from generated_views import around, views
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import DepthMap
-from ss_flow.tasks.capture.depth import AgreementParams, SweepParams, agree, presume, sweep
+from ss_flow.tasks.capture.depth import AgreementParams, SweepParams, agree, sweep
 from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.cameras import cameras_by_view
 from ss_flow.tasks.geometry.images import encode_png
@@ -96,16 +96,6 @@ def test_of_two_views_one_confirms_the_other(scene, swept):
     _, cameras, _ = scene
     both = agree(swept[:2], cameras_by_view(cameras)[:2], params=AgreementParams(min_views=2))
     assert (both.depth > 0).mean() > 0.5
-
-
-def test_what_one_view_alone_found_is_presumed_and_marked_as_such(scene, swept):
-    agreed = agreed_view(scene, swept, 0)
-    known = agreed.depth > 0
-    both = presume(agreed, swept[0])
-    assert both.name == agreed.name and (agreed.source, both.source) == ("mvs", "presumed")
-    np.testing.assert_array_equal(both.depth[known], agreed.depth[known])
-    np.testing.assert_array_equal(both.depth[~known], swept[0].depth[~known])
-    assert 0 < known.mean() < (both.depth > 0).mean()
 
 
 def test_views_that_were_compared_without_any_result_are_refused(scene, swept):
