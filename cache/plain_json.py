@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import json
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import msgspec
@@ -13,19 +13,19 @@ T = TypeVar("T")
 _write = msgspec.json.Encoder().encode
 
 
-def from_json(content: bytes, kind: type[T]) -> T:
-    """What a document holds: a `kind`, say a dataclass of plain data. Raises ValueError for anything else."""
-    try:
-        return _reader(kind).decode(content)
-    except msgspec.ValidationError:
-        raise
-    except msgspec.DecodeError:  # the standard library also reads what it writes itself: NaN and Infinity
-        return msgspec.convert(json.loads(content), kind)
+def reader(kind: type[T]) -> Callable[[bytes], T]:
+    """What reads documents that hold a `kind`, say a dataclass of plain data. It raises ValueError for others."""
+    decode = msgspec.json.Decoder(kind).decode
 
+    def read(content: bytes) -> T:
+        try:
+            return decode(content)
+        except msgspec.ValidationError:
+            raise
+        except msgspec.DecodeError:  # the standard library also reads what it writes itself: NaN and Infinity
+            return msgspec.convert(json.loads(content), kind)
 
-@functools.cache
-def _reader(kind: type[T]) -> msgspec.json.Decoder[T]:
-    return msgspec.json.Decoder(kind)
+    return read
 
 
 def as_json(value: Any) -> bytes:

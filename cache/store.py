@@ -50,7 +50,7 @@ from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, writing
 from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder
-from ss_flow.cache.plain_json import from_json
+from ss_flow.cache.plain_json import reader
 
 MEMORY_BYTES = 2 << 30
 """How much of what was read lately a process keeps in memory."""
@@ -87,6 +87,9 @@ class Action:
     peak_rss_mb: float
     host: str = socket.gethostname()
     warnings: tuple[str, ...] = ()
+
+
+_read_action = reader(Action)
 
 
 class Store:
@@ -259,7 +262,7 @@ class Store:
         path = f"{self._actions}/{key[:2]}/{key}.json"
         try:
             content, modified = read_stamped(path)
-            action = from_json(content, Action)
+            action = _read_action(content)
         except (FileNotFoundError, ValueError):  # not there, or not one of ours
             return None
         if action.key != key or not _is_sound(action):
