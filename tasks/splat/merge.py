@@ -90,7 +90,7 @@ class MergeParams:
         final_share=0.1,
         fall="cosine",
     )
-    """How fast each parameter is learnt: first faster than leads to an end, then more and more slowly."""
+    """How fast each parameter is learnt: faster at first than training could end with, then more and more slowly."""
     guard_iou: Fraction = 0.02
     """A refinement that lowers the mean IoU of the masks by more than this is undone."""
     guard_psnr: NonNegative = 1.0
