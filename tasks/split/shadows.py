@@ -102,8 +102,6 @@ class _Contact:
     """[3] of the surface there, towards the cameras."""
     change: Float64
     """[C, 3] of the colour there, from the lower label to the higher one."""
-    stays: Bool
-    """[C] whether there is none that can be seen."""
     step: _Step | None
     """What it is along the border, if it may be a shadow's."""
 
@@ -139,7 +137,7 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Border
     shadows = [step for step in steps if sum(step.repeats(other) for other in steps) >= params.repeats]
     # Between the things that stand on a table, and along shadows, its points have no label: masks do not agree there.
     filled = smooth(label, label == 0, cloud.points, cloud.spacing, _FILLED)
-    touches = _touches(cloud, filled, eye, shadows, params)
+    touches = _touches(cloud, label, filled, eye, shadows, params)
     while touches.alike.any():
         taken: set[int] = set()
         for a, b in _meeting(touches, surface, filled, params):
@@ -157,12 +155,10 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Border
 def _contacts(cloud: PointCloud, label: Int32, ends: Borders, eye: Float64, params: ShadowParams) -> list[_Contact]:
     """How the colours change where each two labels touch without an edge."""
     rows, _, _, (point, touched) = ends
-    change, color, near = _across(cloud, label, rows[point], touched)
     own = label[rows[point]]
+    change, color, near = _across(cloud, label, rows[point], own, touched)
     low, high = np.minimum(own, touched), np.maximum(own, touched)
     change[own == high] *= -1  # from the lower label to the higher one
-    seen = (color > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1)  # black tells nothing
-    stays = np.asarray(seen & (np.abs(change) < _OTHER).all(axis=1))
     order = np.lexsort((high, low))
     starts = np.flatnonzero(np.diff(low[order]) | np.diff(high[order])) + 1
     contacts = []
@@ -171,16 +167,20 @@ def _contacts(cloud: PointCloud, label: Int32, ends: Borders, eye: Float64, para
         centre, normal = plane_through(cloud.points[around[around >= 0]].astype(np.float64))
         normal = towards(normal, centre, eye)
         step = _step(change[here], color[here], (own == low)[here], normal) if len(here) >= params.min_points else None
-        contacts.append(_Contact(here, normal, change[here], stays[here], step))
+        contacts.append(_Contact(here, normal, change[here], step))
     return contacts
 
 
-def _touches(cloud: PointCloud, label: Int32, eye: Float64, shadows: list[_Step], params: ShadowParams) -> _Touches:
-    """Where labels touch without an edge, and where the colour stays there or changes as into one of the shadows."""
-    ends = borders(label, cloud, TouchingParams())
-    alike = np.zeros(ends.smooth.shape[1], bool)
-    for contact in _contacts(cloud, label, ends, eye, params):
-        alike[contact.of] = contact.stays
+def _touches(
+    cloud: PointCloud, label: Int32, filled: Int32, eye: Float64, shadows: list[_Step], params: ShadowParams
+) -> _Touches:
+    """Where labels touch without an edge, and where the colour stays there or changes as into one of the shadows.
+
+    filled: [N] the labels, and for points without one that of their neighbours.
+    """
+    ends = borders(filled, cloud, TouchingParams())
+    alike = _stays(cloud, label, filled, ends)
+    for contact in _contacts(cloud, filled, ends, eye, params):
         for step in shadows:
             shaded = _shaded(contact.change, step.change)
             if step.normal @ contact.normal >= _PARALLEL and shaded.sum() > alike[contact.of].sum():
@@ -188,9 +188,19 @@ def _touches(cloud: PointCloud, label: Int32, eye: Float64, shadows: list[_Step]
     return _Touches(ends.rows, ends.beside, ends.smooth[0], ends.smooth[1], alike)
 
 
-def _across(cloud: PointCloud, label: Int32, rows: Int32, touched: Int32) -> tuple[Float64, Float64, Int32]:
-    """How the colour changes from points [T] to the labels that they touch [T, 3]; the colour on the points' own side
-    [T, 3]; and the points near to each, of the two labels, that tell so [T, _NEAR], -1 for none."""
+def _stays(cloud: PointCloud, label: Int32, filled: Int32, ends: Borders) -> Bool:
+    """[T] where there is no change of colour that can be seen, by the points that have a label of themselves: what
+    fills a gap beside a sheet of paper is table."""
+    rows, _, _, (point, touched) = ends
+    change, color, _ = _across(cloud, label, rows[point], filled[rows[point]], touched)
+    seen = (color > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1)  # black tells nothing
+    return np.asarray(seen & (np.abs(change) < _OTHER).all(axis=1))
+
+
+def _across(cloud: PointCloud, label: Int32, rows: Int32, own: Int32, touched: Int32) -> tuple[Float64, Float64, Int32]:
+    """How the colour changes from points [T] to the labels that they touch [T, 3], not a number where a label has no
+    points near; the colour on the points' own side, of the label `own` [T, 3]; and the points near to each, of the two
+    labels, that tell so [T, _NEAR], -1 for none."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(cloud.points)
@@ -199,9 +209,13 @@ def _across(cloud: PointCloud, label: Int32, rows: Int32, touched: Int32) -> tup
     found = near < tree.n
     near = np.where(found, near, 0).astype(np.int32)
     color = _logarithms(cloud.colors)[near]
-    sides = [found & (label[near] == of[:, None]) for of in (label[rows], touched)]
-    own, other = (np.einsum("tk,tkc->tc", side, color) / np.maximum(side.sum(axis=1), 1)[:, None] for side in sides)
-    return other - own, own, np.where(sides[0] | sides[1], near, -1)
+    sides = [found & (label[near] == of[:, None]) for of in (own, touched)]
+    count = [side.sum(axis=1)[:, None] for side in sides]
+    here, there = (
+        np.where(n > 0, np.einsum("tk,tkc->tc", side, color) / np.maximum(n, 1), np.nan)
+        for side, n in zip(sides, count, strict=True)
+    )
+    return there - here, here, np.where(sides[0] | sides[1], near, -1)
 
 
 def _logarithms(colors: UInt8) -> Float64:

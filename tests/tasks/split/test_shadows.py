@@ -123,6 +123,11 @@ def test_where_the_colour_does_not_change_nothing_ends():
     assert surfaces(patch(BROWN, 0, 0), patch(BROWN, 0.5, 0, 0.1)) == [1, 2]
 
 
+def test_a_sheet_of_paper_does_not_take_the_colour_of_what_fills_the_gap_beside_it():
+    between = patch(BROWN, 0.5, 0, width=0.2)
+    assert surfaces(patch(BROWN, 0, 0), patch(WHITE, 0.7, 0), between, unlabelled=1) == [1, 2]
+
+
 def test_in_the_dark_nothing_is_known():
     assert surfaces(patch(0 * BROWN, 0, 0), patch(0 * BROWN, 0.5, 0)) == [1, 2]
 
