@@ -247,7 +247,7 @@ def test_a_pair_and_a_last_pass_that_fail_leave_the_union_and_the_run_is_degrade
         raise ArithmeticError("diverged")
 
     monkeypatch.setattr("ss_flow.tasks.splat.merge.train", fail)
-    all_collide = ["--set", "plan.overlap=voxel", "--set", "plan.voxel=20", "--set", "merge.rates.color=0.02"]
+    all_collide = ["--set", "plan.overlap=voxel", "--set", "plan.voxel=20", "--set", "merge.rates.color=0.03"]
     called = run_tiny(warm.scene, warm.store, *all_collide, out=warm.out)
     assert called.code == 3, called.err
     document = called.document()
