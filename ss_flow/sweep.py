@@ -119,9 +119,8 @@ def _spread(match: re.Match[str], part: str) -> list[str]:
     if match[4] and not (low > 0 and high > 0):
         raise InputError(f"range {part!r} is not possible; both ends of a range in the logarithm must be above 0.")
     shares = [i / (count - 1) for i in range(count)]
-    if match[4]:
-        return [_written(low ** (1 - s) * high**s) for s in shares]
-    return [_written((1 - s) * low + s * high) for s in shares]
+    values = [low ** (1 - s) * high**s if match[4] else (1 - s) * low + s * high for s in shares]
+    return [_written(value) for value in sorted(values, reverse=low > high)]  # in order to the last digit
 
 
 def _written(value: float) -> str:

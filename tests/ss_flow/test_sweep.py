@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import ss_flow_toy as toy
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ss_flow.engine import Request, run_flow, run_flows
@@ -60,6 +60,7 @@ def test_a_bad_list_is_refused_with_one_sentence(text, says):
 
 
 @given(st.floats(1e-6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 30), st.booleans())
+@example(100000.6640625, 100000.6640625, 4, False)  # half way between two numbers of 12 digits
 def test_a_range_has_as_many_values_as_it_says_and_both_its_ends(low, high, count, log):
     values = [float(text) for text in values_of(f"{low!r}:{high!r}:{count}{'log' if log else ''}")]
     assert len(values) == count
