@@ -13,7 +13,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Int32, Observation, PointCloud
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
 from ss_flow.tasks.split.observe import membership
-from ss_flow.tasks.split.votes.at_once import correlation_clusters
+from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence
 
 
 def part_labels(
@@ -34,7 +34,7 @@ def part_labels(
     rate: as for masks (`votes.at_once`), by whose rule the pieces of a label are clustered. first: the number of the
     first new label; the largest cluster keeps the old one, and so do those that no view sees together with it.
     """
-    from scipy.sparse import coo_array, csr_array, diags_array
+    from scipy.sparse import coo_array, csr_array
 
     pieces: list[Int32] = []
     of: list[int] = []
@@ -49,14 +49,12 @@ def part_labels(
     if not pieces:
         return label
     whole = np.array(of, np.int32)
-    masks = [(k, seen.inside(j)) for k, seen in enumerate(observations) for j in range(len(seen.mask))]
-    members = membership(pieces, len(label)), membership([inside for _, inside in masks], len(label))
     size = np.array([len(rows) for rows in pieces])
-    held = csr_array(diags_array(1 / size) @ members[0] @ members[1].T)
-    view = np.array([k for k, _ in masks], np.int32)
-    of_view = csr_array((np.ones(len(masks)), (np.arange(len(masks)), view)), shape=(len(masks), len(observations)))
-    said = (held @ of_view).toarray()
-    together = coo_array(held @ held.T)
+    view = np.repeat(np.arange(len(observations), dtype=np.int32), [len(seen.mask) for seen in observations])
+    masks = [seen.inside(j) for seen in observations for j in range(len(seen.mask))]
+    within = membership(masks, len(label))
+    pairs, said = evidence(membership(pieces, len(label)), view, np.ones(len(masks), np.int32), masks=within)
+    together = coo_array(pairs)
     same = whole[together.row] == whole[together.col]
     together = csr_array((together.data[same], (together.row[same], together.col[same])), shape=together.shape)
     cluster = correlation_clusters(together, said, np.ones(len(pieces), np.int32), rate)
