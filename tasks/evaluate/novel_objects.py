@@ -16,7 +16,7 @@ from ss_flow.tasks.evaluate.novel_view import identity, perceived, psnr, ssim, t
 from ss_flow.tasks.evaluate.objects import change_elsewhere
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.geometry.cameras import camera_of
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, near_border
 from ss_flow.tasks.masks.packing import bounds
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.lpips import distance
@@ -133,10 +133,7 @@ def removals(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> Re
 
 def border_band(ids: np.ndarray) -> Bool:
     """[H, W] the pixels within 5 of a border between two ids, one of which may be 0."""
-    import cv2
-
-    window = np.ones((2 * _BAND + 1,) * 2, np.uint8)
-    return np.asarray(cv2.erode(ids, window) != cv2.dilate(ids, window))
+    return near_border(ids, _BAND)
 
 
 def _compared(

@@ -1,4 +1,4 @@
-"""Pixels of frames: decoding, encoding, sizes."""
+"""Pixels of frames and of their ids: decoding, encoding, sizes, borders."""
 
 from __future__ import annotations
 
@@ -98,3 +98,11 @@ def size_within(side: int, width: int, height: int) -> tuple[int, int]:
     """Width and height of an image, scaled down where one of them is above `side`."""
     scale = min(1.0, side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def near_border(ids: np.ndarray, reach: int) -> Bool:
+    """[H, W] which pixels have another id (uint8, uint16 or float32) within so many rows and columns of them."""
+    import cv2
+
+    window = np.ones((2 * reach + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(ids, window) != cv2.dilate(ids, window))

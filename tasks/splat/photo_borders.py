@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Float32, Int32, UInt8
+from ss_flow.tasks.artifacts import Float32, Int32, UInt8
+from ss_flow.tasks.geometry.images import near_border
 
 _Ids = NDArray[np.uint16]
 
@@ -41,14 +42,6 @@ def settled_by_photo(rgb: UInt8, masks: _Ids, shown: _Ids, reach: int) -> _Ids:
     keeps = thin & (by_masks < by_scene)
     keeps[0] = False
     return np.where(keeps[strip], masks, shown)
-
-
-def near_border(ids: NDArray[np.uint16] | Float32, reach: int) -> Bool:
-    """[H, W] which pixels have another id within so many rows and columns of them."""
-    import cv2
-
-    window = np.ones((2 * reach + 1,) * 2, np.uint8)
-    return cv2.erode(ids, window) != cv2.dilate(ids, window)
 
 
 def _strips(masks: _Ids, shown: _Ids) -> Int32:

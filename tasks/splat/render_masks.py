@@ -16,9 +16,9 @@ from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid, depth_at_frame_size
+from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid, depth_at_frame_size, near_border
 from ss_flow.tasks.ranges import Fraction
-from ss_flow.tasks.splat.photo_borders import near_border, settled_by_photo
+from ss_flow.tasks.splat.photo_borders import settled_by_photo
 
 _LABELS_AT_ONCE = 16
 """So many mask images are held at once."""
