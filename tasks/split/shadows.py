@@ -93,17 +93,29 @@ class _Step:
 
 
 @dataclass(frozen=True)
+class _Colors:
+    """The colours where labels touch without an edge."""
+
+    near: Int32
+    """[T, _NEAR] the points near each touch, of the two labels; -1 for none."""
+    change: Float64
+    """[T, 3] from the points to the labels that they touch; not a number where a label has no points near."""
+    own: Float64
+    """[T, 3] on the points' own side."""
+
+
+@dataclass(frozen=True)
 class _Contact:
     """Where two labels touch."""
 
     of: NDArray[np.intp]
     """[C] which of the touches."""
+    first: Bool
+    """[C] whether the touch is one of the lower label's points."""
     normal: Float64
     """[3] of the surface there, towards the cameras."""
     change: Float64
     """[C, 3] of the colour there, from the lower label to the higher one."""
-    step: _Step | None
-    """What it is along the border, if it may be a shadow's."""
 
 
 @dataclass(frozen=True)
@@ -123,21 +135,20 @@ class _Touches:
 
 
 def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, params: ShadowParams) -> Int32:
-    """[L + 1] the lowest label of the surface that each label is a piece of; itself where no shadow parts it.
+    """[L + 1] the lowest label of the surface that each label is a piece of; itself where it is all of one.
 
     label: [N] of the cloud's points, 0 = none; ends: their borders. Round by round, the labels are united that lie in
-    one plane and touch without an edge where light alone tells them apart: those that do so along the largest share of
-    a border first, each once a round.
+    one plane and touch without an edge where light alone, or nothing, tells them apart: those that do so along the
+    largest share of a border first, each once a round.
     """
     surface = np.arange(int(label.max(initial=0)) + 1, dtype=np.int32)
     if not params.agreement or not label.any():
         return surface
     eye = middle_of(cameras)
-    steps = [contact.step for contact in _contacts(cloud, label, ends, eye, params) if contact.step is not None]
-    shadows = [step for step in steps if sum(step.repeats(other) for other in steps) >= params.repeats]
+    shadows = _shadows(cloud, label, ends, eye, params)
     # Between the things that stand on a table, and along shadows, its points have no label: masks do not agree there.
     filled = smooth(label, label == 0, cloud.points, cloud.spacing, _FILLED)
-    touches = _touches(cloud, label, filled, eye, shadows, params)
+    touches = _touches(cloud, label, filled, eye, shadows)
     while touches.alike.any():
         taken: set[int] = set()
         for a, b in _meeting(touches, surface, filled, params):
@@ -152,70 +163,79 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Border
     return surface
 
 
-def _contacts(cloud: PointCloud, label: Int32, ends: Borders, eye: Float64, params: ShadowParams) -> list[_Contact]:
-    """How the colours change where each two labels touch without an edge."""
-    rows, _, _, (point, touched) = ends
-    own = label[rows[point]]
-    change, color, near = _across(cloud, label, rows[point], own, touched)
+def _shadows(cloud: PointCloud, label: Int32, ends: Borders, eye: Float64, params: ShadowParams) -> list[_Step]:
+    """The steps that enough other borders repeat."""
+    colors = _across(cloud, label, label, ends, _around(cloud, ends))
+    steps = []
+    for contact in _contacts(cloud, label, ends, colors, eye):
+        if len(contact.of) >= params.min_points:
+            step = _step(contact.change, colors.own[contact.of], contact.first, contact.normal)
+            if step is not None:
+                steps.append(step)
+    return [step for step in steps if sum(step.repeats(other) for other in steps) >= params.repeats]
+
+
+def _touches(cloud: PointCloud, label: Int32, filled: Int32, eye: Float64, shadows: list[_Step]) -> _Touches:
+    """Where labels touch without an edge, and where the colour stays there or changes as into one of the shadows.
+
+    filled: [N] the labels, and for points without one that of their neighbours. That the colour stays is told by points
+    that have a label of themselves: what fills a gap beside a sheet of paper is table.
+    """
+    ends = borders(filled, cloud, TouchingParams())
+    near = _around(cloud, ends)
+    alike = _stays(_across(cloud, label, filled, ends, near))
+    if shadows:
+        for contact in _contacts(cloud, filled, ends, _across(cloud, filled, filled, ends, near), eye):
+            for step in shadows:
+                shaded = _shaded(contact.change, step.change)
+                if step.normal @ contact.normal >= _PARALLEL and shaded.sum() > alike[contact.of].sum():
+                    alike[contact.of] = shaded
+    return _Touches(ends.rows, ends.beside, ends.smooth[0], ends.smooth[1], alike)
+
+
+def _contacts(cloud: PointCloud, label: Int32, ends: Borders, colors: _Colors, eye: Float64) -> list[_Contact]:
+    """The touches without an edge, by the two labels that touch."""
+    own, touched = label[ends.rows[ends.smooth[0]]], ends.smooth[1]
     low, high = np.minimum(own, touched), np.maximum(own, touched)
-    change[own == high] *= -1  # from the lower label to the higher one
+    change = np.where((own == high)[:, None], -colors.change, colors.change)
     order = np.lexsort((high, low))
     starts = np.flatnonzero(np.diff(low[order]) | np.diff(high[order])) + 1
     contacts = []
     for here in np.split(order, starts) if len(order) else []:
-        around = np.unique(near[here])
+        around = np.unique(colors.near[here])
         centre, normal = plane_through(cloud.points[around[around >= 0]].astype(np.float64))
-        normal = towards(normal, centre, eye)
-        step = _step(change[here], color[here], (own == low)[here], normal) if len(here) >= params.min_points else None
-        contacts.append(_Contact(here, normal, change[here], step))
+        contacts.append(_Contact(here, (own == low)[here], towards(normal, centre, eye), change[here]))
     return contacts
 
 
-def _touches(
-    cloud: PointCloud, label: Int32, filled: Int32, eye: Float64, shadows: list[_Step], params: ShadowParams
-) -> _Touches:
-    """Where labels touch without an edge, and where the colour stays there or changes as into one of the shadows.
-
-    filled: [N] the labels, and for points without one that of their neighbours.
-    """
-    ends = borders(filled, cloud, TouchingParams())
-    alike = _stays(cloud, label, filled, ends)
-    for contact in _contacts(cloud, filled, ends, eye, params):
-        for step in shadows:
-            shaded = _shaded(contact.change, step.change)
-            if step.normal @ contact.normal >= _PARALLEL and shaded.sum() > alike[contact.of].sum():
-                alike[contact.of] = shaded
-    return _Touches(ends.rows, ends.beside, ends.smooth[0], ends.smooth[1], alike)
+def _stays(colors: _Colors) -> Bool:
+    """[T] where no change of colour can be seen; black tells nothing."""
+    seen = (colors.own > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1)
+    return np.asarray(seen & (np.abs(colors.change) < _OTHER).all(axis=1))
 
 
-def _stays(cloud: PointCloud, label: Int32, filled: Int32, ends: Borders) -> Bool:
-    """[T] where there is no change of colour that can be seen, by the points that have a label of themselves: what
-    fills a gap beside a sheet of paper is table."""
-    rows, _, _, (point, touched) = ends
-    change, color, _ = _across(cloud, label, rows[point], filled[rows[point]], touched)
-    seen = (color > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1)  # black tells nothing
-    return np.asarray(seen & (np.abs(change) < _OTHER).all(axis=1))
-
-
-def _across(cloud: PointCloud, label: Int32, rows: Int32, own: Int32, touched: Int32) -> tuple[Float64, Float64, Int32]:
-    """How the colour changes from points [T] to the labels that they touch [T, 3], not a number where a label has no
-    points near; the colour on the points' own side, of the label `own` [T, 3]; and the points near to each, of the two
-    labels, that tell so [T, _NEAR], -1 for none."""
+def _around(cloud: PointCloud, ends: Borders) -> Int32:
+    """[T, _NEAR] the points near each touch without an edge, -1 for none."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(cloud.points)
     reach = TouchingParams().reach * cloud.spacing
-    _, near = tree.query(cloud.points[rows], k=np.arange(1, _NEAR + 1), distance_upper_bound=reach)
-    found = near < tree.n
-    near = np.where(found, near, 0).astype(np.int32)
+    places = cloud.points[ends.rows[ends.smooth[0]]]
+    _, near = tree.query(places, k=np.arange(1, _NEAR + 1), distance_upper_bound=reach)
+    return np.where(near < tree.n, near, -1).astype(np.int32)
+
+
+def _across(cloud: PointCloud, shown: Int32, label: Int32, ends: Borders, near: Int32) -> _Colors:
+    """The colours on both sides where labels [N] touch without an edge, by the points near that `shown` labels so."""
     color = _logarithms(cloud.colors)[near]
-    sides = [found & (label[near] == of[:, None]) for of in (own, touched)]
+    own, touched = label[ends.rows[ends.smooth[0]]], ends.smooth[1]
+    sides = [(near >= 0) & (shown[near] == of[:, None]) for of in (own, touched)]
     count = [side.sum(axis=1)[:, None] for side in sides]
     here, there = (
         np.where(n > 0, np.einsum("tk,tkc->tc", side, color) / np.maximum(n, 1), np.nan)
         for side, n in zip(sides, count, strict=True)
     )
-    return there - here, here, np.where(sides[0] | sides[1], near, -1)
+    return _Colors(np.where(sides[0] | sides[1], near, -1), there - here, here)
 
 
 def _logarithms(colors: UInt8) -> Float64:
