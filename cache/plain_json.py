@@ -20,8 +20,6 @@ def reader(kind: type[T]) -> Callable[[bytes], T]:
     def read(content: bytes) -> T:
         try:
             return decode(content)
-        except msgspec.ValidationError:
-            raise
         except msgspec.DecodeError:  # the standard library also reads what it writes itself: NaN and Infinity
             return msgspec.convert(json.loads(content), kind)
 
