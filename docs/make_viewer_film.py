@@ -36,11 +36,15 @@ def steps(viewer: Viewer, page: Page) -> Iterator[str]:
     """Do one thing after the other, and tell each."""
     panel, session = viewer.panel, viewer.panel.session
     yield "the scene"
-    search(page, "orange")
+    search(page, "brown")
     yield "search"
-    chosen = next(i for i in session.state.objects.entries if "orange" in session.state.objects.name(i))
+    objects, pieces = session.state.objects, session.state.pieces
+    chosen = max((i for i in pieces if i and "brown" in objects.name(i)), key=lambda i: len(pieces[i].rows))
     panel._chosen((chosen,))
     yield "select what was found"
+    (client,) = viewer.server.get_clients().values()
+    panel._look_at(client)
+    yield "look at it"
     session.isolate((chosen,))
     panel.refresh()
     yield "isolate"

@@ -13,7 +13,8 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.flows.describe import as_html, provenance
 from ss_flow.flows.results import Results, of_type
-from ss_flow.flows.view.drawing import Around, draw, is_spatial, look_from, start_view
+from ss_flow.flows.view.drawing import Around, draw, is_spatial
+from ss_flow.flows.view.looking import look_from, start_view
 from ss_flow.runs import Run
 from ss_flow.tasks.artifacts import Cameras, Frame, PointCloud
 from ss_flow.tasks.deliver.draw import draw as picture_of

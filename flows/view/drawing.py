@@ -19,7 +19,6 @@ from ss_flow.tasks.artifacts import (
     Cameras,
     DepthMap,
     Float32,
-    Float64,
     Frame,
     Gaussians,
     InstanceMasks,
@@ -40,12 +39,11 @@ from ss_flow.tasks.geometry.cameras import (
     camera_extent,
     camera_of,
     cameras_by_view,
-    pixels_in_view,
 )
 from ss_flow.tasks.geometry.images import decode_rgb
 
 if TYPE_CHECKING:
-    from viser import CameraFrustumHandle, GaussianSplatHandle, PointCloudHandle, SceneApi, ViserServer
+    from viser import CameraFrustumHandle, GaussianSplatHandle, PointCloudHandle, SceneApi
 
 _UNLABELLED = (190, 190, 190)
 _PICTURE_HEIGHT = 240
@@ -87,46 +85,6 @@ class Around:
         if self.points is None or len(self.points.points) != len(labels):
             raise InputError("labels can be placed only with the dense points that they are about.")
         return self.points
-
-
-@dataclass(frozen=True)
-class StartView:
-    """Where to look from first: as viser's initial camera, in world units."""
-
-    position: Float64
-    look_at: Float64
-    up: Float64
-    fov: float
-    """Vertical, in radians."""
-
-
-def start_view(cameras: Cameras, points: Float32) -> StartView:
-    """The view of the capture that shows most of the scene: what photos saw is what Gaussians show well.
-
-    points: [N, 3] centres of the scene.
-    """
-    some = points[:: max(1, len(points) // 20_000)]
-    shown = [pixels_in_view(some, camera)[3] for camera in cameras_by_view(cameras)]
-    view = max(range(len(shown)), key=lambda k: len(shown[k]))
-    camera = camera_of(cameras, view)
-    ahead = float(np.median(shown[view])) if len(shown[view]) else max(camera_extent([camera]), 1.0)
-    forward = camera.world_to_camera[2, :3]
-    fov = 2 * np.arctan(camera.height / 2 / camera.fy)
-    return StartView(camera.center, camera.center + ahead * forward, up_of(cameras), float(fov))
-
-
-def look_from(server: ViserServer, first: StartView) -> None:
-    """Let browsers that come look from there."""
-    camera = server.initial_camera
-    server.scene.set_up_direction(first.up)
-    camera.position, camera.look_at, camera.up, camera.fov = first.position, first.look_at, first.up, first.fov
-
-
-def up_of(cameras: Cameras) -> Float64:
-    """[3] the direction that is up in most photos, of length 1."""
-    up = -cameras.world_to_camera[:, 1, :3].mean(axis=0)
-    length = float(np.linalg.norm(up))
-    return up / length if length > 0.1 else -cameras.world_to_camera[0, 1, :3]
 
 
 def add_gaussians(scene: SceneApi, name: str, gaussians: Gaussians, colors: UInt8 | None = None) -> GaussianSplatHandle:

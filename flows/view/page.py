@@ -18,7 +18,7 @@ import numpy as np
 
 from ss_flow.cache.files import write_atomically
 from ss_flow.flows.results import BACKGROUND, FinishedRun
-from ss_flow.flows.view.drawing import StartView, start_view
+from ss_flow.flows.view.looking import Viewpoint, start_view
 from ss_flow.tasks.artifacts import Float32, Gaussians
 from ss_flow.tasks.deliver.compressed import Thumbnail, data_uri
 from ss_flow.tasks.deliver.export.content import morton_order
@@ -50,7 +50,7 @@ def write_page(file: Path, run: FinishedRun) -> None:
 
 
 def page_html(
-    title: str, scene: Gaussians, start: StartView, objects: list[tuple[Mapping[str, Any], Thumbnail | None]]
+    title: str, scene: Gaussians, start: Viewpoint, objects: list[tuple[Mapping[str, Any], Thumbnail | None]]
 ) -> str:
     """The page of a scene.
 

@@ -14,12 +14,13 @@ from ss_flow.errors import InputError
 from ss_flow.flows.results import BACKGROUND
 from ss_flow.flows.view.correcting import Correcting
 from ss_flow.flows.view.corrections import Corrections
+from ss_flow.flows.view.looking import move_to, view_of_object
 from ss_flow.flows.view.nodes import SceneNodes
 from ss_flow.flows.view.object_list import ObjectList
 from ss_flow.flows.view.picking import Picker, pixel_met
 from ss_flow.flows.view.search import Search
 from ss_flow.flows.view.session import Operation, Piece, Session, write_script
-from ss_flow.tasks.artifacts import Float64
+from ss_flow.tasks.artifacts import Cameras, Float64
 from ss_flow.tasks.edit.operations import Motion
 
 if TYPE_CHECKING:
@@ -47,16 +48,18 @@ class Panel:
     def __init__(
         self,
         server: viser.ViserServer,
+        cameras: Cameras,
         session: Session,
         script: Path,
         search: Search | None,
         corrections: Callable[[], Corrections] | None = None,
         draw_at_most: int | None = None,
     ) -> None:
-        """script: the file that the edit script is saved to. search: None where a run cannot be searched. corrections:
-        opens those of the run; None where it cannot be run again. draw_at_most: so many Gaussians, for browsers that
-        draw without a GPU; what is done means all of them."""
-        self._server, self.session, self._script = server, session, script
+        """cameras: of the capture; objects are looked at from there. script: the file that the edit script is saved to.
+        search: None where a run cannot be searched. corrections: opens those of the run; None where it cannot be run
+        again. draw_at_most: so many Gaussians, for browsers that draw without a GPU; what is done means all of them.
+        """
+        self._server, self._cameras, self.session, self._script = server, cameras, session, script
         count = sum(len(piece.rows) for piece in session.state.pieces.values())
         self.nodes = SceneNodes(server, min(1.0, (draw_at_most or count) / max(count, 1)))
         self.lock = threading.RLock()
@@ -103,7 +106,7 @@ class Panel:
     def _build_actions(self, gui: viser.GuiApi) -> None:
         act = self._actions()
         for label, names in (
-            ("Show", ("Hide", "Isolate", "Show all")),
+            ("Show", ("Look at", "Hide", "Isolate", "Show all")),
             ("Change", ("Move", "Duplicate", "Remove", "Merge", "Split")),
         ):
             self._group(gui, label, {name: act[name] for name in names})
@@ -123,6 +126,7 @@ class Panel:
         """What each button does; it is given the browser that asked."""
         session = self.session
         return {
+            "Look at": self._look_at,
             "Hide": lambda _: session.hide(session.selected),
             "Isolate": lambda _: session.isolate(session.selected),
             "Show all": lambda _: session.show(),
@@ -188,6 +192,15 @@ class Panel:
         """What is selected and can be moved."""
         shown = self.session.visible()
         return [i for i in self.session.selected if i != BACKGROUND and i in shown]
+
+    def _look_at(self, client: Client) -> None:
+        """Stand where what is selected is seen well; it may be anywhere, when it comes from the list."""
+        pieces = [self.session.state.pieces[i] for i in self.session.selected if i in self.session.state.pieces]
+        if not pieces:
+            raise InputError("select an object that has Gaussians to look at it.")
+        if client is not None:
+            points = np.concatenate([piece.gaussians.means for piece in pieces])
+            move_to(client, view_of_object(self._cameras, points, client.camera.fov))
 
     def _toggle_gizmo(self) -> None:
         self._is_moving = not self._is_moving
@@ -290,6 +303,7 @@ class Panel:
 
 
 _KEYS: tuple[tuple[str, Any, Any], ...] = (
+    ("Look at", "F", None),
     ("Hide", "H", None),
     ("Isolate", "I", None),
     ("Show all", "U", None),

@@ -21,8 +21,8 @@ from ss_flow.flows.view.drawing import (
     agreement_colors,
     draw,
     label_colors,
-    start_view,
 )
+from ss_flow.flows.view.looking import start_view
 from ss_flow.flows.view.thinning import thinned
 from ss_flow.tasks.artifacts import Gaussians, PointLabels, UInt8
 from ss_flow.tasks.deliver.palette import instance_color

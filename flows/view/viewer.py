@@ -9,7 +9,7 @@ from pathlib import Path
 from ss_flow.flows.results import FinishedRun
 from ss_flow.flows.view.camera_views import CameraViews
 from ss_flow.flows.view.corrections import Corrections
-from ss_flow.flows.view.drawing import look_from, start_view
+from ss_flow.flows.view.looking import look_from, start_view
 from ss_flow.flows.view.panel import Panel
 from ss_flow.flows.view.search import Search
 from ss_flow.flows.view.server import start
@@ -44,7 +44,7 @@ class Viewer:
         self.server, self.address = start(host, port, run.name)
         look_from(self.server, start_view(cameras, scene.means))
         corrections = None if hints is None else partial(Corrections, run, hints)
-        self.panel = Panel(self.server, session, script, search, corrections, draw_at_most)
+        self.panel = Panel(self.server, cameras, session, script, search, corrections, draw_at_most)
         self.cameras = CameraViews(self.server, cameras, run.results)
 
     def add_timeline(self, beside: FinishedRun | None = None) -> None:

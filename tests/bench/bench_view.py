@@ -25,6 +25,7 @@ import numpy as np
 import psutil
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from box_scene import cameras
 from browser import Page, browser_page
 
 from ss_flow.flows.view.panel import Panel
@@ -76,7 +77,8 @@ def measure(count: int, objects: int, frames: int, draw_at_most: int | None) -> 
     server, address = start("127.0.0.1", 0, "bench")
     server.initial_camera.position, server.initial_camera.look_at = eye, middle
     with tempfile.TemporaryDirectory() as folder:
-        panel = Panel(server, Session(scene, instances, Path()), Path(folder, "script.json"), None, None, draw_at_most)
+        session, script = Session(scene, instances, Path()), Path(folder, "script.json")
+        panel = Panel(server, cameras(), session, script, None, None, draw_at_most)
         told = {"server ready, s": time.perf_counter() - begun}
         if frames:
             told |= _browser(address, frames)

@@ -10,7 +10,8 @@ from tiny_runs import run_tiny, ss_flow
 from ss_flow.cache.store import Store
 from ss_flow.flows.cli import view
 from ss_flow.flows.view.artifact import around_of, placed, show
-from ss_flow.flows.view.drawing import Around, start_view
+from ss_flow.flows.view.drawing import Around
+from ss_flow.flows.view.looking import start_view
 from ss_flow.runs import latest_runs
 
 

@@ -208,6 +208,12 @@ class Hands:
             seen.image_width, seen.image_height, focal, focal, seen.image_width / 2, seen.image_height / 2, pose
         )
 
+    def is_in_the_middle(self, place: Float64) -> bool:
+        """Whether the page shows a place in the middle, and from another place than at first."""
+        camera = self.camera()
+        (pixel,), _ = project(place[None], camera)
+        return np.linalg.norm(pixel - (camera.width / 2, camera.height / 2)) < 3 and not self.has_arrived()
+
     def seen(self) -> dict[int, Float64]:
         """Of each instance, pixels that show it, left of the panel; those of most pixels first."""
         camera = self.camera()
@@ -247,6 +253,20 @@ def opened(warm, folder: Path, beside: Path | None = None, width: int = 900) -> 
         hands.until(hands.has_arrived)
         yield hands
     viewer.close()
+
+
+def test_what_is_chosen_from_the_list_is_looked_at(hands):
+    session, page = hands.session, hands.page
+    page.evaluate("buttons('Look at')[0].click()")
+    page.wait_for("document.body.innerText.includes('select an object')")
+    for chosen in list(session.state.objects.entries)[:3]:
+        if chosen not in session.state.pieces:
+            continue
+        hands.pick(chosen)
+        hands.until(lambda chosen=chosen: session.selected == (chosen,))
+        place = np.median(session.state.pieces[chosen].gaussians.means, axis=0)
+        hands.key("f", "KeyF")
+        hands.until(lambda place=place: hands.is_in_the_middle(place))
 
 
 def test_every_operation_is_clicked_through_and_the_script_gives_the_scene_that_was_seen(hands, warm, tmp_path):

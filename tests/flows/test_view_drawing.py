@@ -19,8 +19,8 @@ from ss_flow.flows.view.drawing import (
     draw,
     is_spatial,
     label_colors,
-    start_view,
 )
+from ss_flow.flows.view.looking import start_view, view_of_object
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.gaussians.densification import rotations
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
@@ -108,6 +108,25 @@ def test_the_first_view_is_the_photo_that_shows_most(around):
     ahead = first.look_at - first.position
     np.testing.assert_allclose(ahead / np.linalg.norm(ahead), best.world_to_camera[2, :3], atol=1e-6)
     assert first.up @ -best.world_to_camera[1, :3] > 0.7
+
+
+def test_an_object_is_looked_at_whole_from_the_side_that_a_photo_saw(results, around):
+    cameras, scene = around.cameras, results.one("scene")
+    for instance in np.unique(scene.instance_id[scene.instance_id > 0]):
+        points = scene.means[scene.instance_id == instance]
+        view = view_of_object(cameras, points, fov := 0.9)
+        away = view.position - view.look_at
+        centers = np.array([camera_of(cameras, k).center for k in range(len(cameras.names))]) - view.look_at
+        cosines = centers @ away / np.linalg.norm(centers, axis=1) / np.linalg.norm(away)
+        assert cosines.max() == pytest.approx(1)  # on the line to a camera
+        nearest = np.linalg.norm(centers[cosines.argmax()])
+        assert np.linalg.norm(away) <= nearest * (1 + 1e-9)
+        rays = points - view.position
+        depth = rays @ -away / np.linalg.norm(away)
+        off_axis = np.arccos(np.clip(depth / np.linalg.norm(rays, axis=1), -1, 1))
+        is_near = np.linalg.norm(away) < nearest * (1 - 1e-9)
+        assert not is_near or np.mean(off_axis < fov / 2) > 0.9  # it fits into the picture, and fills it
+        assert not is_near or np.quantile(off_axis, 0.95) > 0.2 * fov
 
 
 SPATIAL = {

@@ -14,7 +14,7 @@ from browser import browser_page, needs_browser
 
 from ss_flow.cache.store import Store
 from ss_flow.flows.results import finished_run, read_run
-from ss_flow.flows.view.drawing import start_view
+from ss_flow.flows.view.looking import start_view
 from ss_flow.flows.view.page import page_html, write_page
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians.initialise import select

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_scene import cameras
 from made_gaussians import made_gaussians
 from still_life import DOCUMENT, scene
 from tiny_runs import ss_flow
@@ -66,7 +67,7 @@ def test_the_viewer_draws_the_share_of_each_object_and_clicks_and_edits_mean_all
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         session = Session(scene(), json.loads(json.dumps(DOCUMENT)), Path())
-        panel = Panel(server, session, tmp_path / "s.json", None, draw_at_most=11)
+        panel = Panel(server, cameras(), session, tmp_path / "s.json", None, draw_at_most=11)
         drawn = {i: len(server.scene.get_handle_by_name(f"/objects/{i}").buffer) for i in session.state.pieces}
         assert drawn == {0: 5, 2: 2, 3: 2, 4: 2}
         notes = [
