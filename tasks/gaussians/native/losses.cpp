@@ -13,7 +13,7 @@ using namespace lanes;
 constexpr int kRadius = 5;  // an 11 x 11 window, sigma 1.5 (Wang et al. 2004)
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 constexpr int kPiece = 16;  // rows
-constexpr int kLanes = sizeof(Register) / sizeof(float);
+constexpr int kLanes = sizeof(Register) / sizeof(float), kTogether = 16;
 
 struct Window {
     float tap[kRadius + 1];
@@ -51,11 +51,18 @@ void each_tap(int y, int height, const Window& w, F visit) {
 
 Register read(const float* at) { return Memory<Register>::load(at); }
 
-// Down the columns around row y of images of `height` rows of n: each line gets one of the sums that `add(at, tap, sums)`
-// adds to, for a register of elements from `at` on; what lies beyond the end of a row is read, and counts nowhere.
+// From `by` elements before a part of a row of n to as many behind it. It begins at a multiple of what `Sum` and every
+// register hold, so that each element has the bytes that it would have in the whole row.
+Part widened(Part part, int by, int n) {
+    return {std::max(part.begin - by, 0) / kTogether * kTogether, std::min(part.end + by, n)};
+}
+
+// Down the columns around row y of images of `height` rows of n, in a part of the row: each line gets one of the sums
+// that `add(at, tap, sums)` adds to, for a register of elements from `at` on; what lies beyond the end of a row is read,
+// and counts nowhere.
 template <int count, class F>
-void convolve_columns(int n, int y, int height, const Window& w, Line (&to)[count], F add) {
-    for (int i = 0; i < n; i += kLanes) {
+void convolve_columns(Part part, int y, int n, int height, const Window& w, Line (&to)[count], F add) {
+    for (int i = part.begin; i < part.end; i += kLanes) {
         Register sums[count] = {};
         each_tap(y, height, w, [&](int row, float tap) { add((int64_t)row * n + i, tap, sums); });
         for (int k = 0; k < count; ++k) Memory<Register>::store(to[k].middle + i, sums[k]);
@@ -81,13 +88,13 @@ void compare(int n, const float* __restrict share, const float* __restrict mx, f
 }
 
 struct Sum {  // of many floats: sixteen running sums, added at the end
-    float lane[16] = {};
+    float lane[kTogether] = {};
     double total = 0;
     void add(const float* values, int n) {
         int i = 0;
-        for (; i + 16 <= n; i += 16)
-            for (int k = 0; k < 16; ++k) lane[k] += values[i + k];
-        for (; i < n; ++i) lane[i % 16] += values[i];
+        for (; i + kTogether <= n; i += kTogether)
+            for (int k = 0; k < kTogether; ++k) lane[k] += values[i + k];
+        for (; i < n; ++i) lane[i % kTogether] += values[i];
         for (float& v : lane) total += v, v = 0;
     }
 };
@@ -108,6 +115,7 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
         float *share = loss.share.room(size), *x = loss.x.room(wide), *y = loss.y.room(wide);
         float *mean = loss.towards_mean.room(wide), *square = loss.towards_square.room(wide);
         float* product = loss.towards_product.room(wide);
+        Part* counted = loss.counted.room(height);  // what of each row counts at most; SSIM is asked for nowhere else
         double* sums = loss.sums.room(2 * pieces);
         double total = 0;
         for (int64_t p = 0; p < (int64_t)width * height; ++p) total += weight[p];
@@ -125,8 +133,13 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
             std::vector<float> terms(n);
             Sum l1;
             rows(piece, [&](int r, int64_t at) {
+                const float* of_row = weight + (int64_t)r * width;
+                int first = 0, end = width;
+                while (first < end && !(of_row[first] > 0)) ++first;
+                while (first < end && !(of_row[end - 1] > 0)) --end;
+                counted[r] = widened({first * channels, end * channels}, 0, n);
                 for (int p = 0; p < width; ++p)
-                    for (int c = 0; c < channels; ++c) share[at + p * channels + c] = weight[(int64_t)r * width + p] * norm;
+                    for (int c = 0; c < channels; ++c) share[at + p * channels + c] = of_row[p] * norm;
                 for (int64_t i = at; i < at + n; ++i) {
                     x[i] = share[i] > 0 ? image[i] : 0, y[i] = share[i] > 0 ? target[i] : 0;
                     const float d = x[i] - y[i];
@@ -148,14 +161,19 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
                 for (int k = 0; k < 5; ++k) m[k] = blurred.data() + (size_t)k * n;
                 Sum ssim;
                 rows(piece, [&](int r, int64_t at) {
-                    convolve_columns(n, r, height, w, down, [&](int64_t from, float tap, Register(&sums)[5]) {
+                    for (float* towards : {mean, square, product}) std::fill(towards + at, towards + at + n, 0.0f);
+                    const Part part = counted[r], around = widened(part, pad, n);
+                    const int b = part.begin, some = part.end - part.begin;
+                    if (some <= 0) return;
+                    convolve_columns(around, r, n, height, w, down, [&](int64_t from, float tap, Register(&sums)[5]) {
                         const Register u = read(x + from), v = read(y + from), a = tap * u, b = tap * v;
                         sums[0] = sums[0] + a, sums[1] = sums[1] + b;
                         sums[2] = sums[2] + a * u, sums[3] = sums[3] + b * v, sums[4] = sums[4] + a * v;
                     });
-                    for (int k = 0; k < 5; ++k) convolve(n, channels, w, down[k].middle, m[k]);
-                    compare(n, share + at, m[0], m[1], m[2], m[3], m[4], mean + at, square + at, product + at);
-                    ssim.add(m[1], n);
+                    for (int k = 0; k < 5; ++k) convolve(some, channels, w, down[k].middle + b, m[k]);
+                    compare(some, share + at + b, m[0], m[1], m[2], m[3], m[4], mean + at + b, square + at + b,
+                            product + at + b);
+                    ssim.add(m[1], some);
                 });
                 sums[2 * piece + 1] = ssim.total;
             });
@@ -166,17 +184,21 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
                 std::vector<float> blurred(3 * (size_t)n);
                 float *m = blurred.data(), *s = m + n, *p = s + n;
                 rows(piece, [&](int r, int64_t at) {
-                    convolve_columns(n, r, height, w, down, [&](int64_t from, float tap, Register(&sums)[3]) {
+                    const Part part = counted[r], around = widened(part, pad, n);
+                    const int some = part.end - part.begin;
+                    if (some <= 0) return;
+                    convolve_columns(around, r, n, height, w, down, [&](int64_t from, float tap, Register(&sums)[3]) {
                         sums[0] = sums[0] + tap * read(mean + from);
                         sums[1] = sums[1] + tap * read(square + from);
                         sums[2] = sums[2] + tap * read(product + from);
                     });
-                    convolve(n, channels, w, down[0].middle, m);
-                    convolve(n, channels, w, down[1].middle, s);
-                    convolve(n, channels, w, down[2].middle, p);
-                    for (int i = 0; i < n; ++i) {
-                        const float towards = m[i] + 2 * x[at + i] * s[i] + y[at + i] * p[i];
-                        gradient[at + i] += share[at + i] > 0 ? ssim_weight * towards : 0;
+                    const int64_t b = at + part.begin;
+                    convolve(some, channels, w, down[0].middle + part.begin, m);
+                    convolve(some, channels, w, down[1].middle + part.begin, s);
+                    convolve(some, channels, w, down[2].middle + part.begin, p);
+                    for (int i = 0; i < some; ++i) {
+                        const float towards = m[i] + 2 * x[b + i] * s[i] + y[b + i] * p[i];
+                        gradient[b + i] += share[b + i] > 0 ? ssim_weight * towards : 0;
                     }
                 });
             });

@@ -3,11 +3,16 @@
 
 #include "binning.h"
 
+struct Part {  // of a row
+    int begin, end;
+};
+
 struct Workspace {
     binning::Frame frame;
     struct {
         parallel::Buffer<float> share, x, y, towards_mean, towards_square, towards_product;
         parallel::Buffer<double> sums;
+        parallel::Buffer<Part> counted;
     } loss;
 };
 

@@ -60,6 +60,20 @@ def test_ignored_pixels_change_neither_loss_nor_gradient():
     assert not a.gradient[5:9, 5:9].any()
 
 
+@pytest.mark.parametrize("left", [0, 5, 16, 37, 58])
+def test_what_counts_in_a_part_of_an_image_has_the_loss_and_the_gradient_that_it_has_alone(left):
+    rng = np.random.default_rng(left)
+    image, target = rng.random((2, 40, 70, 3)).astype(np.float32)
+    weight = np.zeros((40, 70), np.float32)
+    part = slice(9, 22), slice(left, left + 12)
+    weight[part] = rng.random((13, 12)) < 0.5
+    weight[12:14] = 0
+    whole, alone = photometric(image, target, weight), photometric(image[part], target[part], weight[part])
+    assert (whole.loss, whole.ssim) == pytest.approx((alone.loss, alone.ssim), abs=1e-6)
+    np.testing.assert_allclose(whole.gradient[part], alone.gradient, rtol=1e-5, atol=1e-8)
+    assert not whole.gradient[weight == 0].any() and whole.gradient[weight > 0].all()
+
+
 def test_equal_images_have_no_loss_and_nothing_to_judge_has_none_either():
     image = np.random.default_rng(2).random((12, 12, 3)).astype(np.float32)
     assert photometric(image, image, np.ones((12, 12), np.float32)).loss == pytest.approx(0, abs=1e-6)
