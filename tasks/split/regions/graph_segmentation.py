@@ -8,6 +8,7 @@ the pixel pairs across it, of what geometry says there, plus a share for the dif
 from __future__ import annotations
 
 import heapq
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -186,11 +187,13 @@ class RegionGraph:
         flat = regions.ravel()
         self.size = count = int(flat.max()) + 1
         inside = flat >= 0
-        self.area = np.bincount(flat[inside], minlength=count).astype(np.float64)
+        area = np.bincount(flat[inside], minlength=count).astype(np.float64)
         sums = [np.bincount(flat[inside], lab[..., c].ravel()[inside], count) for c in range(3)]
-        self.color = np.stack(sums, axis=1) / np.maximum(self.area, 1)[:, None]
-        self._owner = np.arange(count)
-        self._version = np.zeros(count, np.int64)
+        # Lists from here on: single numbers out of arrays would take most of the time.
+        self._area: list[float] = area.tolist()
+        self._color: list[list[float]] = (np.stack(sums, axis=1) / np.maximum(area, 1)[:, None]).tolist()
+        self._united_with = list(range(count))
+        self._version = [0] * count
         self._weight, self._scale = color_weight, color_scale
         a, b = flat[boundary.first], flat[boundary.second]
         low, high = np.minimum(a, b), np.maximum(a, b)
@@ -209,8 +212,7 @@ class RegionGraph:
     def strength(self, i: int, j: int) -> float:
         """How strong the boundary between two neighbours is, 0..1 + color_weight."""
         length, seen, strength = self._links[i][j]
-        difference = self.color[i] - self.color[j]
-        color = 1 - np.exp(-float(np.sqrt(difference @ difference)) / self._scale)
+        color = 1 - math.exp(-math.dist(self._color[i], self._color[j]) / self._scale)
         share = seen / length
         return strength / max(seen, 1) * share + color * (share * self._weight + (1 - share))
 
@@ -222,10 +224,11 @@ class RegionGraph:
                 self._unite(i, j)
 
     def _unite(self, i: int, j: int) -> None:
-        total = self.area[i] + self.area[j]
-        self.color[i] = (self.area[i] * self.color[i] + self.area[j] * self.color[j]) / total
-        self.area[i] = total
-        self._owner[self._owner == j] = i
+        one, other = self._area[i], self._area[j]
+        colors = zip(self._color[i], self._color[j], strict=True)
+        self._color[i] = [(one * a + other * b) / (one + other) for a, b in colors]
+        self._area[i] = one + other
+        self._united_with[j] = i
         self._version[i] += 1
         self._version[j] = -1
         del self._links[i][j], self._links[j][i]
@@ -237,17 +240,20 @@ class RegionGraph:
         self._links[j] = {}
         for k in self._links[i]:
             low, high = min(i, k), max(i, k)
-            entry = (self.strength(low, high), low, high, int(self._version[low]), int(self._version[high]))
+            entry = (self.strength(low, high), low, high, self._version[low], self._version[high])
             heapq.heappush(self._heap, entry)
 
     def owners(self) -> Int32:
         """The merged region of each region of the start: [R]."""
-        return self._owner.astype(np.int32)
+        owner = np.array(self._united_with, np.int32)
+        while (owner != owner[owner]).any():
+            owner = owner[owner]
+        return owner
 
     def enclosures(self) -> dict[int, float]:
         """Mean strength of the whole boundary of each merged region, 0 where it has no neighbour."""
         result = {}
-        for i in np.unique(self._owner).tolist():
+        for i in np.unique(self.owners()).tolist():
             links = self._links[i]
             length = sum(link[0] for link in links.values())
             total = sum(self.strength(i, j) * links[j][0] for j in sorted(links))
@@ -263,32 +269,33 @@ def find_planes(surface: Surface, valid: Bool, min_share: float, tolerance: floa
     """
     rng = np.random.default_rng(0)
     rows = np.flatnonzero((valid & surface.known).ravel())
-    points = surface.points.reshape(-1, 3)
-    normals = surface.normals.reshape(-1, 3)
+    points, normals = (array.reshape(-1, 3)[rows] for array in (surface.points, surface.normals))
     least = min_share * valid.sum()
     planes: list[Bool] = []
     while len(planes) < rounds and len(rows) >= max(least, 1):
-        sample = rng.choice(rows, size=min(len(rows), 2000), replace=False)
-        tried = sample[:100]
-        distance = np.abs((points[sample] - points[tried][:, None]) @ normals[tried][:, :, None])[..., 0]
-        near = (distance < tolerance * points[sample][:, 2]) & (normals[tried] @ normals[sample].T > 0.9)
-        best = tried[int(near.sum(axis=1).argmax())]
-        normal, offset = normals[best], normals[best] @ points[best]
-        inliers = rows[:0]
+        sample = rng.choice(len(rows), size=min(len(rows), 2000), replace=False)
+        some, tried = points[sample], slice(100)
+        sides = normals[sample]
+        # A table for each coordinate: one of short rows would take several times as long.
+        apart = sum((some[:, c] - some[tried, c, None]) * sides[tried, c, None] for c in range(3))
+        near = (np.abs(apart) < tolerance * some[:, 2]) & (sides[tried] @ sides.T > 0.9)
+        best = int(near.sum(axis=1).argmax())
+        normal, offset = sides[best], sides[best] @ some[best]
+        inlier = np.zeros(len(rows), bool)
         for _ in range(3):
-            close = np.abs(points[rows] @ normal - offset) < tolerance * points[rows][:, 2]
-            inliers = rows[close & (normals[rows] @ normal > 0.85)]
+            inlier = (np.abs(points @ normal - offset) < tolerance * points[:, 2]) & (normals @ normal > 0.85)
+            inliers = points[inlier]
             if len(inliers) < 3:
                 break
-            centre = points[inliers].mean(axis=0)
-            spread = (points[inliers] - centre).astype(np.float64)
+            centre = inliers.mean(axis=0)
+            spread = (inliers - centre).astype(np.float64)
             axis = np.linalg.eigh(spread.T @ spread)[1][:, 0].astype(np.float32)
             normal = axis if axis @ normal > 0 else -axis
             offset = normal @ centre
-        if len(inliers) < least:
+        if inlier.sum() < least:
             break
         mask = np.zeros(valid.size, bool)
-        mask[inliers] = True
+        mask[rows[inlier]] = True
         planes.append(mask.reshape(valid.shape))
-        rows = np.setdiff1d(rows, inliers, assume_unique=True)
+        rows, points, normals = rows[~inlier], points[~inlier], normals[~inlier]
     return planes
