@@ -7,6 +7,7 @@ edge there; that tells the scale about the principal point and the shift that br
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -58,6 +59,11 @@ class _View:
     """[N, 2] where depth has edges, from the principal point on."""
     center: Float64
     """[2] the principal point."""
+
+    @functools.cached_property
+    def neutral(self) -> float:
+        """What counts for points beyond the photo, which speak neither for a placing nor against it."""
+        return float(self.edges.mean())
 
 
 @task(name="capture.registration")
@@ -187,10 +193,8 @@ def _fit(views: Sequence[_View], placing: Placing) -> float:
     fits = []
     for view in views:
         at = (view.outline * scale + view.center + shift - 0.5).astype(np.float32)
-        # What leaves the photo neither speaks for the placing nor against it.
-        neutral = float(view.edges.mean())
         here = cv2.remap(
-            view.edges, at[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=neutral
+            view.edges, at[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=view.neutral
         )
         fits.append(float(here.mean()))
     return float(np.mean(fits))
@@ -229,13 +233,12 @@ def _coarse_fits(view: _View) -> Float32:
 
     (view,) = _blurred([view], 2)
     height, width = view.edges.shape
-    neutral = float(view.edges.mean())
-    padded = cv2.copyMakeBorder(view.edges, *[_REACH] * 4, cv2.BORDER_CONSTANT, value=neutral)
+    padded = cv2.copyMakeBorder(view.edges, *[_REACH] * 4, cv2.BORDER_CONSTANT, value=view.neutral)
     fits = []
     for scale in _SCALES.tolist():
         at = np.floor(view.outline * scale + view.center).astype(int)
         at = at[((at >= 0) & (at < (width, height))).all(axis=1)]
-        drawn = np.zeros((height, width), np.float32)
-        np.add.at(drawn, (at[:, 1], at[:, 0]), 1)
-        fits.append(cv2.matchTemplate(padded, drawn, cv2.TM_CCORR) + neutral * (len(view.outline) - len(at)))
+        drawn = np.bincount(at[:, 1] * width + at[:, 0], minlength=height * width).astype(np.float32)
+        drawn = drawn.reshape(height, width)
+        fits.append(cv2.matchTemplate(padded, drawn, cv2.TM_CCORR) + view.neutral * (len(view.outline) - len(at)))
     return np.asarray(np.stack(fits) / len(view.outline), np.float32)
