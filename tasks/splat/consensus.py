@@ -74,6 +74,8 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
         y, x, points = _surface(scene, view, STRIDE * y, STRIDE * x)
         distance, _ = tree.query(points, distance_upper_bound=BEYOND * spacing, workers=1)
         far = np.flatnonzero(np.isinf(distance))
+        if not len(far):
+            continue
         votes, held = _votes(scene, points[far], others)
         joins = (held + 1 >= LEAST_VIEWS) & (held + 1 >= share * (votes + 1))
         if joins.any():
