@@ -20,7 +20,8 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.semantics.describe import describe
 from ss_flow.tasks.splat.collisions import MergePlan
-from ss_flow.tasks.splat.merge import assemble, global_pass, merge_pair
+from ss_flow.tasks.splat.global_pass import assemble, global_pass
+from ss_flow.tasks.splat.merge import merge_pair
 from ss_flow.tasks.splat.plan import plan
 from ss_flow.tasks.splat.reconstruct import reconstruct, retrain
 from ss_flow.tasks.splat.refine import refine, rendered

@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,14 @@ def running(surroundings: Surroundings) -> Iterator[None]:
         yield
     finally:
         _surroundings.reset(token)
+
+
+@contextmanager
+def nothing_kept() -> Iterator[None]:
+    """Within this no half-done work is kept or found: for the first, short part of a task whose second part keeps its
+    own."""
+    with running(replace(_surroundings.get(), checkpoint=None)):
+        yield
 
 
 def progress(done: int, total: int, note: str = "") -> None:

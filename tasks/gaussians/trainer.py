@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -99,7 +99,9 @@ class TrainParams:
     max_gaussians: Natural = 30_000
     """Densification ends at this number; 0 = never."""
     part_weight: NonNegative = 0.0
-    """Weight of the mean absolute error of alpha in the views of parts, of which each step sees one."""
+    """Weight of the mean absolute error of alpha in the views of parts."""
+    parts_per_step: Count = 1
+    """How many views of parts each step sees."""
     prune_opacity: Fraction = 0.005
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
@@ -244,10 +246,11 @@ class _Training:
         settings = Settings(behind, self._num_labels, degree, winners=False)
         weights = params.objective.at(done_share, params.mask_weight)
         labels = None if self._channels is None else self._channels[parameters.origin]
-        rows, towards_part = self._part(settings)
+        towards_parts = list(self._towards_parts(settings))
         found = self._backend.descent(parameters.values, labels, self._there[view], settings, weights)
-        for name, gradient in towards_part.items():
-            found.gradients[name][rows] += gradient
+        for rows, towards in towards_parts:
+            for name, gradient in towards.items():
+                found.gradients[name][rows] += gradient
         self._losses[self.step - 1] = found.loss
         now = params.rates.at(done_share)
         rates = _by_name(now, now.position * self._extents[parameters.origin])
@@ -258,15 +261,17 @@ class _Training:
             seen = Seen(found.gradients["centers"], found.radii, self._targets[view].pixels)
             self._control.after(self.step, parameters, seen, self._generator)
 
-    def _part(self, settings: Settings) -> tuple[slice, Values]:
-        """The rows of the part whose turn it is, and the gradients of its alpha; nothing where there are no parts."""
-        if not self._parts:
-            return slice(0), {}
-        rows, there = self._parts[self._turns[self.step % len(self._turns)]]
-        own = {name: value[rows] for name, value in self.parameters.values.items()}
+    def _towards_parts(self, settings: Settings) -> Iterator[tuple[slice, Values]]:
+        """Of each part whose turn it is, its rows and the gradients of its alpha."""
         alone = replace(settings, background=(0.0, 0.0, 0.0), num_labels=0)
-        found = self._backend.descent(own, None, there, alone, Weights(ssim=0.0, alpha=1.0, depth=0.0, mask=0.0))
-        return rows, {name: self._params.part_weight * found.gradients[name] for name in own}
+        weights = Weights(ssim=0.0, alpha=1.0, depth=0.0, mask=0.0)
+        most = self._params.parts_per_step if self._parts else 0
+        for turn in range(most * self.step, most * (self.step + 1)):
+            rows, there = self._parts[self._turns[turn % len(self._turns)]]
+            own = {name: value[rows] for name, value in self.parameters.values.items()}
+            found = self._backend.descent(own, None, there, alone, weights)
+            # The product is a copy, too: the next descent may write where this one did.
+            yield rows, {name: self._params.part_weight * found.gradients[name] for name in own}
 
     def losses(self) -> Float32:
         """Of the steps so far. Raises TrainingDiverged when one of them or a parameter is not finite.

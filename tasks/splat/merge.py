@@ -15,7 +15,7 @@ from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, extent
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, PartView, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
 from ss_flow.tasks.gaussians.views import (
     IGNORED,
     NONE_OF_MINE,
@@ -25,13 +25,11 @@ from ss_flow.tasks.gaussians.views import (
     TrainView,
     Views,
     group_view,
-    whole_view,
 )
 from ss_flow.tasks.geometry.cameras import camera_extent, pixels_in_view
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import group_box
-from ss_flow.tasks.splat.side_views import side_views
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,10 @@ class MergeParams:
     """Weight, in the last pass, of the mean alpha where an instance, seen alone from anywhere, has no surface near; 0 =
     only photos count."""
     side_views: Count = 24
-    """Views of each instance that this is looked at from, of which a step sees one; no more in all than steps."""
+    """Views of each instance that this is looked at from; no more in all than steps."""
+    relabel_after: Natural = 100
+    """Steps of the last pass after which its Gaussians get their labels anew, from what the scene shows by then; 0 =
+    labels stay, as they do where the pass has no more steps. From there on rates fall from their first values."""
     reset_opacity: bool = False
     """Whether what collides starts from opacities of at most 0.01, as in the paper."""
     prune_opacity: Fraction = 0.005
@@ -177,16 +178,16 @@ def merge_pair(
         started,
         seen,
         params=settings,
-        extent=_extent(colliding, seen, params),
+        extent=extent(colliding, seen, params),
         seed=int(ids[0]) + (params.seed << 32),
         label_ids=ids.tolist(),
     ).gaussians
     refined = select(trained, ~reach | _shows(trained, seen, params))
-    merged = _guarded(colliding, refined, seen, ids, params)
+    merged = guarded(colliding, refined, seen, ids, params)
     return concatenate([select(union, ~near), merged]) if not near.all() else merged
 
 
-def _extent(gaussians: Gaussians, seen: Sequence[TrainView], params: MergeParams) -> float | Float32:
+def extent(gaussians: Gaussians, seen: Sequence[TrainView], params: MergeParams) -> float | Float32:
     """World units, of all or for each of them."""
     own = extents(gaussians)
     return own if params.extent == "instance" else camera_extent([view.camera for view in seen]) or own
@@ -218,67 +219,6 @@ def _shows(gaussians: Gaussians, views: Sequence[TrainView], params: MergeParams
         np.maximum(strongest, render(gaussians, view.camera).max_contribution, out=strongest)
     opaque = gaussians.opacities >= params.prune_opacity
     return opaque & (strongest >= params.prune_contribution)
-
-
-@task(name="splat.assemble")
-def assemble(groups: tuple[Gaussians, ...]) -> Gaussians:
-    """All groups as one scene, ordered by instance id; inside an instance the order stays."""
-    parts = [group for group in groups if len(group)]
-    if not parts:
-        return NO_GAUSSIANS
-    union = concatenate(sorted(parts, key=lambda part: int(part.instance_id.min())))
-    return select(union, np.argsort(union.instance_id, kind="stable"))
-
-
-@task(
-    name="splat.global_pass",
-    resources=Resources(cores=1, most_cores=8, memory_mb=4000, gpus=0.5),
-    environment=backend_identity,
-)
-def global_pass(
-    views: Views,
-    scene: Gaussians,
-    masks: tuple[LabelMap, ...],
-    *,
-    params: MergeParams,
-) -> Gaussians:
-    """A last, short training of the whole scene with its background, on whole photos (spec P4, A22).
-
-    scene: as `assemble` gives it. masks: exclusive label maps of all views. Opacities are kept and nothing is split or
-    cloned. The loss is `global_objective`, `global_mask_weight` times the mask loss, and `side_weight` times what an
-    instance covers beside its surface (`side_views`); the guard of `merge_pair` holds here too.
-    """
-    if not len(scene) or not params.global_iterations:
-        return scene
-    ids = np.unique(scene.instance_id)
-    compared = views.compared(VisibilityParams())
-    seen = _whole_views(compared, masks, ids, params.crop.max_side)
-    parts: list[PartView] = []
-    if params.side_weight:
-        parts = side_views(compared, scene, masks, params.side_views, params.global_iterations)
-    settings = TrainParams(
-        iterations=params.global_iterations,
-        sh_degree=params.sh_degree,
-        sh_every=params.sh_every,
-        objective=params.global_objective,
-        densify="none",
-        mask_weight=params.global_mask_weight,
-        part_weight=params.side_weight,
-        prune_opacity=params.prune_opacity,
-        prune_contribution=params.prune_contribution,
-        max_scale=params.max_scale,
-        rates=params.rates,
-    )
-    refined = train(
-        scene,
-        seen,
-        params=settings,
-        extent=_extent(scene, seen, params),
-        seed=params.seed << 32,
-        label_ids=ids.tolist(),
-        parts=parts,
-    ).gaussians
-    return _guarded(scene, refined, seen, ids, params)
 
 
 def quality(gaussians: Gaussians, views: Sequence[TrainView], ids: Int32) -> Quality:
@@ -315,27 +255,18 @@ def _group_views(
     """
     surface, shown = PointSurface.of(_solid_centres(group)), group.means[around]
     views = []
-    for view, channels in enumerate(_channels(masks, ids, NONE_OF_MINE, others)):
-        if (channels >= 0).any() and len(pixels_in_view(shown, scene.cameras[view])[0]):
+    for view, shows in enumerate(channels(masks, ids, NONE_OF_MINE, others)):
+        if (shows >= 0).any() and len(pixels_in_view(shown, scene.cameras[view])[0]):
             views.append(
                 group_view(
-                    scene, view, channels, surface,
+                    scene, view, shows, surface,
                     crop=params.crop, ignore_occluded=params.ignore_occluded, around=shown,
                 )
             )  # fmt: skip
     return [view for view in views if view.inside.any()]
 
 
-def _whole_views(scene: SceneViews, masks: Sequence[LabelMap], ids: Int32, max_side: int) -> list[TrainView]:
-    """The entire photos that show any of the instances."""
-    # What has no Gaussians of its own can only be explained by the background.
-    rest = 0 if ids[0] == 0 else NONE_OF_MINE
-    channels = _channels(masks, ids, rest, np.zeros(0, np.int32))
-    views = [whole_view(scene, view, c, max_side) for view, c in enumerate(channels) if (c >= 0).any()]
-    return [view for view in views if view.inside.any()]
-
-
-def _channels(masks: Sequence[LabelMap], ids: Int32, rest: int, others: Int32) -> Iterator[Int32]:
+def channels(masks: Sequence[LabelMap], ids: Int32, rest: int, others: Int32) -> Iterator[Int32]:
     """[H, W] of each view: the place in `ids` of the instance at a pixel, IGNORED for `others`, else `rest`."""
     channel_of = np.full(np.iinfo(np.uint16).max + 1, rest, np.int32)
     channel_of[others] = IGNORED
@@ -343,7 +274,11 @@ def _channels(masks: Sequence[LabelMap], ids: Int32, rest: int, others: Int32) -
     return (channel_of[label_map.ids] for label_map in masks)
 
 
-def _guarded(before: Gaussians, after: Gaussians, views: list[TrainView], ids: Int32, params: MergeParams) -> Gaussians:
+def guarded(before: Gaussians, after: Gaussians, views: list[TrainView], ids: Int32, params: MergeParams) -> Gaussians:
+    """What a training made of Gaussians, or with a warning what they were, if views lose more by it than allowed.
+
+    ids: [L] the instance of each channel of the views.
+    """
     if not params.guard_views:
         return after
     step = max(1, -(-len(views) // params.guard_views))

@@ -12,7 +12,7 @@ from ss_flow.tasks.gaussians.initialise import neighbour_spread
 from ss_flow.tasks.gaussians.objective import Target
 from ss_flow.tasks.gaussians.trainer import PartView
 from ss_flow.tasks.gaussians.views import SceneViews, sample_depth
-from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, project, surface_of_pixels
+from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, surface_of_pixels
 from ss_flow.tasks.geometry.sampling import cube_of_each, sphere
 
 FEWEST = 20
@@ -23,6 +23,10 @@ GAP = 2.5
 """Spacings between points that still belong to one surface: narrower gaps are closed."""
 RIM = 0.5
 """Spacings by which the surface goes on beyond its last points."""
+TRIM = 0.05
+"""Share of the points at either end of each axis that do not tell where an instance is: some carry a wrong label."""
+GROWN = 1.3
+"""How much larger than the box of the others what is looked at may be."""
 SURFACE_PIXELS = 2_000_000
 """Pixels of all views together whose surface points are looked at."""
 LEAST_KNOWN = 0.9
@@ -79,10 +83,10 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
     points, ids = np.concatenate(places), np.concatenate(shown_there)
     if not len(points):
         return {}
-    _, cube = np.unique(cube_of_each(points, side), return_inverse=True)
     most = int(ids.max()) + 1
-    pair, first, held = np.unique(cube * most + ids, return_index=True, return_counts=True)
-    good = (held >= 2) & (held >= LEAST_SHARE * np.bincount(cube)[pair // most])
+    pair, first, held = np.unique(cube_of_each(points, side) * most + ids, return_index=True, return_counts=True)
+    _, cube = np.unique(pair // most, return_inverse=True)
+    good = (held >= 2) & (held >= LEAST_SHARE * np.bincount(cube, held)[cube])
     pair, first = pair[good] % most, first[good]
     known = np.bincount(ids, minlength=len(area)) >= LEAST_KNOWN * area
     return {int(i): points[first[pair == i]] for i in np.unique(pair) if known[i]}
@@ -90,9 +94,15 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
 
 def cameras_around(points: Float32, spacing: float, count: int) -> Iterator[Camera]:
     """Cameras that show points whole from directions evenly spread over the sphere, at twice the diagonal of their box,
-    with pixels of half a spacing where that needs no more than MOST_PIXELS."""
-    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-    middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2 + GAP * spacing
+    with pixels of half a spacing where that needs no more than MOST_PIXELS.
+
+    Points far off from most others stay outside: with them, a bowl of which a piece of the table has the label would be
+    a few pixels wide.
+    """
+    low, high = np.quantile(points.astype(np.float64), (TRIM, 1 - TRIM), axis=0)
+    middle = (low + high) / 2
+    farthest = np.linalg.norm(np.abs(points - middle).max(axis=0))
+    radius = min(GROWN * np.linalg.norm(high - low) / 2, farthest) + GAP * spacing
     size = int(np.clip(np.ceil(4 * radius / spacing), 16, MOST_PIXELS))
     focal = size / 2 * np.sqrt(15.0)  # a sphere seen from four of its radii
     for direction in sphere(count):
@@ -109,8 +119,8 @@ def empty(camera: Camera, points: Float32, spacing: float) -> Bool:
     import cv2
 
     fine = camera.scaled(2 * camera.width, 2 * camera.height)
-    pixels = spacing * fine.fx / float(project(points, camera)[1].mean())
-    _, column, row, _ = pixels_in_view(points, fine)
+    _, column, row, z = pixels_in_view(points, fine)
+    pixels = spacing * fine.fx / float(z.mean())
     border = int(np.ceil(GAP * pixels)) + 1  # what lies outside of the picture is empty, too
     free = np.pad(np.ones((fine.height, fine.width), np.uint8), border, constant_values=1)
     free[row + border, column + border] = 0

@@ -38,7 +38,8 @@ from ss_flow.tasks.artifacts import Gaussians, InstanceMasks, LabelMap
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.gaussians.views import TrainView, Views, whole_view
 from ss_flow.tasks.geometry.cameras import cameras_by_view
-from ss_flow.tasks.splat.merge import assemble, global_pass, quality
+from ss_flow.tasks.splat.global_pass import assemble, global_pass
+from ss_flow.tasks.splat.merge import quality
 from ss_flow.tasks.splat.reconstruct import reconstruct
 
 

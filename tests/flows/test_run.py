@@ -246,7 +246,8 @@ def test_a_pair_and_a_last_pass_that_fail_leave_the_union_and_the_run_is_degrade
     def fail(*_, **__):
         raise ArithmeticError("diverged")
 
-    monkeypatch.setattr("ss_flow.tasks.splat.merge.train", fail)
+    for module in ("merge", "global_pass"):
+        monkeypatch.setattr(f"ss_flow.tasks.splat.{module}.train", fail)
     all_collide = ["--set", "plan.overlap=voxel", "--set", "plan.voxel=20", "--set", "merge.rates.color=0.03"]
     called = run_tiny(warm.scene, warm.store, *all_collide, out=warm.out)
     assert called.code == 3, called.err

@@ -26,7 +26,7 @@ from ss_flow.tasks.gaussians.torch_backend import TorchBackend
 from ss_flow.tasks.gaussians.trainer import TrainParams, TrainResult, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import camera_extent, camera_of
-from ss_flow.tasks.splat import merge, reconstruct
+from ss_flow.tasks.splat import global_pass, merge, reconstruct
 
 _spec = importlib.util.spec_from_file_location("gaussian_reference", Path(__file__).with_name("reference.py"))
 reference = importlib.util.module_from_spec(_spec)
@@ -78,8 +78,8 @@ def asked_by(task: str, small: SmallScene, monkeypatch: pytest.MonkeyPatch) -> A
         heard.append(Asked(initial, list(views), params, extent, tuple(label_ids)))
         return TrainResult(initial, 0, np.zeros(0, np.float32))
 
-    monkeypatch.setattr(reconstruct, "train", listening)
-    monkeypatch.setattr(merge, "train", listening)
+    for module in (reconstruct, merge, global_pass):
+        monkeypatch.setattr(module, "train", listening)
     box, ball = some(small, 1, EVERY[1]), some(small, 2, EVERY[2])
     if task == "reconstruct":
         reconstruct.reconstruct(small.views, small.instance(1, every=EVERY[1]), params=PAPER.reconstruct)
@@ -87,8 +87,8 @@ def asked_by(task: str, small: SmallScene, monkeypatch: pytest.MonkeyPatch) -> A
     elif task == "merge_pair":
         merge.merge_pair(small.views, box, ball, small.maps, params=PAPER.merge, w_mask=W_MASK)
     else:
-        whole = merge.assemble((some(small, 0, EVERY[0]), box, ball))
-        merge.global_pass(small.views, whole, small.maps, params=PAPER.merge)
+        whole = global_pass.assemble((some(small, 0, EVERY[0]), box, ball))
+        global_pass.global_pass(small.views, whole, small.maps, params=PAPER.merge)
     (only,) = heard
     return only
 

@@ -348,7 +348,7 @@ def test_the_number_of_threads_changes_no_byte():
 
 @pytest.mark.parametrize("strategy", ["classic", "none"])
 def test_a_training_that_was_interrupted_goes_on_to_the_same_bytes(strategy, tmp_path):
-    params = TrainParams(iterations=320, densify=strategy, part_weight=0.1)
+    params = TrainParams(iterations=320, densify=strategy, part_weight=0.1, parts_per_step=2)
     parts = [part_view(0, 200, angle) for angle in (0.3, 0.9, 1.8)] if strategy == "none" else []
     alone = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1, parts=parts)
 
@@ -416,6 +416,27 @@ def test_a_part_is_seen_without_the_others_and_moves_them_by_nothing():
         assert np.array_equal(found.log_scales[others], both.log_scales[others])
     assert not np.array_equal(alone.log_scales, none.log_scales)
     assert np.array_equal(alone.sh, none.sh)  # its colours do not count
+
+
+def test_a_step_sees_as_many_parts_as_asked_for_one_after_the_other():
+    ball, behind = ball_points(), np.array([[0, 0, 1.3]], np.float32)
+    hidden = initialise(np.repeat(behind, 5, axis=0), np.zeros((5, 3), np.uint8), 4, 0.5, opacity=0.9)
+    both = concatenate([ball, replace(hidden, log_scales=np.full((5, 3), np.log(0.1), np.float32))])
+    parts = [part_view(0, 300, 0.3), part_view(300, 305, np.pi / 2)]
+
+    def moved(parts_per_step: int, iterations: int) -> tuple[bool, bool]:
+        params = TrainParams(
+            iterations=iterations, densify="none", part_weight=0.5, parts_per_step=parts_per_step,
+            prune_contribution=0.0, prune_opacity=0.0,
+        )  # fmt: skip
+        found, without = (
+            train(both, VIEWS[:1], params=params, extent=1.6, seed=1, parts=some).gaussians.log_scales
+            for some in (parts, [])
+        )
+        return tuple(not np.array_equal(found[rows], without[rows]) for rows in (slice(300), slice(300, 305)))
+
+    assert sorted(moved(1, 1)) == [False, True]
+    assert moved(2, 1) == (True, True) == moved(1, 2)
 
 
 def test_views_of_parts_need_rows_that_stay():

@@ -50,6 +50,20 @@ def test_what_lies_beyond_the_rim_of_points_is_empty_from_all_directions():
         assert free[[0, 0, -1, -1], [0, -1, 0, -1]].all()
 
 
+def test_a_few_points_far_away_hardly_move_the_cameras_back():
+    ball = (0.5 * sphere(2000)).astype(np.float32)
+    strays = np.array([9.0, 0, 0], np.float32) + 0.1 * ball[::40]
+    spacing = float(np.median(neighbour_spread(ball)))
+    both = np.concatenate([ball, strays])
+    for alone, camera in zip(cameras_around(ball, spacing, 6), cameras_around(both, spacing, 6), strict=True):
+        assert camera.width == pytest.approx(alone.width, rel=0.4)
+        assert np.linalg.norm(camera.center) == pytest.approx(np.linalg.norm(alone.center), rel=0.4)
+        free = empty(camera, both, spacing)
+        passes = distance_of_rays(camera, np.zeros(3))
+        assert not free[passes < 0.5].any()
+        assert free[passes > 0.5 + (RIM + 1.5) * spacing].mean() > 0.9  # a stray may stand before or behind
+
+
 @pytest.mark.parametrize(("width", "closed"), [(1.5 * GAP, True), (3 * GAP, False)])
 def test_narrow_gaps_between_points_close_and_wide_ones_stay_empty(width, closed):
     across, up = (axis.ravel() for axis in np.meshgrid(np.arange(-20, 21), np.arange(-20, 21)))

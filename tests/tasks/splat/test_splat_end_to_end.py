@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
 
+from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import REFINED, Appearances, Gaussians
 from ss_flow.tasks.gaussians.initialise import concatenate, extents, initialise, select
 from ss_flow.tasks.gaussians.render import render
@@ -18,7 +19,8 @@ from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.splat import merge as module
-from ss_flow.tasks.splat.merge import MergeParams, Quality, acceptable, assemble, global_pass, merge_pair
+from ss_flow.tasks.splat.global_pass import assemble, global_pass
+from ss_flow.tasks.splat.merge import MergeParams, Quality, acceptable, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
 from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
 from ss_flow.tasks.splat.render_masks import RenderMasksParams, render_masks
@@ -276,3 +278,53 @@ def test_an_instance_that_only_excluded_pixels_show_stays_as_its_points_and_is_t
     with pytest.warns(UserWarning, match="No view shows instance 1"):
         kept = reconstruct(views, instance, params=replace(TRAIN, max_points=0))
     np.testing.assert_array_equal(kept.means, instance.points)
+
+
+def test_the_last_pass_gives_gaussians_to_the_instance_that_photos_show_there(built):
+    ball = replace(built.ball, instance_id=np.where(np.arange(len(built.ball)) % 6, 2, 1).astype(np.int32))
+    scene = assemble((built.background, built.box, ball))
+    params = replace(MERGE, prune_opacity=0.0, prune_contribution=0.0)
+
+    def gained(params: MergeParams) -> int:
+        """Gaussians of the ball."""
+        found = global_pass(built.views, scene, built.scene.maps, params=params)
+        assert len(found) == len(scene) and (np.diff(found.instance_id) >= 0).all()
+        return int((found.instance_id == 2).sum() - (scene.instance_id == 2).sum())
+
+    lost = int((ball.instance_id == 1).sum())
+    assert lost > 50
+    assert 0.6 * lost < gained(params) < 1.2 * lost
+    assert gained(replace(params, relabel_after=0)) == 0
+
+
+def test_a_last_pass_of_few_steps_keeps_its_labels(built):
+    scene = assemble((built.background, replace(built.ball, instance_id=np.full(len(built.ball), 1, np.int32))))
+    params = replace(MERGE, global_iterations=20, relabel_after=20, guard_views=0)
+    found = global_pass(built.views, scene, built.scene.maps, params=params)
+    same_steps = global_pass(built.views, scene, built.scene.maps, params=replace(params, relabel_after=0))
+    assert same(found, same_steps)
+
+
+def test_a_last_pass_that_was_interrupted_goes_on_to_the_same_bytes(built, tmp_path):
+    class Interrupted(Exception):
+        pass
+
+    scene = assemble((built.background, built.box, built.ball))
+    params = replace(MERGE, relabel_after=50)
+    alone = global_pass(built.views, scene, built.scene.maps, params=params)
+    told: list[tuple[int, int]] = []
+
+    def stop(done: int, total: int, note: str) -> None:
+        told.append((done, total))
+        if (done, total) == (100, 150):
+            raise Interrupted
+
+    here = Surroundings(stop, checkpoint=tmp_path / "kept.npz")
+    with running(here), pytest.raises(Interrupted):
+        global_pass(built.views, scene, built.scene.maps, params=params)
+    again: list[tuple[int, int]] = []
+    with running(replace(here, listener=lambda done, total, note: again.append((done, total)))):
+        found = global_pass(built.views, scene, built.scene.maps, params=params)
+    assert (50, 50) in told and (50, 150) in told
+    assert (50, 50) in again and (150, 150) in again and (50, 150) not in again
+    assert same(found, alone)

@@ -1,0 +1,125 @@
+"""The whole scene as one: assembled, and trained together on whole photos (Split&Splat, Sec. 3.2.3; spec P4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ss_flow.running import nothing_kept
+from ss_flow.task import Resources, task
+from ss_flow.tasks.artifacts import Gaussians, Int32, LabelMap
+from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, select
+from ss_flow.tasks.gaussians.rasterize import backend_identity
+from ss_flow.tasks.gaussians.trainer import PartView, TrainParams, train
+from ss_flow.tasks.gaussians.views import NONE_OF_MINE, SceneViews, TrainView, Views, whole_view
+from ss_flow.tasks.geometry.visibility import VisibilityParams
+from ss_flow.tasks.splat.merge import MergeParams, channels, extent, guarded
+from ss_flow.tasks.splat.relabel import relabelled, shown_masks
+from ss_flow.tasks.splat.side_views import side_views
+
+SIDES_PER_STEP = 2
+"""Views of instances alone that a step of the last pass sees besides a photo."""
+
+
+@task(name="splat.assemble")
+def assemble(groups: tuple[Gaussians, ...]) -> Gaussians:
+    """All groups as one scene, ordered by instance id; inside an instance the order stays."""
+    parts = [group for group in groups if len(group)]
+    if not parts:
+        return NO_GAUSSIANS
+    return by_instance(concatenate(sorted(parts, key=lambda part: int(part.instance_id.min()))))
+
+
+def by_instance(gaussians: Gaussians) -> Gaussians:
+    """Ordered by instance id; inside an instance the order stays."""
+    return select(gaussians, np.argsort(gaussians.instance_id, kind="stable"))
+
+
+@task(
+    name="splat.global_pass",
+    resources=Resources(cores=1, most_cores=8, memory_mb=4000, gpus=0.5),
+    environment=backend_identity,
+)
+def global_pass(
+    views: Views,
+    scene: Gaussians,
+    masks: tuple[LabelMap, ...],
+    *,
+    params: MergeParams,
+) -> Gaussians:
+    """A last, short training of the whole scene with its background, on whole photos (spec P4, A22).
+
+    scene: as `assemble` gives it. masks: exclusive label maps of all views. Opacities are kept and nothing is split or
+    cloned. The loss is `global_objective`, `global_mask_weight` times the mask loss, and `side_weight` times what an
+    instance covers beside its surface (`side_views`); the guard of `merge_pair` holds here too.
+
+    After `relabel_after` steps the scene shows what belongs to what better than the masks do. So a Gaussian whose place
+    shows another instance in most views becomes that one's, and only then is each instance looked at from the side.
+    """
+    if not len(scene) or not params.global_iterations:
+        return scene
+    ids = np.unique(scene.instance_id)
+    compared = views.compared(VisibilityParams())
+    seen = _whole_views(compared, masks, ids, params.crop.max_side)
+    first = params.relabel_after if params.relabel_after < params.global_iterations else 0
+    settings = TrainParams(
+        iterations=params.global_iterations - first,
+        sh_degree=params.sh_degree,
+        sh_every=params.sh_every,
+        objective=params.global_objective,
+        densify="none",
+        mask_weight=params.global_mask_weight,
+        part_weight=params.side_weight,
+        parts_per_step=SIDES_PER_STEP,
+        prune_opacity=params.prune_opacity,
+        prune_contribution=params.prune_contribution,
+        max_scale=params.max_scale,
+        rates=params.rates,
+    )
+
+    def trained(begun: Gaussians, settings: TrainParams, parts: Sequence[PartView] = ()) -> Gaussians:
+        return train(
+            begun,
+            seen,
+            params=settings,
+            extent=extent(surface, seen, params),
+            seed=params.seed << 32,
+            label_ids=ids.tolist(),
+            parts=parts,
+        ).gaussians
+
+    surface, begun, shown = scene, scene, masks
+    if first:
+        with nothing_kept():
+            begun = trained(scene, _opening(settings, first))
+        shown = tuple(shown_masks(views, begun, masks))
+        surface = relabelled(compared, scene, shown)
+        labels = {name: getattr(surface, name) for name in ("instance_id", "instance_conf", "part_id")}
+        surface, begun = by_instance(surface), by_instance(replace(begun, **labels))
+    parts: list[PartView] = []
+    if params.side_weight:
+        parts = side_views(compared, surface, shown, params.side_views, params.global_iterations)
+    return guarded(scene, trained(begun, settings, parts), seen, ids, params)
+
+
+def _opening(settings: TrainParams, steps: int) -> TrainParams:
+    """For the steps before labels are given anew: nothing falls, and every Gaussian stays."""
+    return replace(
+        settings,
+        iterations=steps,
+        objective=replace(settings.objective, depth_weight_final=settings.objective.depth_weight_start),
+        rates=replace(settings.rates, position_final=settings.rates.position, final_share=1.0),
+        prune_opacity=0.0,
+        prune_contribution=0.0,
+    )
+
+
+def _whole_views(scene: SceneViews, masks: Sequence[LabelMap], ids: Int32, max_side: int) -> list[TrainView]:
+    """The entire photos that show any of the instances."""
+    # What has no Gaussians of its own can only be explained by the background.
+    rest = 0 if ids[0] == 0 else NONE_OF_MINE
+    shows = channels(masks, ids, rest, np.zeros(0, np.int32))
+    views = [whole_view(scene, view, c, max_side) for view, c in enumerate(shows) if (c >= 0).any()]
+    return [view for view in views if view.inside.any()]
