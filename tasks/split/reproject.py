@@ -34,7 +34,7 @@ from ss_flow.tasks.masks.painting import (
 )
 from ss_flow.tasks.masks.pool import smoothed
 from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
-from ss_flow.tasks.ranges import Count, NonNegative
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 
 _DENSE = 2.5
 """Pixels, of an image with a diagonal of 800, between a label's points up to which `reach` is meant as it stands."""
@@ -48,6 +48,9 @@ class ReprojectParams:
     """Which masks of a view show a label."""
     draw_missing: bool = True
     """Whether a label that a view sees, but that no mask shows, gets its points there, grown together, as its mask."""
+    min_agreement: Fraction = 0.7
+    """IoU of a label's mask with its points in the view below which these are drawn, and of the mask only that stays
+    which no point of another label is near; 0 = never (only with `draw_missing`)."""
     min_points: Count = 10
     """Points of a label that must be in front in a view for this."""
     reach: NonNegative = 4.0
@@ -94,7 +97,7 @@ def reproject(
                 if agrees >= params.selection.min_iou and agrees > own:
                     shown[label], origin[label] = mask, PROMPTED
         if params.draw_missing:
-            for label, mask in _drawn(painted, view, set(shown), params).items():
+            for label, mask in _drawn(painted, view, shown, params).items():
                 shown[label], origin[label] = mask, DRAWN
         ids = stack_exclusive(shown, view.height, view.width)
         views.append({int(i): (np.packbits(ids == i), origin.get(int(i), FOUND)) for i in np.unique(ids)})
@@ -126,19 +129,25 @@ def reproject(
     return tuple(found)
 
 
-def _drawn(painted: PaintedView, view: Visibility, shown: set[int], params: ReprojectParams) -> dict[int, Bool]:
-    """Masks of the labels in front in a view, but those in `shown`: the pixels nearest to their points, smoothed.
+def _drawn(painted: PaintedView, view: Visibility, shown: dict[int, Bool], params: ReprojectParams) -> dict[int, Bool]:
+    """Masks of the labels in front in a view that have none, or none that their points agree with: the pixels nearest
+    to their points, and what a mask holds besides where no point of another label is near; smoothed.
 
     A label whose points lie so scattered that hardly any of them is left inside has none.
     """
-    missing = [label for label in labels_in_front(painted, params.min_points) if label not in shown]
+    ids = stack_exclusive(shown, view.height, view.width)
+    good = {label for label in shown if agreement(painted, ids == label, label) >= params.min_agreement}
+    missing = [label for label in labels_in_front(painted, params.min_points) if label not in good]
     if not missing:
         return {}
     nearest, distance = nearest_painted(painted, view.height, view.width)
     masks = {}
     for label in missing:
         reach = _reach_of(label, painted, view, params)
-        masks[label] = smoothed((nearest == label) & (distance <= reach), round(reach))
+        mask = (nearest == label) & (distance <= reach)
+        if label in shown:
+            mask |= shown[label] & ((nearest == 0) | (distance > reach))
+        masks[label] = smoothed(mask, round(reach))
     return {label: mask for label, mask in masks.items() if agreement(painted, mask, label) >= params.selection.min_iou}
 
 

@@ -262,6 +262,33 @@ def test_a_label_without_a_mask_is_drawn_from_its_points():
     assert not len(run([columns(0, 5)], halves(), replace(params, min_points=13))[2].views)
 
 
+def test_a_mask_that_its_points_contradict_keeps_only_what_no_other_label_tells_of():
+    # The whole view shows label 1 by half: 20 pixels of 40; label 2 has 12 points, too few to be drawn here.
+    params = ReprojectParams(min_points=13, reach=0.0)
+    one = run([columns(0, 10)], halves(), params)[1]
+    np.testing.assert_array_equal(one.dense()[0], columns(0, 5) | columns(8, 10))
+    assert one.origin.tolist() == [DRAWN]
+    kept = run([columns(0, 10)], halves(), replace(params, min_agreement=0.0))[1]
+    assert kept.dense()[0].all() and kept.origin.tolist() == [FOUND]
+
+
+def test_a_mask_keeps_what_lies_far_from_all_points():
+    cloud, labels = labelled(halves())
+    seen = np.flatnonzero(columns(0, 8).ravel()).astype(np.int32)
+    known = replace(view(), point_index=seen, pixel=seen, depth=np.ones(len(seen), np.float32))
+    masks = (mask_set(columns(0, 10)[None], "a"),)
+    params = ReprojectParams(min_points=13, reach=0.0)
+    _, one, _ = reproject(cloud, (known,), masks, labels, WHOLE, (), params=params)
+    np.testing.assert_array_equal(one.dense()[0], columns(0, 5) | columns(8, 10))
+
+
+def test_a_mask_that_smaller_ones_leave_right_stays():
+    # Alone the mask of both halves agrees with label 1 by .6; without the columns of label 2's it agrees fully.
+    found = run([columns(0, 8), columns(5, 8)], halves(), ReprojectParams(reach=0.0))
+    np.testing.assert_array_equal(found[1].dense()[0], columns(0, 5))
+    assert found[1].origin.tolist() == found[2].origin.tolist() == [FOUND]
+
+
 def test_a_drawn_mask_reaches_a_little_round_its_points():
     painted = PaintedView.of(np.array([0, 5, 33], np.int32), np.array([4, 0, 7], np.int32))
     near = nearest_labels(painted, H, W, 1.5)
