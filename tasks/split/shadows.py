@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Int32, PointCloud, UInt8
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
 from ss_flow.tasks.ranges import Count, Fraction
+from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.smoothing import smooth
 from ss_flow.tasks.split.votes.touching import Borders, TouchingParams, borders
 
@@ -37,6 +38,8 @@ _OTHER = 0.3
 """Difference between two colours, in one logarithm, from which on their surfaces are of different colours."""
 _PARALLEL = 0.95
 """Cosine of the normals of surfaces on which a shadow makes the same step."""
+_OPEN = 0.2
+"""Least share of a common border at which the colour stays nevertheless: a poster's outline shows all along."""
 _REST = 0.15
 """By how much a change of colour may differ, in each logarithm, from a share of a shadow's step."""
 _SHARE = (-0.2, 1.25)
@@ -62,6 +65,9 @@ class ShadowParams:
     """Other borders, on parallel surfaces of other colours, that must show the same step: one may be chance."""
     alike: Fraction = 0.75
     """Share of their common border at which the colour stays, or changes as into a shadow."""
+    colors: Fraction = 0.95
+    """Or else, cosine of both colour histograms from which on they are of one colour, whatever lies along most of their
+    border: a part of a shadow, or the joint of two planks. 1 = the border alone tells."""
     contact: Fraction = 0.03
     """Share of the border of one of them along which they touch without an edge: not much of a table's top is left
     between the things that stand on it."""
@@ -132,6 +138,8 @@ class _Touches:
     """[T] that label."""
     alike: Bool
     """[T] whether the colour stays there, or changes as into a shadow."""
+    known: Bool
+    """[T] whether both labels have points of their own near, so that no gap is between them."""
 
 
 def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, params: ShadowParams) -> Int32:
@@ -149,18 +157,35 @@ def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Border
     # Between the things that stand on a table, and along shadows, its points have no label: masks do not agree there.
     filled = smooth(label, label == 0, cloud.points, cloud.spacing, _FILLED)
     touches = _touches(cloud, label, filled, eye, shadows)
-    while touches.alike.any():
+    bins, brightness = bins_of(cloud.colors), _logarithms(cloud.colors)
+    while True:
         taken: set[int] = set()
-        for a, b in _meeting(touches, surface, filled, params):
+        for a, b, stays in _meeting(touches, surface, filled, params):
             if taken & {a, b}:
                 continue
             of = surface[label]
-            if _in_one_plane(cloud, np.flatnonzero(of == a), np.flatnonzero(of == b), params):
+            rows = np.flatnonzero(of == a), np.flatnonzero(of == b)
+            if (stays or _of_one_color(bins, brightness, rows, params)) and _in_one_plane(cloud, *rows, params):
                 taken |= {a, b}
                 surface[surface == b] = a
         if not taken:
-            break
-    return surface
+            return surface
+
+
+def _of_one_color(
+    bins: Int32, brightness: Float64, rows: tuple[NDArray[np.intp], NDArray[np.intp]], params: ShadowParams
+) -> bool:
+    """Whether two sets of points have the same colours all over; black tells nothing.
+
+    bins: [N] of all points' colours; brightness: [N, 3] their logarithms.
+    """
+    if params.colors == 1:
+        return False
+    first, second = (np.median(brightness[part], axis=0) for part in rows)
+    if (np.abs(first - second) >= _OTHER).any() or not _bright(first[None])[0]:
+        return False
+    spread = TouchingParams().color_spread
+    return likeness(*(histogram(bins[part], spread) for part in rows)) >= params.colors
 
 
 def _shadows(cloud: PointCloud, label: Int32, ends: Borders, eye: Float64, params: ShadowParams) -> list[_Step]:
@@ -183,14 +208,16 @@ def _touches(cloud: PointCloud, label: Int32, filled: Int32, eye: Float64, shado
     """
     ends = borders(filled, cloud, TouchingParams())
     near = _around(cloud, ends)
-    alike = _stays(_across(cloud, label, filled, ends, near))
+    colors = _across(cloud, label, filled, ends, near)
+    alike = _stays(colors)
     if shadows:
         for contact in _contacts(cloud, filled, ends, _across(cloud, filled, filled, ends, near), eye):
             for step in shadows:
                 shaded = _shaded(contact.change, step.change)
                 if step.normal @ contact.normal >= _PARALLEL and shaded.sum() > alike[contact.of].sum():
                     alike[contact.of] = shaded
-    return _Touches(ends.rows, ends.beside, ends.smooth[0], ends.smooth[1], alike)
+    known = np.asarray(np.isfinite(colors.change).all(axis=1))
+    return _Touches(ends.rows, ends.beside, ends.smooth[0], ends.smooth[1], alike, known)
 
 
 def _contacts(cloud: PointCloud, label: Int32, ends: Borders, colors: _Colors, eye: Float64) -> list[_Contact]:
@@ -210,8 +237,12 @@ def _contacts(cloud: PointCloud, label: Int32, ends: Borders, colors: _Colors, e
 
 def _stays(colors: _Colors) -> Bool:
     """[T] where no change of colour can be seen; black tells nothing."""
-    seen = (colors.own > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1)
-    return np.asarray(seen & (np.abs(colors.change) < _OTHER).all(axis=1))
+    return np.asarray(_bright(colors.own) & (np.abs(colors.change) < _OTHER).all(axis=1))
+
+
+def _bright(brightness: Float64) -> Bool:
+    """[N] which logarithms [N, 3] are of more than black."""
+    return np.asarray((brightness > _logarithms(np.full(3, _DARKEST, np.uint8)) + 1e-6).any(axis=1))
 
 
 def _around(cloud: PointCloud, ends: Borders) -> Int32:
@@ -269,8 +300,9 @@ def _shaded(change: Float64, step: Float64) -> Bool:
     return into if into.sum() >= out.sum() else out
 
 
-def _meeting(touches: _Touches, surface: Int32, label: Int32, params: ShadowParams) -> list[tuple[int, int]]:
-    """The pairs of surfaces that light alone tells apart, those that touch along the largest share of a border first.
+def _meeting(touches: _Touches, surface: Int32, label: Int32, params: ShadowParams) -> list[tuple[int, int, bool]]:
+    """The pairs of surfaces that may be one, those that touch along the largest share of a border first; and of each
+    whether light alone tells them apart there. Otherwise their own points touch.
 
     surface: [L + 1] of each label. label: [N] of the points.
     """
@@ -283,12 +315,14 @@ def _meeting(touches: _Touches, surface: Int32, label: Int32, params: ShadowPara
     found = []
     for number, (low, high) in enumerate(pairs.T.tolist()):
         here = kept[of.ravel() == number]
-        if len(here) < params.min_points or touches.alike[here].mean() < params.alike:
+        alike = touches.alike[here].mean()
+        stays = bool(alike >= params.alike)
+        if alike < min(_OPEN, params.alike) or (here if stays else here[touches.known[here]]).size < params.min_points:
             continue
         share = max(len(np.unique(touches.point[here[a[here] == name]])) / max(length[name], 1) for name in (low, high))
         if share >= params.contact:
-            found.append((-share, low, high))
-    return [(low, high) for _, low, high in sorted(found)]
+            found.append((-share, low, high, stays))
+    return [(low, high, stays) for _, low, high, stays in sorted(found)]
 
 
 def _in_one_plane(cloud: PointCloud, a: NDArray[np.intp], b: NDArray[np.intp], params: ShadowParams) -> bool:

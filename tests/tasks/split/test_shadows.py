@@ -128,6 +128,28 @@ def test_a_sheet_of_paper_does_not_take_the_colour_of_what_fills_the_gap_beside_
     assert surfaces(patch(BROWN, 0, 0), patch(WHITE, 0.7, 0), between, unlabelled=1) == [1, 2]
 
 
+def dark_edge(color: np.ndarray, open_from: float = 0.3) -> list[Patch]:
+    """A brown patch, darker where it ends but for a piece of that border, and one of a colour beside it."""
+    places, light = patch(BROWN, 0, 0)
+    light[(places[:, 0] > 0.4) & (places[:, 1] < open_from)] *= 0.5
+    return [(places, light), patch(color, 0.5, 0)]
+
+
+def test_of_one_colour_all_over_they_are_one_whatever_lies_along_most_of_their_border():
+    assert surfaces(*dark_edge(BROWN)) == [1, 1]
+    assert surfaces(*dark_edge(BROWN), colors=1.0) == [1, 2]
+    assert surfaces(*dark_edge(RED)) == [1, 2]
+
+
+def test_what_has_an_outline_all_along_stays_apart_though_of_one_colour():
+    assert surfaces(*dark_edge(BROWN, open_from=1)) == [1, 2]
+
+
+def test_two_sheets_of_one_colour_stay_apart_beside_a_gap_between_them():
+    sheets = [patch(WHITE, 0, 0), patch(WHITE, 0.7, 0)]
+    assert surfaces(*sheets, patch(BROWN, 0.5, 0, width=0.2), unlabelled=1) == [1, 2]
+
+
 def test_in_the_dark_nothing_is_known():
     assert surfaces(patch(0 * BROWN, 0, 0), patch(0 * BROWN, 0.5, 0)) == [1, 2]
 
