@@ -264,7 +264,7 @@ def test_when_a_step_that_all_need_fails_the_run_fails_and_the_earlier_result_st
     def fail(*_):
         raise ArithmeticError("nothing fits")
 
-    monkeypatch.setattr("ss_flow.tasks.splat.merge.concatenate", fail)
+    monkeypatch.setattr("ss_flow.tasks.splat.global_pass.concatenate", fail)
     before = {path.name: path.read_bytes() for path in warm.out.iterdir() if path.is_file()}
     called = run_tiny(warm.scene, warm.store, "--set", "reconstruct.min_iterations=13", out=warm.out)
     assert called.code == 1
