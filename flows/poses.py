@@ -4,6 +4,7 @@ out. Photos with poses that do not fit them -> better ones."""
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, cast
 
 from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import INDEX, each, expand, gather, pick
@@ -45,29 +46,38 @@ def refined_poses(frames: tuple[Frame, ...], cameras: Cameras, params: CapturePa
 def fitting_poses(
     frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...] | None, params: CaptureParams
 ) -> Cameras:
-    """Add the nodes that look at a few pairs of photos, and refine the given poses where these do not fit them.
+    """Add the nodes that look at a few pairs of photos, at more where these leave a doubt, and refine the given poses
+    where these do not fit them.
 
     depths: what a sensor measured, if one did; it has a say in which poses are better.
     """
-    pairs = pose_pairs(cameras)
 
-    def compare(chosen: PosePairs) -> Cameras:
+    looks = pose_pairs(cameras)
+
+    def look(place: int, count: int) -> Cameras:
+        return expand(looks[place], lambda chosen: compare(chosen, place, count))
+
+    def compare(chosen: PosePairs, place: int, count: int) -> Cameras:
         rows = chosen.view.tolist()
         photos = each(pick(frames, rows), build=lambda frame: features(frame, params=params.sfm.features))
         matches = gather([match(photos[a], pick(photos, [b])) for a, b in chosen.pair.tolist()])
         known = gather([]) if depths is None else pick(depths, rows)
-        before = pose_fit(cameras, pairs, photos, matches, known)
+        before = pose_fit(cameras, looks[place], photos, matches, known)
 
         def decide(fit: PoseFit) -> Cameras:
+            if params.pose_fit.certain(fit):
+                return cameras
+            if place + 1 < count:
+                return look(place + 1, count)
             if not fit.distance > params.pose_fit.least_distance:
                 return cameras
             refined = refined_poses(frames, cameras, params)
-            after = pose_fit(refined, pairs, photos, matches, known)
+            after = pose_fit(refined, looks[place], photos, matches, known)
             return better_poses(cameras, refined, before, after, params=params.pose_fit)
 
         return expand(before, decide)
 
-    return expand(pairs, compare)
+    return expand(cast(Any, looks), lambda count: look(0, count))
 
 
 def matched(

@@ -19,8 +19,11 @@ from ss_flow.tasks.capture.matches import Matches
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
 
-_PAIRS = 12
-"""Of so many views, evenly chosen, each is compared with its nearest neighbour."""
+FEW_PAIRS, MOST_PAIRS = 6, 12
+"""Of so many views, evenly chosen, each is compared with its nearest neighbour: of few at first, and of more where
+these leave a doubt."""
+_CLEAR = 0.5
+"""Few pairs leave none below this share of the distance from which poses are refined."""
 _LEAST_PAIRS, _LEAST_MATCHES = 3, 15
 """With fewer pairs, of fewer matches each, photos tell nothing about poses."""
 _OCCLUDED = 0.25
@@ -38,6 +41,10 @@ class PoseFitParams:
     are refined; under exact poses and under COLMAP's it is a third of that."""
     gain: Fraction = 0.25
     """Share of this distance that refined poses must take away to be used."""
+
+    def certain(self, fit: PoseFit) -> bool:
+        """Whether poses fit beyond doubt, so that no more pairs need to be looked at."""
+        return fit.distance <= _CLEAR * self.least_distance
 
 
 @dataclass(frozen=True)
@@ -62,10 +69,16 @@ class PoseFit:
 
 
 @task(name="capture.pose_pairs")
-def pose_pairs(cameras: Cameras) -> PosePairs:
-    """A few views, evenly chosen, each with the nearest one that looks the same way, within 45 degrees."""
+def pose_pairs(cameras: Cameras) -> tuple[PosePairs, ...]:
+    """A few views, evenly chosen, each with the nearest one that looks the same way, within 45 degrees; and the same of
+    more views, unless these are no other pairs."""
+    few, more = _pairs(cameras, FEW_PAIRS), _pairs(cameras, MOST_PAIRS)
+    return (few,) if np.array_equal(few.view, more.view) and np.array_equal(few.pair, more.pair) else (few, more)
+
+
+def _pairs(cameras: Cameras, count: int) -> PosePairs:
     pairs = set()
-    for view in np.linspace(0, len(cameras) - 1, min(_PAIRS, len(cameras))).astype(int).tolist():
+    for view in np.linspace(0, len(cameras) - 1, min(count, len(cameras))).astype(int).tolist():
         for other in nearest_views(cameras, view, 1):
             pairs.add((min(view, other), max(view, other)))
     chosen = np.array(sorted(pairs), np.int32).reshape(-1, 2)

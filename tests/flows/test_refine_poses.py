@@ -79,6 +79,7 @@ def test_poses_that_fit_their_photos_stay_without_a_word(scenes, tmp_path):
     store = tmp_path / "store"
     called = run_tiny(scenes[0], store, *UNTIL)
     assert called.computed()["capture.pose_fit"] == 1
+    assert called.computed()["capture.features"] < 12
     assert "capture.refined_cameras" not in called.computed()
     assert warnings_of(called) == []
     assert called.results() == run_tiny(scenes[0], store, *UNTIL, *NEVER).results()
