@@ -22,7 +22,7 @@ from ss_flow.tasks.ranges import Count, Fraction
 
 _SIDE = 320
 """Longer side of the images that are compared, at most; all lengths below are pixels of these."""
-_SCALES = np.exp(np.arange(-0.2, 0.201, 0.02))
+_SCALES = np.exp(np.arange(-0.2, 0.201, 0.01))
 _REACH = 12
 """Largest shift that is looked for."""
 _LEAST_EDGE, _LEAST_OUTLINE = 10, 50
