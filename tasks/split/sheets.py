@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,29 +54,47 @@ class Sheets:
     def standing(self, pieces: Sequence[tuple[int, ...]]) -> Bool:
         """Which pieces, each some labels (rows), rise from another one that is a sheet in something larger: [P]."""
         stands = np.zeros(len(pieces), bool)
-        for sheet in np.flatnonzero(self._outwards(pieces) > self.flush).tolist():
-            own = self._places(pieces[sheet])
-            centre, normal = _plane(own)
-            reach = self.points.spacing
-            if (np.abs((own - centre) @ normal) <= _THICKNESS * reach).mean() < _FLAT:
+        parts = self._flat_ones_joined(pieces)
+        whole = [tuple(row for i in part for row in pieces[i]) for part in parts]
+        for sheet in np.flatnonzero(self._outwards(whole) > self.flush).tolist():
+            own = self._places(whole[sheet])
+            if not self._is_flat(own):
                 continue
-            for i in set(range(len(pieces))) - {sheet}:
+            centre, normal = _plane(own)
+            for i in set(range(len(pieces))) - set(parts[sheet]):
                 other = self._places(pieces[i])
                 rises = np.quantile(np.abs((other - centre) @ normal), 0.9)
-                stands[i] |= bool(rises >= max(self.height * box_diagonal(other, _TRIM), _RISES * reach))
+                stands[i] |= bool(rises >= max(self.height * box_diagonal(other, _TRIM), _RISES * self.points.spacing))
         return stands
+
+    def _flat_ones_joined(self, pieces: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
+        """The pieces by number, those as one that go on into each other in one plane: a page may be in pieces."""
+        parts: list[tuple[int, ...]] = [(i,) for i in range(len(pieces))]
+        for a, b in combinations(range(len(pieces)), 2):
+            first, second = (next(part for part in parts if i in part) for i in (a, b))
+            if first == second or not self.smooth[np.ix_(pieces[a], pieces[b])].any():
+                continue
+            if self._is_flat(self._places(tuple(row for i in first + second for row in pieces[i]))):
+                parts = [part for part in parts if part not in (first, second)] + [first + second]
+        return parts
+
+    def _is_flat(self, places: Float64) -> bool:
+        centre, normal = _plane(places)
+        return bool((np.abs((places - centre) @ normal) <= _THICKNESS * self.points.spacing).mean() >= _FLAT)
 
     def _outwards(self, pieces: Sequence[tuple[int, ...]]) -> Float64:
         """[P] share of the border of each piece that goes on into larger labels of none of the pieces, less the share
-        that goes on into the other pieces."""
+        that goes on into the other pieces. What goes on into smaller labels does not count: a page may be in pieces
+        there that no mask shows with these."""
         member = np.zeros((len(pieces), len(self.border)))
         for row, labels in enumerate(pieces):
             member[row, list(labels)] = 1
         size = np.array([len(rows) for rows in self.rows], np.float64)
         within = ((member @ self.meets) * member).sum(axis=1)  # between the labels of a piece is no border
-        border = np.maximum(member @ self.border - within, 1)
         goes_on, any_piece = member @ self.smooth, member.sum(axis=0)
         larger = size >= (member @ size)[:, None]
+        smaller = (goes_on * (1 - any_piece) * ~larger).sum(axis=1)
+        border = np.maximum(member @ self.border - within - smaller, 1)
         inside = np.minimum((goes_on * (any_piece - member)).sum(axis=1) / border, 1)
         outside = np.minimum((goes_on * (1 - any_piece) * larger).sum(axis=1) / border, 1)
         return (outside - inside) * border / (border + _FEW)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,12 @@ def lying(width: float, depth: float, height: float = 0.0) -> np.ndarray:
     """[N, 3] points of a rectangle about the z axis."""
     x, y = np.meshgrid(np.arange(-width / 2, width / 2, STEP), np.arange(-depth / 2, depth / 2, STEP))
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+
+
+def halved(cloud: PointCloud, labels: PointLabels, at: float) -> Sheets:
+    """The same scene with the page in two pieces, the right one with label 4."""
+    label = np.where((labels.label == 2) & (cloud.points[:, 0] >= at), 4, labels.label).astype(np.int32)
+    return sheets_of(cloud, replace(labels, label=label))
 
 
 def within(places: np.ndarray, half: float) -> np.ndarray:
@@ -42,12 +50,25 @@ def scene(page: float = 0.0, mug: float = 0.1, table: float = 0.8) -> tuple[Poin
 
 
 def on_table(flush: float = 0.6, **sizes: float) -> Sheets:
-    cloud, labels = scene(**sizes)
+    return sheets_of(*scene(**sizes), flush)
+
+
+def sheets_of(cloud: PointCloud, labels: PointLabels, flush: float = 0.6) -> Sheets:
     return find_sheets(cloud, labels, borders(labels.label, cloud, TouchingParams()), flush=flush, height=0.09)
 
 
 def test_a_mug_stands_on_the_page_that_lies_on_a_table():
     assert on_table().standing([(PAGE,), (MUG,)]).tolist() == [False, True]
+
+
+def test_a_page_in_two_pieces_is_one_sheet():
+    sheets = halved(*scene(), at=0.0)
+    assert sheets.standing([(PAGE,), (3,), (MUG,)]).tolist() == [False, False, True]
+
+
+def test_a_piece_of_the_page_that_no_mask_shows_with_it_tells_nothing():
+    sheets = replace(halved(*scene(), at=0.05), flush=0.7)
+    assert sheets.standing([(PAGE,), (MUG,)]).tolist() == [False, True]
 
 
 def test_within_a_set_that_holds_the_table_the_page_is_no_sheet():
