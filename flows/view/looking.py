@@ -35,7 +35,8 @@ def start_view(cameras: Cameras, points: Float32) -> Viewpoint:
 
     points: [N, 3] centres of the scene.
     """
-    shown = [pixels_in_view(_some(points), camera)[3] for camera in cameras_by_view(cameras)]
+    some = _some(points)
+    shown = [pixels_in_view(some, camera)[3] for camera in cameras_by_view(cameras)]
     view = max(range(len(shown)), key=lambda k: len(shown[k]))
     camera = camera_of(cameras, view)
     ahead = float(np.median(shown[view])) if len(shown[view]) else max(camera_extent([camera]), 1.0)
@@ -44,8 +45,9 @@ def start_view(cameras: Cameras, points: Float32) -> Viewpoint:
     return Viewpoint(camera.center, camera.center + ahead * forward, up_of(cameras), float(fov))
 
 
-def view_of_object(cameras: Cameras, points: Float32, fov: float) -> Viewpoint:
-    """From where the view of the capture looks that has most of an object, as near as shows it whole, and no farther.
+def view_of_object(cameras: Cameras, points: Float32, fov: float) -> tuple[Float64, Float64]:
+    """[3] from where, [3] to where: from the side of the view of the capture that has most of an object, as near as
+    shows it whole, and no farther. World units.
 
     points: [N, 3] its centres, N > 0. fov: vertical, of who looks, in radians.
     """
@@ -56,7 +58,7 @@ def view_of_object(cameras: Cameras, points: Float32, fov: float) -> Viewpoint:
     away = camera_of(cameras, int(np.argmax(angle))).center - center
     radius = float(np.quantile(np.linalg.norm(some - center, axis=1), 0.95))
     near = radius / np.sin(_OF_PICTURE * fov / 2)
-    return Viewpoint(center + away * min(1.0, near / np.linalg.norm(away)), center, up_of(cameras), fov)
+    return center + away * min(1.0, near / np.linalg.norm(away)), center
 
 
 def look_from(server: ViserServer, first: Viewpoint) -> None:
@@ -66,11 +68,11 @@ def look_from(server: ViserServer, first: Viewpoint) -> None:
     camera.position, camera.look_at, camera.up, camera.fov = first.position, first.look_at, first.up, first.fov
 
 
-def move_to(client: ClientHandle, view: Viewpoint) -> None:
-    """Let one browser look from there."""
+def move_to(client: ClientHandle, position: Float64, look_at: Float64) -> None:
+    """Let one browser look from there, with its own up and field of view."""
     with client.atomic():
-        client.camera.position = view.position  # takes what it looks at along
-        client.camera.look_at = view.look_at
+        client.camera.position = position  # takes what it looks at along
+        client.camera.look_at = look_at
 
 
 def up_of(cameras: Cameras) -> Float64:

@@ -200,7 +200,7 @@ class Panel:
             raise InputError("select an object that has Gaussians to look at it.")
         if client is not None:
             points = np.concatenate([piece.gaussians.means for piece in pieces])
-            move_to(client, view_of_object(self._cameras, points, client.camera.fov))
+            move_to(client, *view_of_object(self._cameras, points, client.camera.fov))
 
     def _toggle_gizmo(self) -> None:
         self._is_moving = not self._is_moving

@@ -7,7 +7,7 @@ does not. Beyond Split&Splat.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
@@ -50,6 +50,8 @@ class Sheets:
     labels outside of the set."""
     height: float
     """How far something must rise from the sheet to stand on it, as a share of its extent."""
+    _planes: dict[tuple[int, ...], tuple[Float64, Float64] | None] = field(default_factory=dict, init=False)
+    """Planes found so far: many sets share their pieces."""
 
     def standing(self, pieces: Sequence[tuple[int, ...]]) -> Bool:
         """Which pieces, each some labels (rows), rise from another one that is a sheet in something larger: [P]."""
@@ -57,10 +59,9 @@ class Sheets:
         parts = self._flat_ones_joined(pieces)
         whole = [tuple(row for i in part for row in pieces[i]) for part in parts]
         for sheet in np.flatnonzero(self._outwards(whole) > self.flush).tolist():
-            own = self._places(whole[sheet])
-            if not self._is_flat(own):
+            if (plane := self._plane_of(whole[sheet])) is None:
                 continue
-            centre, normal = _plane(own)
+            centre, normal = plane
             for i in set(range(len(pieces))) - set(parts[sheet]):
                 other = self._places(pieces[i])
                 rises = np.quantile(np.abs((other - centre) @ normal), 0.9)
@@ -74,13 +75,18 @@ class Sheets:
             first, second = (next(part for part in parts if i in part) for i in (a, b))
             if first == second or not self.smooth[np.ix_(pieces[a], pieces[b])].any():
                 continue
-            if self._is_flat(self._places(tuple(row for i in first + second for row in pieces[i]))):
+            if self._plane_of(tuple(row for i in first + second for row in pieces[i])) is not None:
                 parts = [part for part in parts if part not in (first, second)] + [first + second]
         return parts
 
-    def _is_flat(self, places: Float64) -> bool:
-        centre, normal = _plane(places)
-        return bool((np.abs((places - centre) @ normal) <= _THICKNESS * self.points.spacing).mean() >= _FLAT)
+    def _plane_of(self, labels: tuple[int, ...]) -> tuple[Float64, Float64] | None:
+        """Centre and normal of the plane in which the labels (rows) lie; None where they do not lie in one."""
+        if labels not in self._planes:
+            places = self._places(labels)
+            centre, normal = _plane(places)
+            flat = (np.abs((places - centre) @ normal) <= _THICKNESS * self.points.spacing).mean() >= _FLAT
+            self._planes[labels] = (centre, normal) if flat else None
+        return self._planes[labels]
 
     def _outwards(self, pieces: Sequence[tuple[int, ...]]) -> Float64:
         """[P] share of the border of each piece that goes on into larger labels of none of the pieces, less the share

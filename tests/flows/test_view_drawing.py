@@ -114,14 +114,14 @@ def test_an_object_is_looked_at_whole_from_the_side_that_a_photo_saw(results, ar
     cameras, scene = around.cameras, results.one("scene")
     for instance in np.unique(scene.instance_id[scene.instance_id > 0]):
         points = scene.means[scene.instance_id == instance]
-        view = view_of_object(cameras, points, fov := 0.9)
-        away = view.position - view.look_at
-        centers = np.array([camera_of(cameras, k).center for k in range(len(cameras.names))]) - view.look_at
+        position, look_at = view_of_object(cameras, points, fov := 0.9)
+        away = position - look_at
+        centers = np.array([camera_of(cameras, k).center for k in range(len(cameras.names))]) - look_at
         cosines = centers @ away / np.linalg.norm(centers, axis=1) / np.linalg.norm(away)
         assert cosines.max() == pytest.approx(1)  # on the line to a camera
         nearest = np.linalg.norm(centers[cosines.argmax()])
         assert np.linalg.norm(away) <= nearest * (1 + 1e-9)
-        rays = points - view.position
+        rays = points - position
         depth = rays @ -away / np.linalg.norm(away)
         off_axis = np.arccos(np.clip(depth / np.linalg.norm(rays, axis=1), -1, 1))
         is_near = np.linalg.norm(away) < nearest * (1 - 1e-9)
