@@ -19,7 +19,7 @@ from ss_flow.tasks.capture.matches import Matches
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
 
-FEW_PAIRS, MOST_PAIRS = 6, 12
+_FEW_PAIRS, _MOST_PAIRS = 6, 12
 """Of so many views, evenly chosen, each is compared with its nearest neighbour: of few at first, and of more where
 these leave a doubt."""
 _CLEAR = 0.5
@@ -72,7 +72,7 @@ class PoseFit:
 def pose_pairs(cameras: Cameras) -> tuple[PosePairs, ...]:
     """A few views, evenly chosen, each with the nearest one that looks the same way, within 45 degrees; and the same of
     more views, unless these are no other pairs."""
-    few, more = _pairs(cameras, FEW_PAIRS), _pairs(cameras, MOST_PAIRS)
+    few, more = _pairs(cameras, _FEW_PAIRS), _pairs(cameras, _MOST_PAIRS)
     return (few,) if np.array_equal(few.view, more.view) and np.array_equal(few.pair, more.pair) else (few, more)
 
 
