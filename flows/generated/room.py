@@ -261,7 +261,7 @@ def _points(views: Views) -> dict[str, Any]:
     points = np.concatenate([backproject(views.depth[i], camera_of(views.cameras, i)) for i in range(len(views))])
     clear = np.flatnonzero(views.valid)
     points = points[clear]
-    cell = np.floor((points - points.min(axis=0)) / _POINT_VOXEL).astype(np.int64)
+    cell = ((points - points.min(axis=0)) / _POINT_VOXEL).astype(np.int64)
     _, first = np.unique(np.ravel_multi_index(cell.T, cell.max(axis=0) + 1), return_index=True)
     first.sort()
     pixel = clear[first]

@@ -64,6 +64,14 @@ def test_a_thing_alone_looks_as_it_does_in_the_room(room: Room) -> None:
         assert (rgb[alpha == 0] == 0).all() and (rgb <= alpha[..., None] + 1e-6).all()
 
 
+def test_a_thing_out_of_sight_shows_nothing_alone(room: Room) -> None:
+    behind = camera_of(room.cameras, 0).world_to_camera.copy()
+    behind[2, 3] -= 100  # metres: the whole room lies behind the camera
+    camera = dataclasses.replace(camera_of(room.cameras, 0), world_to_camera=behind)
+    rgb, alpha, depth = renderer_of(SMALL).alone(camera, int(room.ids.max()))
+    assert rgb.shape == (90, 120, 3) and not rgb.any() and not alpha.any() and not depth.any()
+
+
 def test_depth_seen_from_one_view_agrees_with_depth_and_ids_of_the_others(room: Room) -> None:
     world = backproject(room.depth[0], camera_of(room.cameras, 0))
     ids = room.ids[0].ravel()
