@@ -26,16 +26,25 @@ def smooth(label: Int32, contested: Bool, points: Float32, spacing: float, round
     _, near = cKDTree(points).query(points[rows], k=count, distance_upper_bound=_REACH * spacing)
     near = np.asarray(near).reshape(len(rows), count)
     padded = np.append(label, np.int32(0))  # a neighbour out of reach has the number len(points)
+    changed = np.ones(len(padded), bool)
     for _ in range(rounds):
-        around = np.where(near == rows[:, None], 0, padded[near])
-        padded[rows] = _most_frequent(around)
+        # Where no neighbour has changed, the answer has not.
+        asked = np.flatnonzero(changed[near].any(axis=1))
+        around = np.where(near[asked] == rows[asked, None], 0, padded[near[asked]])
+        found, before = _most_frequent(around), padded[rows[asked]]
+        padded[rows[asked]] = found
+        changed[:] = False
+        changed[rows[asked]] = found != before
     return padded[:-1]
 
 
 def _most_frequent(labels: Int32) -> Int32:
     """The most frequent label above 0 in each row of [M, Q]; ties go to the lowest; 0 where there is none."""
-    ordered = np.sort(labels, axis=1)
-    count = (ordered[:, :, None] == ordered[:, None, :]).sum(axis=2)
-    count[ordered == 0] = 0
-    best = count.argmax(axis=1)
-    return ordered[np.arange(len(ordered)), best]
+    ordered = np.ascontiguousarray(np.sort(labels, axis=1).T)
+    best, most = np.zeros_like(ordered[0]), np.zeros(len(labels), np.int32)
+    length = np.zeros(len(labels), np.int32)
+    for before, label in zip(ordered[[0, *range(len(ordered) - 1)]], ordered, strict=True):
+        length = np.where(label == before, length + 1, 1)
+        longer = (length > most) & (label > 0)
+        best, most = np.where(longer, label, best), np.where(longer, length, most)
+    return best

@@ -34,3 +34,15 @@ def test_points_far_from_all_others_stay_as_they_are():
     points = row(3) * 10
     assert smooth(np.array([1, 0, 2], np.int32), np.array([False, True, False]), points, 1.0, 1).tolist() == [1, 0, 2]
     assert smooth(np.zeros(0, np.int32), np.zeros(0, bool), np.zeros((0, 3), np.float32), 0.0, 3).tolist() == []
+
+
+def test_many_rounds_give_what_one_round_after_the_other_gives():
+    random = np.random.default_rng(0)
+    points = random.random((500, 3)).astype(np.float32)
+    label = np.where(random.random(500) < 0.4, random.integers(1, 5, 500), 0).astype(np.int32)
+    contested = random.random(500) < 0.7
+    step_by_step = label
+    for _ in range(6):
+        step_by_step = smooth(step_by_step, contested, points, 0.1, 1)
+    assert (step_by_step != smooth(label, contested, points, 0.1, 1)).any()
+    assert smooth(label, contested, points, 0.1, 6).tolist() == step_by_step.tolist()
