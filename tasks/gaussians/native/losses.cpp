@@ -87,6 +87,18 @@ void compare(int n, const float* __restrict share, const float* __restrict mx, f
     }
 }
 
+// Of n values: both images where the share is above 0, what each adds to L1, and the gradient of that, times `weight`.
+void differ(int n, float weight, const float* __restrict share, const float* __restrict image,
+            const float* __restrict target, float* __restrict x, float* __restrict y, float* __restrict terms,
+            float* __restrict gradient) {
+    for (int i = 0; i < n; ++i) {
+        x[i] = share[i] > 0 ? image[i] : 0, y[i] = share[i] > 0 ? target[i] : 0;
+        const float d = x[i] - y[i];
+        terms[i] = share[i] * std::fabs(d);
+        gradient[i] = weight * share[i] * (float)((d > 0) - (d < 0));
+    }
+}
+
 struct Sum {  // of many floats: sixteen running sums, added at the end
     float lane[kTogether] = {};
     double total = 0;
@@ -140,12 +152,8 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
                 counted[r] = widened({first * channels, end * channels}, 0, n);
                 for (int p = 0; p < width; ++p)
                     for (int c = 0; c < channels; ++c) share[at + p * channels + c] = of_row[p] * norm;
-                for (int64_t i = at; i < at + n; ++i) {
-                    x[i] = share[i] > 0 ? image[i] : 0, y[i] = share[i] > 0 ? target[i] : 0;
-                    const float d = x[i] - y[i];
-                    terms[i - at] = share[i] * std::fabs(d);
-                    gradient[i] = (1 - ssim_weight) * share[i] * (float)((d > 0) - (d < 0));
-                }
+                differ(n, 1 - ssim_weight, share + at, image + at, target + at, x + at, y + at, terms.data(),
+                       gradient + at);
                 l1.add(terms.data(), n);
             });
             sums[2 * piece] = l1.total, sums[2 * piece + 1] = 0;
@@ -258,7 +266,8 @@ void ss_adam(int64_t rows, int64_t width, int64_t active, int64_t head, float* v
     const float correct = (float)(1 / std::sqrt(1 - std::pow(0.999, (double)step)));
     const double debias = 1 / (1 - std::pow(0.9, (double)step));
     const float small = (float)epsilon;
-    const auto update = [&](int64_t begin, int64_t end, float scale) {
+    const auto update = [&](int64_t begin, int64_t end, double of_these) {
+        const float scale = (float)(of_these * debias);
         for (int64_t i = begin; i < end; ++i) {
             const float g = gradient[i];
             first[i] = 0.9f * first[i] + 0.1f * g;
@@ -266,9 +275,13 @@ void ss_adam(int64_t rows, int64_t width, int64_t active, int64_t head, float* v
             value[i] -= scale * first[i] / (std::sqrt(second[i]) * correct + small);
         }
     };
+    if (active == width && (head == 0 || head == width)) {  // in one go, since short loops do not become vector code
+        update(0, rows * width, head == 0 ? rate : head_rate);
+        return;
+    }
     for (int64_t r = 0; r < rows; ++r) {
-        update(r * width, r * width + head, (float)(head_rate * debias));
-        update(r * width + head, r * width + active, (float)(rate * debias));
+        update(r * width, r * width + head, head_rate);
+        update(r * width + head, r * width + active, rate);
     }
 }
 }
