@@ -43,7 +43,7 @@ def sum_by_voxel(parts: list[VoxelSums], voxel: float) -> VoxelSums:
     position, color, weight = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("position", "color", "weight")
     )
-    cell = np.floor(position / weight[:, None] / voxel + 0.5).astype(np.int64) % _CELLS
+    cell = np.floor(position / weight[:, None] / voxel + 0.5).astype(np.int64) & (_CELLS - 1)
     code = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
     _, inverse = np.unique(code, return_inverse=True)
 
