@@ -61,6 +61,18 @@ def nothing_kept() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def counted(before: int, total: int) -> Iterator[None]:
+    """Within this a task is `before` of `total` steps further than it says: for the parts of one that work in turn."""
+    heard = _surroundings.get()
+
+    def listener(done: int, _: int, note: str) -> None:
+        heard.listener(before + done, total, note)
+
+    with running(replace(heard, listener=listener)):
+        yield
+
+
 def progress(done: int, total: int, note: str = "") -> None:
     """Say how far a long task is; costs nothing where there is no listener. A cancelled task ends here."""
     _surroundings.get().listener(done, total, note)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ss_flow.running import nothing_kept
+from ss_flow.running import counted, nothing_kept
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, select
@@ -92,7 +92,7 @@ def global_pass(
 
     surface, begun, shown = scene, scene, masks
     if first:
-        with nothing_kept():
+        with nothing_kept(), counted(0, params.global_iterations):
             begun = trained(scene, _opening(settings, first))
         shown = tuple(shown_masks(views, begun, masks))
         surface = relabelled(compared, scene, shown)
@@ -101,7 +101,9 @@ def global_pass(
     parts: list[PartView] = []
     if params.side_weight:
         parts = side_views(compared, surface, shown, params.side_views, params.global_iterations)
-    return guarded(scene, trained(begun, settings, parts), seen, ids, params)
+    with counted(first, params.global_iterations):
+        finished = trained(begun, settings, parts)
+    return guarded(scene, finished, seen, ids, params)
 
 
 def _opening(settings: TrainParams, steps: int) -> TrainParams:

@@ -316,7 +316,7 @@ def test_a_last_pass_that_was_interrupted_goes_on_to_the_same_bytes(built, tmp_p
 
     def stop(done: int, total: int, note: str) -> None:
         told.append((done, total))
-        if (done, total) == (100, 150):
+        if done == 150:
             raise Interrupted
 
     here = Surroundings(stop, checkpoint=tmp_path / "kept.npz")
@@ -325,6 +325,6 @@ def test_a_last_pass_that_was_interrupted_goes_on_to_the_same_bytes(built, tmp_p
     again: list[tuple[int, int]] = []
     with running(replace(here, listener=lambda done, total, note: again.append((done, total)))):
         found = global_pass(built.views, scene, built.scene.maps, params=params)
-    assert (50, 50) in told and (50, 150) in told
-    assert (50, 50) in again and (150, 150) in again and (50, 150) not in again
+    assert told == [(50, 200), (100, 200), (150, 200)]
+    assert again == [(50, 200), (200, 200)]
     assert same(found, alone)
