@@ -18,6 +18,7 @@ from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.splat.merge import MergeParams, channels, extent, guarded
 from ss_flow.tasks.splat.relabel import relabelled, shown_masks
 from ss_flow.tasks.splat.side_views import side_views
+from ss_flow.tasks.splat.strays import without_strays
 
 SIDES_PER_STEP = 2
 """Views of instances alone that a step of the last pass sees besides a photo."""
@@ -56,7 +57,8 @@ def global_pass(
     instance covers beside its surface (`side_views`); the guard of `merge_pair` holds here too.
 
     After `relabel_after` steps the scene shows what belongs to what better than the masks do. So a Gaussian whose place
-    shows another instance in most views becomes that one's, and only then is each instance looked at from the side.
+    shows another instance in most views becomes that one's, and only then is each instance looked at from the side. In
+    the end what stands apart from its instance, where those views show others, is the background's.
     """
     if not len(scene) or not params.global_iterations:
         return scene
@@ -103,6 +105,8 @@ def global_pass(
         parts = side_views(compared, surface, shown, params.side_views, params.global_iterations)
     with counted(first, params.global_iterations):
         finished = trained(begun, settings, parts)
+    if first:
+        finished = by_instance(without_strays(views.cameras, finished, shown))
     return guarded(scene, finished, seen, ids, params)
 
 

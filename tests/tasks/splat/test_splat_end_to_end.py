@@ -297,6 +297,25 @@ def test_the_last_pass_gives_gaussians_to_the_instance_that_photos_show_there(bu
     assert gained(replace(params, relabel_after=0)) == 0
 
 
+def test_the_last_pass_leaves_a_thing_no_gaussian_far_off_that_photos_show_as_another(built):
+    far = np.arange(len(built.box)) % 40 == 0
+    box = replace(built.box, instance_id=np.where(far, 2, built.box.instance_id).astype(np.int32))
+    scene = assemble((built.background, box, built.ball))
+    # No label changes by what the scene shows at a place, so what is far off stays far off to the end.
+    blind = tuple(replace(d, depth=np.zeros_like(d.depth)) for d in built.views.depths)
+    views = replace(built.views, depths=blind)
+
+    def ball(params: MergeParams) -> np.ndarray:
+        found = global_pass(views, scene, built.scene.maps, params=params)
+        assert (np.diff(found.instance_id) >= 0).all()
+        return found.means[found.instance_id == 2]
+
+    assert far.sum() > 10
+    size = np.linalg.norm(np.ptp(built.ball.means, axis=0))
+    assert np.linalg.norm(np.ptp(ball(replace(MERGE, relabel_after=0)), axis=0)) > 1.5 * size
+    assert np.linalg.norm(np.ptp(ball(MERGE), axis=0)) < 1.2 * size
+
+
 def test_a_last_pass_of_few_steps_keeps_its_labels(built):
     scene = assemble((built.background, replace(built.ball, instance_id=np.full(len(built.ball), 1, np.int32))))
     params = replace(MERGE, global_iterations=20, relabel_after=20, guard_views=0)

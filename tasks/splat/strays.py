@@ -1,0 +1,107 @@
+"""Gaussians that stand apart from the thing whose label they carry, where the views show something else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
+from ss_flow.tasks.gaussians.render import weights_by_id
+from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
+from ss_flow.tasks.geometry.images import size_within
+
+MOST_PIXELS = 160
+"""Longer side of the renderings that tell where Gaussians weigh."""
+NEIGHBOURS = 3
+"""The spacing of an instance is the median distance of its Gaussians to the neighbour of this rank."""
+GAP = 5.0
+"""Spacings without a Gaussian that part one piece of an instance from another."""
+LEAST_OWN = 0.5
+"""Share of a piece's weight that lies in pixels of its instance, from which it belongs there."""
+BACKGROUND = 0
+
+
+def without_strays(cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[LabelMap]) -> Gaussians:
+    """The same rows, where what stands apart from its instance, and shows where others are, is the background's.
+
+    Some points have a wrong label, and some Gaussians got theirs from afar. They make the box, the file and the
+    pictures of a thing too large, though in the whole scene they help to show what is really there. So each instance
+    but the background falls into pieces, GAP spacings and more from one another. The piece that weighs most in the
+    pixels of its instance, T * alpha summed over all views, is kept, and so is each that has at least half of its own
+    weight there. What of the others lies outside the box around these becomes part 0 of the background; inside of it,
+    it may be a leg that masks lack. The whole scene looks as before, as only labels change.
+
+    scene: fully trained. masks: exclusive label maps of all views, one a camera.
+    """
+    piece = _pieces_apart(scene)
+    rows = np.flatnonzero(piece >= 0)
+    if not len(rows):
+        return scene
+    own, everywhere = (
+        np.bincount(piece[rows], weights[rows])
+        for weights in _weights(cameras, scene, masks, np.unique(scene.instance_id[rows]))
+    )
+    instance = np.zeros(len(own), np.int32)
+    instance[piece[rows]] = scene.instance_id[rows]
+    order = np.lexsort((-own, instance))
+    main = order[np.unique(instance[order], return_index=True)[1]]
+    kept = (own >= LEAST_OWN * everywhere) & (everywhere > 0)
+    kept[main] = True
+    strays = (piece >= 0) & ~kept[piece]
+    strays &= ~_inside_own_box(scene, ~strays)
+    return replace(
+        scene,
+        instance_id=np.where(strays, BACKGROUND, scene.instance_id).astype(np.int32),
+        part_id=np.where(strays, 0, scene.part_id).astype(np.int32),
+    )
+
+
+def _pieces_apart(scene: Gaussians) -> Int32:
+    """[N] the number of each Gaussian's piece, -1 where its instance is in one, or is the background."""
+    piece = np.full(len(scene), -1, np.int32)
+    count = 0
+    for instance, rows in rows_by_label(scene.instance_id).items():
+        if instance == BACKGROUND or len(rows) <= NEIGHBOURS:
+            continue
+        found = dbscan(scene.means[rows], GAP * _spacing(scene.means[rows]), min_samples=1)
+        if pieces := int(found.max()):
+            piece[rows] = count + found
+            count += pieces + 1
+    return piece
+
+
+def _inside_own_box(scene: Gaussians, kept: Bool) -> Bool:
+    """[N] which centres lie in the box around those of their instance that are kept."""
+    inside = np.zeros(len(scene), bool)
+    for rows in rows_by_label(scene.instance_id).values():
+        own, known = scene.means[rows], scene.means[rows[kept[rows]]]
+        inside[rows] = ((own >= known.min(axis=0)) & (own <= known.max(axis=0))).all(axis=1)
+    return inside
+
+
+def _spacing(points: Float32) -> float:
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1, workers=1)
+    return float(np.median(np.asarray(distance)[:, -1]))
+
+
+def _weights(
+    cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[LabelMap], asked: Int32
+) -> tuple[Float64, Float64]:
+    """[N] the weight of each Gaussian over all views: in pixels of its instance, where that is one of those asked for;
+    and in all pixels."""
+    import cv2
+
+    own, everywhere = np.zeros(len(scene)), np.zeros(len(scene))
+    rest = np.iinfo(np.uint16).max + 1
+    for camera, shown in zip(cameras, masks, strict=True):
+        small = camera.scaled(*size_within(MOST_PIXELS, camera.width, camera.height))
+        ids = cv2.resize(shown.ids, (small.width, small.height), interpolation=cv2.INTER_NEAREST).astype(np.int32)
+        for instance, weights in weights_by_id(scene, small, np.where(np.isin(ids, asked), ids, rest)):
+            everywhere += weights
+            own += np.where(scene.instance_id == instance, weights, 0)
+    return own, everywhere

@@ -1,0 +1,111 @@
+"""What stands apart from its instance, where views show others, becomes the background's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_and_box import SmallScene
+
+from ss_flow.tasks.artifacts import Gaussians, LabelMap
+from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, initialise, select
+from ss_flow.tasks.geometry.sampling import first_of_each_cube
+from ss_flow.tasks.splat.strays import without_strays
+
+FLOOR, BOX, BALL = 0, 1, 2
+
+
+@pytest.fixture(scope="module")
+def small() -> SmallScene:
+    return SmallScene()
+
+
+@pytest.fixture(scope="module")
+def scene(small) -> Gaussians:
+    """Small, opaque Gaussians all over the surface, with their true labels."""
+    rows = first_of_each_cube(small.points, 0.03)
+    labels = small.labels[rows]
+    round_ones = initialise(small.points[rows], small.colors[rows], labels, 0.9, np.full(len(rows), 3), opacity=0.95)
+    return replace(round_ones, log_scales=round_ones.log_scales - np.float32(np.log(2)))
+
+
+def far_from_ball(scene: Gaussians, count: int) -> np.ndarray:
+    """[count] rows of the floor that lie farthest from the ball."""
+    middle = scene.means[scene.instance_id == BALL].mean(axis=0)
+    away = np.linalg.norm(scene.means - middle, axis=1) * (scene.instance_id == FLOOR)
+    return np.argsort(-away)[:count]
+
+
+def given(scene: Gaussians, rows: np.ndarray, instance: int) -> Gaussians:
+    labels = scene.instance_id.copy()
+    labels[rows] = instance
+    return replace(scene, instance_id=labels)
+
+
+def cleaned(small: SmallScene, scene: Gaussians, maps: list[LabelMap] | None = None) -> Gaussians:
+    return without_strays(small.views.cameras, scene, small.maps if maps is None else maps)
+
+
+def test_a_scene_whose_instances_are_whole_stays_as_it_is(small, scene):
+    found = cleaned(small, scene)
+    assert np.array_equal(found.instance_id, scene.instance_id)
+    assert np.array_equal(found.part_id, scene.part_id)
+
+
+def test_gaussians_far_off_that_views_show_as_something_else_become_the_background(small, scene):
+    rows = far_from_ball(scene, 6)
+    found = cleaned(small, given(scene, rows, BALL))
+    assert (found.instance_id[rows] == FLOOR).all() and (found.part_id[rows] == 0).all()
+    rest = np.setdiff1d(np.arange(len(scene)), rows)
+    assert np.array_equal(found.instance_id[rest], scene.instance_id[rest])
+    assert np.array_equal(found.part_id[rest], scene.part_id[rest])
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        assert getattr(found, name) is getattr(scene, name)
+
+
+def test_a_piece_far_off_stays_where_views_show_it_as_the_instance(small, scene):
+    rows = far_from_ball(scene, 6)
+    piece = given(scene, rows, BALL)
+    maps = []
+    for camera, shown in zip(small.views.cameras, small.maps, strict=True):
+        ids = shown.ids.copy()
+        y, x = np.indices(ids.shape) + 0.5
+        for mean in scene.means[rows]:
+            at = camera.world_to_camera[:3, :3] @ mean + camera.world_to_camera[:3, 3]
+            u, v = camera.fx * at[0] / at[2] + camera.cx, camera.fy * at[1] / at[2] + camera.cy
+            ids[np.hypot(x - u, y - v) < 8] = BALL
+        maps.append(replace(shown, ids=ids))
+    assert (cleaned(small, piece, maps).instance_id[rows] == BALL).all()
+
+
+def test_the_piece_that_weighs_most_in_its_own_pixels_stays_however_little_that_is(small, scene):
+    rows = far_from_ball(scene, 6)
+    nowhere = [replace(m, ids=np.where(m.ids == BALL, BOX, m.ids).astype(np.uint16)) for m in small.maps]
+    nowhere[0] = small.maps[0]
+    found = cleaned(small, given(scene, rows, BALL), nowhere)
+    assert (found.instance_id[rows] == FLOOR).all()
+    assert (found.instance_id[scene.instance_id == BALL] == BALL).all()
+
+
+def test_what_no_view_sees_far_off_becomes_the_background(small, scene):
+    behind = select(scene, np.flatnonzero(scene.instance_id == BALL)[:5])
+    unseen = replace(behind, means=behind.means + np.array([0, 0, 50], np.float32))
+    found = cleaned(small, concatenate([scene, unseen]))
+    assert (found.instance_id[len(scene) :] == FLOOR).all()
+    assert np.array_equal(found.instance_id[: len(scene)], scene.instance_id)
+
+
+def test_what_lies_in_the_box_of_its_instance_stays(small, scene):
+    ball = select(scene, scene.instance_id == BALL)
+    low, high = ball.means.min(axis=0), ball.means.max(axis=0)
+    for middle, stays in (((low + high) / 2, True), ((low + high) / 2 + 1.5 * (high - low), False)):
+        alone = replace(select(ball, [0]), means=middle[None], log_scales=np.full((1, 3), -9, np.float32))
+        found = cleaned(small, concatenate([scene, alone]))
+        assert (found.instance_id[-1] == BALL) == stays
+
+
+def test_few_gaussians_and_none_stay(small, scene):
+    assert len(cleaned(small, NO_GAUSSIANS)) == 0
+    few = select(scene, np.flatnonzero(scene.instance_id == BALL)[[0, -1]])
+    assert np.array_equal(cleaned(small, few).instance_id, few.instance_id)
