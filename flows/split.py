@@ -127,7 +127,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         propagating, granularity = replace(propagating, touching_merge=False, apart=False), 1.0
     pieces = propagate(points, seen, observed, params=propagating)
     counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
-    tree = hierarchy(points, capture.cameras, pieces, counted, params=params.hierarchy)
+    tree = hierarchy(points, capture.cameras, seen, pieces, counted, params=params.hierarchy)
     labels = cut(pieces, tree, granularity=granularity)
     shown = masks
     nested = find_parts(observed, masks, pieces, params=params.parts)

@@ -2,9 +2,9 @@
 
 A segmenter shows the box, its faces and the label printed on it, and often the box with what stands beside it. The
 level that is a thing is the one that the views repeat: most views which see two pieces of it have a mask with just
-these pieces, and the segmenter is as sure of that mask as of those of the pieces. Two things are known without masks:
-what light alone or nothing parts is one surface, and what touches nothing but walls and floors stands alone. Beyond
-Split&Splat.
+these pieces, and the segmenter is as sure of that mask as of those of the pieces. Three things are known without masks:
+what light alone or nothing parts is one surface, what touches nothing but walls and floors stands alone, and what meets
+in a convex edge are faces of one thing, unless the views deny it. Beyond Split&Splat.
 """
 
 from __future__ import annotations
@@ -17,9 +17,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Hierarchy, Int32, PointCloud, PointLabels, Tally
+from ss_flow.tasks.artifacts import (
+    Bool,
+    Cameras,
+    Float32,
+    Float64,
+    Hierarchy,
+    Int32,
+    PointCloud,
+    PointLabels,
+    Tally,
+    Visibility,
+)
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.split.edges import convex_edges
 from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
 from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
@@ -40,6 +52,9 @@ _ALONE = 0.5
 """Share of what pieces touch, other than stuff, that must be of their own set for it to begin to stand alone."""
 _TOUCH = 10.0
 """Border points of other things that are presumed, so that a faint touch proves nothing."""
+_TOGETHER = 0.5
+"""Share of the views which see two pieces that must hold them under one mask, whatever else it holds, so that a convex
+edge between them makes them faces of one thing."""
 _MOST_SETS = 2000
 """Sets of pieces that are weighed in a round: those that the most masks show."""
 
@@ -76,12 +91,17 @@ class HierarchyParams:
     alone: Fraction = 0.3
     """Share by which an agreement rises towards 1 where the pieces touch each other and stuff, and nothing else: a
     chair on a floor. Less where they touch other things, down to nothing at half of what they touch."""
+    convex: Fraction = 0.46
+    """Agreement that two pieces have at least where they meet in a convex edge, as the faces of a box do, and half of
+    the views that see both hold them under one mask. Just above the default of `split.granularity`, so that what the
+    views show as one comes first. 0 = convex edges are not looked for."""
 
 
 @task(name="split.hierarchy")
 def hierarchy(
     points: PointCloud,
     cameras: Cameras,
+    visibility: Sequence[Visibility],
     labels: PointLabels,
     tallies: Sequence[Tally],
     *,
@@ -89,8 +109,8 @@ def hierarchy(
 ) -> Hierarchy:
     """The tree of what the labels make up.
 
-    labels: of `points`. tallies: one a view, of these labels. What light alone or nothing parts is united first. Then,
-    round by round, the sets of pieces with the highest agreement are, each piece once a round, until none reaches
+    visibility, tallies: one of each a view; labels: of `points`. What light alone or nothing parts is united first.
+    Then, round by round, the sets of pieces with the highest agreement are, each piece once a round, until none reaches
     `min_agreement`; a thing and stuff never are. The order of the views does not matter, nor that of the masks.
     """
     names = np.unique(labels.label[labels.label > 0]).astype(np.int32)
@@ -101,7 +121,10 @@ def hierarchy(
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)
     contact = find_contact(ends, labels.label)
     sheets = find_sheets(points, labels, ends, flush=params.flush, height=params.bulge)
-    pieces = _Pieces.of(names, tallies, is_stuff, contact, mounds, sheets, params)
+    edges = np.zeros((len(names), len(names)), bool)
+    if params.convex:
+        edges = convex_edges(points, cameras, visibility, labels.label, ends)
+    pieces = _Pieces.of(names, tallies, is_stuff, contact, edges, mounds, sheets, params)
     node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
     top = list(range(len(names)))  # the tree's row of each piece
     lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
@@ -153,6 +176,8 @@ class _Pieces:
     """[G]."""
     contact: Float32
     """[G, G] points at which each touches each other one, from both sides."""
+    edges: Bool
+    """[G, G] which meet in a convex edge."""
     labels: list[tuple[int, ...]]
     """G x the labels (rows) that each is made of."""
     mounds: Mounds
@@ -165,6 +190,7 @@ class _Pieces:
         tallies: Sequence[Tally],
         stuff: Bool,
         contact: Float32,
+        edges: Bool,
         mounds: Mounds,
         sheets: Sheets,
         params: HierarchyParams,
@@ -179,7 +205,7 @@ class _Pieces:
             held[-1][:, column] = tally.held
             quality.append(tally.quality.astype(np.float64))
         own: list[tuple[int, ...]] = [(row,) for row in range(len(names))]
-        return _Pieces(seen, held, quality, stuff, contact, own, mounds, sheets, params)
+        return _Pieces(seen, held, quality, stuff, contact, edges, own, mounds, sheets, params)
 
     @functools.cached_property
     def views(self) -> list[_View]:
@@ -208,12 +234,16 @@ class _Pieces:
             held=[held @ joined for held in self.held],
             stuff=self.stuff[[members[0] for members in groups]],
             contact=(joined.T @ self.contact @ joined * ~np.eye(len(groups), dtype=bool)).astype(np.float32),
+            edges=joined.T @ self.edges @ joined * ~np.eye(len(groups), dtype=bool) > 0,
             labels=[tuple(row for piece in members for row in self.labels[piece]) for members in groups],
         )
 
     def best_unions(self) -> list[tuple[tuple[int, ...], float]]:
         """The sets of pieces to unite now, each with its agreement: of sets that share a piece, the best alone."""
         sets, group = self._sets()
+        faces = self._faces()
+        unshown = sorted(faces - set(sets))
+        sets, group = sets + unshown, group + [False] * len(unshown)
         if not sets:
             return []
         member = np.zeros((len(sets), len(self.stuff)), np.float32)
@@ -221,7 +251,8 @@ class _Pieces:
             member[row, list(members)] = 1
         agreement = self._agreement(member)
         agreement += (1 - agreement) * self.params.alone * self._alone(member)
-        agreement = np.round(agreement * np.where(group, _ON_TOP, 1.0), 6)
+        least = np.where([members in faces for members in sets], self.params.convex, 0)
+        agreement = np.maximum(agreement * np.where(group, _ON_TOP, 1.0), least).astype(np.float64).round(6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
@@ -249,6 +280,18 @@ class _Pieces:
                 on_top.setdefault(below, self._standing(below))
         sets = [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
         return sets, [bool(on_top[members]) for members in sets]
+
+    def _faces(self) -> set[tuple[int, ...]]:
+        """The pairs of things that meet in a convex edge, and that the views do not deny to be one."""
+        a, b = np.nonzero(np.triu(self.edges) & ~self.stuff & ~self.stuff[:, None])
+        both, together = np.zeros((2, len(a)))
+        for view in self.views:
+            seen = view.seen > 0
+            holds = (view.held >= 0.5 * view.seen) & seen
+            both += seen[a] & seen[b]
+            together += (holds[:, a] & holds[:, b]).any(axis=0)
+        one = (together > 0) & (together >= _TOGETHER * both)
+        return set(zip(a[one].tolist(), b[one].tolist(), strict=True))
 
     def _standing(self, members: tuple[int, ...]) -> set[int]:
         """Which of these pieces stand on the others."""

@@ -219,7 +219,7 @@ def labelled(
     """The instances of the points, and the tree that they were cut from."""
     pieces = propagate(room.cloud, seen, observed, params=split.propagate)
     counted = [tally(view, pool, pieces) for view, pool in zip(seen, masks, strict=True)]
-    tree = hierarchy(room.cloud, room.cameras, pieces, counted, params=split.hierarchy)
+    tree = hierarchy(room.cloud, room.cameras, seen, pieces, counted, params=split.hierarchy)
     return cut(pieces, tree, granularity=split.granularity), tree
 
 

@@ -35,7 +35,7 @@ def tree(tallies: list[Tally], labels: int, **changes) -> Hierarchy:
     )
     sizes, intrinsics = np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]])
     cameras = Cameras(("a",), sizes, intrinsics, np.eye(4)[None], True)
-    return hierarchy(cloud, cameras, given, tallies, params=HierarchyParams(**{"prior": 0.0, **changes}))
+    return hierarchy(cloud, cameras, [], given, tallies, params=HierarchyParams(**{"prior": 0.0, **changes}))
 
 
 def unions(found: Hierarchy) -> dict[frozenset[int], float]:
@@ -158,7 +158,7 @@ def agreement_beside(neighbour: float, alone: float = 0.3) -> float:
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.02)
     views = [tally([({1, 2}, 0.9)], {1, 2, 3}), tally([({1}, 0.9), ({2}, 0.9)], {1, 2, 3})]
     stuff = StuffParams(extent=1.0)  # nothing is
-    found = hierarchy(cloud, cameras, given, views, params=HierarchyParams(prior=0.0, alone=alone, stuff=stuff))
+    found = hierarchy(cloud, cameras, [], given, views, params=HierarchyParams(prior=0.0, alone=alone, stuff=stuff))
     return dict(zip(found.node.tolist(), found.agreement.tolist(), strict=True))[4]
 
 

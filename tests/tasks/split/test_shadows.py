@@ -165,7 +165,7 @@ def tree(agreement: float) -> Hierarchy:
     nothing = np.zeros(0, np.int32)
     labels = PointLabels(label, np.ones(len(label)), 4, nothing, nothing, nothing, np.zeros(0))
     return hierarchy(
-        cloud, cameras, labels, [], params=HierarchyParams(shadows=ShadowParams(agreement=agreement, repeats=1))
+        cloud, cameras, [], labels, [], params=HierarchyParams(shadows=ShadowParams(agreement=agreement, repeats=1))
     )
 
 

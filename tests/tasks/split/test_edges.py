@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally, Visibility
+from ss_flow.tasks.geometry.cameras import looking
+from ss_flow.tasks.split.edges import convex_edges
+from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
+
+SIDE = 24
+"""Points along a face."""
+TOP, FRONT, GROUND = 1, 2, 3
+
+
+def face(origin, along, up) -> np.ndarray:
+    """SIDE x SIDE points, one unit apart, of a square face."""
+    i, j = np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij")
+    return np.array(origin) + i.reshape(-1, 1) * np.array(along) + j.reshape(-1, 1) * np.array(up)
+
+
+def scene():
+    """A box's top and front, and the ground before it, from above; nothing of them is hidden."""
+    faces = [
+        face((0, 0, SIDE), (1, 0, 0), (0, 1, 0)),
+        face((0, 0, 0.5), (1, 0, 0), (0, 0, 1)),
+        face((0, -0.5, 0), (1, 0, 0), (0, -1, 0)),
+    ]
+    places = np.concatenate(faces).astype(np.float32)
+    places += np.random.default_rng(0).normal(scale=0.05, size=places.shape).astype(np.float32)
+    label = np.repeat(np.array([TOP, FRONT, GROUND], np.int32), SIDE**2)
+    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 1.0)
+    pose = looking(np.array([12.0, -60, 80]), np.array([0.0, 70, -75]), np.array([0.0, 0, 1]))
+    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
+    every = np.arange(len(places), dtype=np.int32)
+    view = Visibility("a", every, np.zeros_like(every), np.ones(len(every), np.float32), 8, 8)
+    return cloud, cameras, view, label
+
+
+def edges(cloud, cameras, view, label):
+    return convex_edges(cloud, cameras, [view], label, borders(label, cloud, TouchingParams()))
+
+
+def test_faces_of_a_box_meet_in_a_convex_edge_and_the_ground_before_it_in_a_hollow():
+    assert np.argwhere(np.triu(edges(*scene()))).tolist() == [[TOP - 1, FRONT - 1]]
+
+
+def test_from_inside_of_a_box_its_faces_meet_in_a_hollow():
+    cloud, _, view, label = scene()
+    inside = np.array([12.0, 12, 12])
+    pose = looking(inside, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
+    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
+    assert not edges(cloud, cameras, view, label)[TOP - 1, FRONT - 1]
+
+
+def test_halves_of_one_face_meet_in_no_edge():
+    cloud, cameras, view, label = scene()
+    halves = np.where((label == TOP) & (cloud.points[:, 0] > SIDE / 2), 4, label)
+    assert not edges(cloud, cameras, view, halves)[TOP - 1, 3]
+
+
+@pytest.mark.parametrize(
+    ("together", "apart", "agreement"), [(2, 1, 0.8), (1, 2, None), (0, 0, None)], ids=["shown", "denied", "unseen"]
+)
+def test_faces_are_one_unless_the_views_deny_it(together, apart, agreement):
+    # The masks that hold both hold much else, so that alone they show nothing.
+    cloud, cameras, view, label = scene()
+    nothing = np.zeros(0, np.int32)
+    labels = PointLabels(label, np.ones(len(label), np.float32), 3, nothing, nothing, nothing, np.zeros(0, np.float32))
+    seen = np.full(3, SIDE**2, np.int32)
+    views = [[[1, 1, 1]]] * together + [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]] * apart
+    tallies = [
+        Tally(
+            "a",
+            np.arange(1, 4, dtype=np.int32),
+            seen - number,
+            np.array(masks, np.int32) * (seen - number),
+            np.zeros((3, 3), np.int32),
+            np.full(len(masks), 0.5 if len(masks) == 1 else 0.95, np.float32),
+        )
+        for number, masks in enumerate(views)
+    ]
+
+    def found(**changes):
+        tree = hierarchy(cloud, cameras, [view], labels, tallies, params=HierarchyParams(**changes))
+        rows = zip(tree.node, tree.agreement, strict=True)
+        return {tuple(tree.node[tree.parent == node].tolist()): share for node, share in rows}
+
+    assert found(convex=0.8).get((TOP, FRONT)) == (None if agreement is None else pytest.approx(agreement))
+    assert (TOP, FRONT) not in found(convex=0.0)
