@@ -17,6 +17,7 @@ from ss_flow.flows.generated.layout import COLORS, HALF_WIDTH, Thing
 from ss_flow.flows.generated.prints import LIFT, lines_of_text, rectangle, sheet
 from ss_flow.flows.generated.render import Renderer
 from ss_flow.flows.generated.room import Room, RoomParams, furnished_room, looking_at, photographed
+from ss_flow.flows.generated.sensor import noisy, with_holes
 from ss_flow.flows.generated.shapes import can, vase
 from ss_flow.tasks.artifacts import Float32, Float64
 from ss_flow.tasks.geometry.cameras import camera_of
@@ -26,12 +27,6 @@ _FOCAL_RATIO = 526 / 585
 """Focal length of the depth over that of the photos, as of a sensor's two lenses taken for one."""
 _NOISE = 0.0025
 """Standard deviation of the depth, as a share of it."""
-_CORRELATED = 1.5
-"""Pixels over which its noise is correlated."""
-_STEP = 0.04
-"""Change of depth within three pixels, as a share of it, that is an edge."""
-_LOST = 0.6, 0.015
-"""Share of the pixels without depth: at edges, and elsewhere."""
 _LATTICE = 9
 """Every so many rows and columns are without depth, as a warped depth map leaves them."""
 
@@ -109,13 +104,7 @@ def _poses(views: int, rng: np.random.Generator) -> Float64:
 
 def _as_measured(depth: Float32, rng: np.random.Generator) -> Float32:
     """What a sensor measures of a depth map [H, W]; 0 where nothing."""
-    from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
-
-    noise = gaussian_filter(rng.normal(size=depth.shape), _CORRELATED)
-    measured = depth * (1 + _NOISE * noise / noise.std())
-    edge = maximum_filter(depth, 3) - minimum_filter(depth, 3) > _STEP * depth
-    measured[edge & (rng.random(depth.shape) < _LOST[0])] = 0
-    measured[rng.random(depth.shape) < _LOST[1]] = 0
+    measured = with_holes(noisy(depth, _NOISE, rng), depth, rng)
     measured[4::_LATTICE] = 0
     measured[:, 4::_LATTICE] = 0
     return measured.astype(np.float32)

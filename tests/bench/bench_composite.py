@@ -1,14 +1,15 @@
 """How many things are exactly one instance: Split with a segmenter's masks on generated rooms of composite things.
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
-                                          [--gripper | --desk] [--store DIR] [--look DIR]
+                                          [--gripper | --sensor | --desk] [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
 whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
 a tenth), mIoU, PQ, over- and under-segmentation, in per cent; the predicted ids, the true things, seconds. Then for
 each thing its best IoU, and of how many predicted ids each covers more than a tenth of it. With --store, rooms and
 results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
-shades) and prediction of some views. With --desk, of small things on a table, in few near views of a depth sensor.
+shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
+of small things on a table, in few near views of a depth sensor.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from ss_flow.flows import settings
 from ss_flow.flows.cli.context import file_digests
 from ss_flow.flows.cli.prepare import RunOptions, prepare
 from ss_flow.flows.generated import RoomParams, generate, generate_desk, write_scene
+from ss_flow.flows.generated.sensor import structured_light
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import Frame, LabelMap
 from ss_flow.tasks.capture.scene import open_scene
@@ -56,11 +58,15 @@ class Outcome:
     seconds: float
 
 
-def folder_of(room: RoomParams, place: Path) -> Path:
-    """The capture of a room; it is written first where it is not there."""
-    folder = place / f"composite-{room.seed}{'-gripper' * room.gripper}"
+def folder_of(room: RoomParams, place: Path, sensor: bool = False) -> Path:
+    """The capture of a room; it is written first where it is not there. sensor: with the depth of a depth camera."""
+    folder = place / f"composite-{room.seed}{'-gripper' * room.gripper}{'-sensor' * sensor}"
     if not folder.exists():
-        write_scene(generate(room), folder)
+        made = generate(room)
+        if sensor:
+            rng = np.random.default_rng(room.seed)
+            made = replace(made, depth=np.stack([structured_light(depth, rng) for depth in made.depth]))
+        write_scene(made, folder)
     return folder
 
 
@@ -123,6 +129,7 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[])
     scene = parser.add_mutually_exclusive_group()
     scene.add_argument("--gripper", action="store_true", help="with a gripper before the lens")
+    scene.add_argument("--sensor", action="store_true", help="with the depth of a depth camera")
     scene.add_argument("--desk", action="store_true", help="desks instead of rooms")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
@@ -131,7 +138,7 @@ def main() -> None:
     with nullcontext(args.store) if args.store else tempfile.TemporaryDirectory() as kept:
         for seed in args.seeds:
             room = replace(ROOM, seed=seed, gripper=args.gripper)
-            folder = desk_of(seed, Path(kept)) if args.desk else folder_of(room, Path(kept))
+            folder = desk_of(seed, Path(kept)) if args.desk else folder_of(room, Path(kept), args.sensor)
             found = outcome(folder, params, Store(Path(kept)))
             values = evaluate_masks(found.predicted, found.truth).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]
