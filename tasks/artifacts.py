@@ -224,6 +224,8 @@ class PointCloud:
     """The length, in world units, that plays the part of one metre in an average room (1.0 when metric)."""
     spacing: float
     """Median distance to the nearest neighbour, in world units."""
+    noise: float = 0.0
+    """Standard deviation of the views' depth from the points, as a share of the depth."""
 
 
 @dataclass(frozen=True)

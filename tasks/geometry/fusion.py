@@ -11,6 +11,12 @@ from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
+_MEDIAN_OF_NORMAL = 0.6745
+"""Median of the absolute value of a normal variable of standard deviation 1."""
+_SAMPLE = 20_000
+"""So many points tell how noisy the depth is."""
+_ELSEWHERE = 0.05
+"""Share of the depth from which on a view sees another surface than the point's."""
 _CELLS = 1 << 21
 """Voxels a side that fit the 63-bit code of a voxel; farther points wrap around, which needs 40 km at 2 cm."""
 
@@ -89,6 +95,21 @@ def consistent_points(
         seen[rows] += known & (measured > z - tolerance)
         confirmed[rows] += known & (np.abs(measured - z) < tolerance)
     return confirmed >= np.clip(seen, 1, min_views)
+
+
+def depth_noise(points: Float64, cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
+    """Standard deviation of the views' depth from the points [N, 3] that they see, as a share of the depth, by its
+    median; 0.0 where no view sees any. It is that of a sensor, of poses and of calibration together."""
+    some = points[:: max(1, len(points) // _SAMPLE)]
+    differences = []
+    for view, depth in enumerate(depths):
+        camera = camera_of(cameras, view)
+        _, column, row, z = pixels_in_view(some, camera)
+        measured = depth_at(depth, column, row, camera.width, camera.height)
+        difference = np.abs(measured - z) / z
+        differences.append(difference[(measured > 0) & (difference < _ELSEWHERE)])
+    found = np.concatenate(differences)
+    return float(np.median(found) / _MEDIAN_OF_NORMAL) if len(found) else 0.0
 
 
 def with_sparse_points(cameras: Cameras, depths: tuple[DepthMap, ...]) -> tuple[DepthMap, ...]:

@@ -21,14 +21,19 @@ class VisibilityParams:
     share_of_depth: NonNegative = 0.25
     """Share of the depth that counts as the scene unit where it is more than one, since sensors and comparisons of
     photos err by a share of what they measure; 0 in `paper`."""
+    deviations: NonNegative = 2.0
+    """How far a point may lie from the view's depth, in standard deviations of the depth, where that is more; 0 in
+    `paper`."""
 
-    def tolerance(self, depth: Float32 | Float64, unit: float) -> Float32 | Float64:
-        """How far two depths of one surface may differ, world units; unit: length of a scene unit in these."""
-        return np.maximum(self.tau_depth * unit, self.tau_depth * self.share_of_depth * depth)
+    def tolerance(self, depth: Float32 | Float64, unit: float, noise: float = 0.0) -> Float32 | Float64:
+        """How far two depths of one surface may differ, world units; unit: length of a scene unit in these; noise:
+        standard deviation of the depth, as a share of it."""
+        share = max(self.tau_depth * self.share_of_depth, self.deviations * noise)
+        return np.maximum(self.tau_depth * unit, share * depth)
 
 
 def surface_points(
-    points: Float32, camera: Camera, depth: DepthMap, params: VisibilityParams, unit: float
+    points: Float32, camera: Camera, depth: DepthMap, params: VisibilityParams, unit: float, noise: float = 0.0
 ) -> tuple[Int32, Int32, Int32, Float64]:
     """The points that a view sees: rows of `points`, pixel columns, pixel rows, and z-depths (Eq. 1-2; spec S3).
 
@@ -36,9 +41,10 @@ def surface_points(
     differs from the point's own by less than the tolerance (Eq. 2). Where depth is unknown (0) no point counts (spec
     A39). Several points may share a pixel.
 
-    points: [N, 3] world. depth: the view's. unit: length of a scene unit, world units.
+    points: [N, 3] world. depth: the view's. unit: length of a scene unit, world units. noise: standard deviation of
+    the depth, as a share of it.
     """
     rows, column, row, z = pixels_in_view(points, camera)
     measured = depth_at(depth, column, row, camera.width, camera.height)
-    seen = (measured > 0) & (np.abs(measured - z) < params.tolerance(z, unit))
+    seen = (measured > 0) & (np.abs(measured - z) < params.tolerance(z, unit, noise))
     return rows[seen], column[seen], row[seen], z[seen]

@@ -12,7 +12,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, PointCloud, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
-from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, sum_by_voxel
+from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_noise, sum_by_voxel
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 from ss_flow.tasks.ranges import Count, NonNegative, Positive
 
@@ -89,7 +89,7 @@ def consistent_cloud(
         cloud = sum_by_voxel([cloud.take(kept)], voxel)
     points = means[kept].astype(np.float32)
     rounded = np.rint(colors[kept]).astype(np.uint8)
-    return PointCloud(points=points, colors=rounded, unit=unit.length, spacing=nearest_spacing(points))
+    return PointCloud(points, rounded, unit.length, nearest_spacing(points), depth_noise(means[kept], cameras, depths))
 
 
 def voxel_side(cameras: Cameras, depths: tuple[DepthMap, ...], unit: SceneUnit, params: DenseParams) -> float:

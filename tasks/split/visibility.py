@@ -16,7 +16,7 @@ def visibility(points: PointCloud, camera: Camera, depth: DepthMap, *, params: V
 
     camera, depth: of this view.
     """
-    rows, column, row, z = surface_points(points.points, camera, depth, params, points.unit)
+    rows, column, row, z = surface_points(points.points, camera, depth, params, points.unit, points.noise)
     return Visibility(
         name=depth.name,
         point_index=rows,

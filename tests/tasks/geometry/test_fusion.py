@@ -1,9 +1,10 @@
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap
-from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_at, sum_by_voxel
+from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_at, depth_noise, sum_by_voxel
 
 
 def samples(points, color=0.0):
@@ -68,3 +69,17 @@ def test_a_point_that_no_view_confirms_is_dropped():
     cameras, depths = four_equal_views([0.0])
     kept = consistent_points(np.array([[0.0, 0, 3.0]]), cameras, depths, tau=0.02, tau_relative=0, min_views=2)
     assert kept.tolist() == [False]
+
+
+def test_the_noise_of_depth_is_a_share_of_it_and_leaves_out_other_surfaces_and_unknown_depth():
+    cameras, _ = four_equal_views([2.0, 2.0])
+    rng = np.random.default_rng(0)
+    pixel = np.arange(10) + 0.5
+    points = np.stack([*np.meshgrid((pixel - 5) / 5, (pixel - 5) / 5), np.full((10, 10), 2.0)], axis=-1).reshape(-1, 3)
+    noisy = [(2 + rng.normal(0, 0.02, (10, 10))).astype(np.float32) for _ in range(2)]
+    noisy[0][:3], noisy[1][:2] = 1.5, 0  # something before the wall; nothing measured
+    depths = tuple(DepthMap("x", depth, "sensor") for depth in noisy)
+    assert depth_noise(points, cameras, depths) == pytest.approx(0.01, rel=0.2)
+    exact = tuple(DepthMap("x", np.full((10, 10), 2, np.float32), "sensor") for _ in range(2))
+    assert depth_noise(points, cameras, exact) == pytest.approx(0, abs=1e-6)
+    assert depth_noise(points[:0], cameras, exact) == 0
