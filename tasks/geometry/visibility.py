@@ -21,15 +21,15 @@ class VisibilityParams:
     share_of_depth: NonNegative = 0.25
     """Share of the depth that counts as the scene unit where it is more than one, since sensors and comparisons of
     photos err by a share of what they measure; 0 in `paper`."""
-    deviations: NonNegative = 2.0
-    """How far a point may lie from the view's depth, in standard deviations of the depth, where that is more; 0 in
-    `paper`."""
+    deviations: NonNegative = 100.0
+    """Standard deviations of the depth that count as the scene unit where they are more than it: at a tau_depth of 0.02
+    a point may lie two of them away; 0 in `paper`."""
 
     def tolerance(self, depth: Float32 | Float64, unit: float, noise: float = 0.0) -> Float32 | Float64:
         """How far two depths of one surface may differ, world units; unit: length of a scene unit in these; noise:
         standard deviation of the depth, as a share of it."""
-        share = max(self.tau_depth * self.share_of_depth, self.deviations * noise)
-        return np.maximum(self.tau_depth * unit, share * depth)
+        share = max(self.share_of_depth, self.deviations * noise)
+        return np.maximum(self.tau_depth * unit, self.tau_depth * share * depth)
 
 
 def surface_points(

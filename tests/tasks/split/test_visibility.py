@@ -51,7 +51,7 @@ def test_unknown_depth_shows_nothing_even_close_to_the_camera():
 def test_the_tolerance_grows_with_the_noise_of_the_depth():
     cameras, depth = one_camera(10.0)
     points = cloud([[0, 0, 10.25]])
-    params = VisibilityParams(0.02, 0, deviations=3)
+    params = VisibilityParams(0.02, 0, deviations=150)
     for noise, seen in ((0.0, 0), (0.008, 0), (0.009, 1)):
         noisy = replace(points, noise=noise)
         assert len(visibility(noisy, camera_of(cameras, 0), depth, params=params).pixel) == seen
