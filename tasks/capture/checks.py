@@ -88,8 +88,11 @@ def checks(
     error, likeness, gains = np.full(len(frames), np.nan), np.full(len(frames), np.nan), []
     now: dict[int, list[float]] = {}
     for (row, other), errors in zip(pairs, near, strict=True):
-        if np.isfinite(errors[_NOW]):
-            now.setdefault(row, []).append(errors[_NOW])
+        # A wrong pose differs both ways. One way alone, as where a view has no depth of what stands close before it and
+        # its neighbour has, something hides the rest.
+        differs = np.fmin(errors[_NOW], _errors(views[other], views[row], np.ones(1))[0])
+        if np.isfinite(differs):
+            now.setdefault(row, []).append(differs)
             error[row] = np.median(now[row])
         alike = _alike(views[row], views[other], scale)
         if alike is not None:

@@ -72,6 +72,31 @@ def test_a_single_wrong_pose_is_named(room: Room) -> None:
     assert int(np.nanargmax(found.depth_error)) in (4, 5, 6)
 
 
+def test_a_view_too_close_for_the_sensor_is_not_taken_for_a_wrong_pose(room: Room) -> None:
+    """A board before a wall. The last view is so close to the board that it has depth of the wall alone, which the
+    board hides from the other views."""
+    centers = np.array([*([x, 0.0, 0.0] for x in np.linspace(-0.8, -0.2, 7)), [0.55, 0.0, 1.2]])
+    w, h, focal = 96, 72, 48.0
+    ray = np.stack(np.meshgrid((np.arange(w) + 0.5 - w / 2) / focal, (np.arange(h) + 0.5 - h / 2) / focal), -1)
+    depth, rgb = np.zeros((8, h, w), np.float32), np.zeros((8, h, w, 3), np.uint8)
+    for view, (x, _, z) in enumerate(centers):
+        on_board = np.abs(x + (1.5 - z) * ray[..., 0]) < 0.5
+        depth[view] = np.where(on_board, 1.5, 3.0) - z
+        place = (depth[view][..., None] * ray + [x, 0]) @ [5.0, 3.0]
+        rgb[view] = (128 + 80 * np.sin(place) * np.where(on_board, 1, 0.5))[..., None]
+    depth[depth < 0.5] = 0
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, :3, 3] = -centers
+    names, sizes = tuple(f"{view:04d}" for view in range(8)), np.tile(np.int32([w, h]), (8, 1))
+    cameras = Cameras(names, sizes, np.tile([focal, focal, w / 2, h / 2], (8, 1)), poses, metric=True)
+    heard, found = _checked(room, rgb, depth, cameras)
+    assert heard == [] and found.depth_error[-1] < 0.01
+    wrong = poses.copy()
+    wrong[-1, 2, 3] += 0.1
+    heard, _ = _checked(room, rgb, depth, replace(cameras, world_to_camera=wrong))
+    assert any("do not fit their depth" in said and "0007" in said for said in heard)
+
+
 @pytest.mark.parametrize("factor", [0.75, 1.3, 0.2, 5, 0.1, 0.3048, 1000])
 def test_depth_of_a_wrong_scale_is_told_with_the_right_one(room: Room, factor: float) -> None:
     (said,), found = _checked(room, depth=room.depth * np.float32(factor))
