@@ -1,9 +1,9 @@
 """Where Split loses an object, stage by stage: from what the segmenter could show to the masks of the instances.
 
-    python tests/bench/bench_stages.py CAPTURE [--labels FOLDER] [--preset default] [--set STEP.PARAM=VALUE]
+    python tests/bench/bench_stages.py CAPTURE [--labels PATH] [--preset default] [--set STEP.PARAM=VALUE]
                                        [--store DIR] [--every N] [--ask]
 
-Prints for each object of the labels (files as bench_masks.py takes them) the best IoU, in per cent
+Prints for each object of the labels (as bench_masks.py takes them) the best IoU, in per cent
 
 - asked (with --ask): of the segmenter's answer to a box round the object and five points on it, both placed by the
   labels: what it can show at all;
@@ -13,7 +13,9 @@ Prints for each object of the labels (files as bench_masks.py takes them) the be
 - cut: of an instance;
 - Split: of an instance's mask in the view;
 
-and the agreement of that node (1 for a leaf), which the cut compares with `split.granularity`. Asked, raw and Split are
+the agreement of that node (1 for a leaf), which the cut compares with `split.granularity`, and, over the labelled views
+of the object together, its best IoU after Split, how many ids cover more than a tenth of it, whether it is whole (IoU
+of at least 0.5, one such id), and which other objects that id holds most of. Asked, raw and Split are
 means over the labelled views, every N-th of them. Leaves, tree and cut are of dense points, whose true object is what
 most labelled views show them on; they tell about grouping, and are not to be compared with the others digit by digit.
 """
@@ -21,14 +23,17 @@ most labelled views show them on; they tell about grouping, and are not to be co
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from bench_masks import best_iou
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from outlines import read_outlines
 
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
@@ -38,6 +43,8 @@ from ss_flow.flows.cli.prepare import RunOptions, prepare
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import Bool, Float64, Frame, Hierarchy, Int32, LabelMap, MaskSet, PointLabels, Visibility
 from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.evaluate.contingency import contingency
+from ss_flow.tasks.evaluate.panoptic import pieces, whole
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.masks.overlap import iou
@@ -75,15 +82,6 @@ def outcome(folder: Path, params: Params, store: Store) -> Outcome:
     values = run_flow(build, store, scene=prepared.name, header={}).values
     read = {name: store.get(v) if isinstance(v, str) else [store.get(one) for one in v] for name, v in values.items()}
     return Outcome(**read)
-
-
-def truth_of(frame: Frame, labels: Path) -> Int32 | None:
-    """The labels of a view at the size of its frame [H, W], None where it has none."""
-    file = labels / f"{frame.name}.png"
-    if not file.exists():
-        return None
-    ids = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    return cv2.resize(ids, (frame.width, frame.height), interpolation=cv2.INTER_NEAREST).astype(np.int32)
 
 
 def asked(sam: Sam, frame: Frame, objects: list[Bool]) -> Iterator[float]:
@@ -144,6 +142,24 @@ def grouping(found: Outcome, true: Int32) -> dict[int, list[float]]:
     return table
 
 
+def instances(found: Outcome, truths: list[Int32 | None]) -> dict[int, tuple[float, int, bool, list[int]]]:
+    """For each object, of all pixels of the views that show it: the best IoU of an instance, how many cover more than a
+    tenth of it, whether it is whole, and the other objects that the best instance holds more than half of."""
+    table = {}
+    for name in sorted({i for truth in truths if truth is not None for i in np.unique(truth[truth > 0]).tolist()}):
+        views = [
+            (t, m.ids) for t, m in zip(truths, found.masks_split, strict=True) if t is not None and (t == name).any()
+        ]
+        counts = contingency(*(np.concatenate([pair[side].ravel() for pair in views]) for side in (0, 1)))
+        counts = counts.without(truth=0, predicted=0)
+        row = counts.truth_ids.tolist().index(name)
+        best = int(counts.iou[row].argmax())
+        held = counts.intersection[:, best] > counts.truth_area / 2
+        others = [int(i) for i in counts.truth_ids[held] if i != name]
+        table[name] = float(counts.iou[row, best]), int(pieces(counts)[row]), bool(whole(counts)[row]), others
+    return table
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
@@ -154,11 +170,13 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="count every N-th labelled view")
     parser.add_argument("--ask", action="store_true", help="ask the segmenter for the labels' objects, too")
     args = parser.parse_args()
+    outlines = read_outlines(args.labels or args.capture / "instance")
     params = settings.apply(settings.preset(Params(), args.preset), args.set)
     with tempfile.TemporaryDirectory() as temporary:
         found = outcome(args.capture, params, Store(args.store or Path(temporary)))
-    truths = [truth_of(frame, args.labels or args.capture / "instance") for frame in found.ingest]
+    truths = [outlines.at_size(frame.name, frame.height, frame.width) for frame in found.ingest]
     labelled = [row for row, truth in enumerate(truths) if truth is not None][:: args.every]
+    kept = [truth if row in labelled else None for row, truth in enumerate(truths)]
     model = find(available("segmenter")[0].name) if args.ask else None
     sam = Sam(model) if model is not None else None
     by_view: dict[int, list[list[float]]] = {}
@@ -171,11 +189,22 @@ def main() -> None:
         for name, mask, answer in zip(names, objects, answers, strict=True):
             pool, split = best_iou(found.segment[row], mask), best_iou(found.masks_split[row], mask)
             by_view.setdefault(name, []).append([answer, pool, split])
-    print("| object | views | asked | raw | leaves | tree | cut | Split | agreement |\n" + "|---" * 9 + "|")
-    for name, (leaves, node, instance, agreement) in grouping(found, true_objects(found, truths)).items():
+    columns = "object | views | asked | raw | leaves | tree | cut | Split | agreement | all views | ids | whole | with"
+    print(f"| {columns} |\n" + "|---" * (columns.count("|") + 1) + "|")
+    grouped, taken = grouping(found, true_objects(found, truths)), instances(found, kept)
+    nothing = [0.0, 0.0, 0.0, 0.0]  # no dense point lies on it
+    for name, (pooled, ids, one, others) in taken.items():
+        leaves, node, instance, agreement = grouped.get(name, nothing)
         answer, raw, split = 100 * np.mean(by_view[name], axis=0)
         cells = [answer, raw, 100 * leaves, 100 * node, 100 * instance, split]
-        print(f"| {name} | {len(by_view[name])} | {' | '.join(f'{cell:.1f}' for cell in cells)} | {agreement:.2f} |")
+        print(
+            f"| {outlines.names[name]} | {len(by_view[name])} | {' | '.join(f'{cell:.1f}' for cell in cells)} "
+            f"| {agreement:.2f} | {100 * pooled:.1f} | {ids} | {'whole' if one else ''} "
+            f"| {', '.join(outlines.names[other] for other in others)} |"
+        )
+    share = 100 * np.mean([one for _, _, one, _ in taken.values()])
+    mean = 100 * np.mean([pooled for pooled, _, _, _ in taken.values()])
+    print(f"\nOf {len(taken)} objects {share:.1f} % whole, mean IoU over all views {mean:.1f}")
 
 
 if __name__ == "__main__":
