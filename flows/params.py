@@ -19,7 +19,7 @@ from ss_flow.tasks.capture.registration import RegistrationParams
 from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.capture.stereo import StereoParams
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.ranges import Count, Fraction
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.semantics.dense_describe import DenseDescribeParams
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams
@@ -94,6 +94,9 @@ class SplitParams:
     dense: DenseParams = field(default_factory=DenseParams)
     splatting: DenseSplattingParams = field(default_factory=DenseSplattingParams)
     visibility: VisibilityParams = field(default_factory=VisibilityParams)
+    visible_color: NonNegative = 8.0
+    """Where a view has no depth, it sees the points in front whose colour its photo shows: this is how far they may be
+    apart, in CIELAB. 0 = it sees none there."""
     observe: ObserveParams = field(default_factory=ObserveParams)
     propagate: PropagateParams = field(default_factory=PropagateParams)
     parts: PartsParams = field(default_factory=PartsParams)

@@ -39,6 +39,7 @@ from ss_flow.tasks.split.segment import segment
 from ss_flow.tasks.split.segment_rgbd import segment_rgbd
 from ss_flow.tasks.split.tally import tally
 from ss_flow.tasks.split.visibility import visibility
+from ss_flow.tasks.split.visible_by_color import visible_by_color
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,17 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         names=capture.names,
         build=lambda camera, depth: visibility(points, camera, depth, params=params.visibility),
     )
+    if params.visible_color:
+        seen = each(
+            capture.by_view,
+            capture.presumed,
+            capture.frames,
+            seen,
+            names=capture.names,
+            build=lambda camera, depth, frame, visible: visible_by_color(
+                points, camera, depth, frame, visible, color=params.visible_color
+            ),
+        )
     hinted: PointLabels | None = None
     if capture.masks is not None:
         masks = capture.masks
