@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TypeVar
+
 import numpy as np
 
+from ss_flow.flows.generated.room import Views
 from ss_flow.tasks.artifacts import Float32, Float64
+
+V = TypeVar("V", bound=Views)
 
 _CORRELATED = 1.5
 """Pixels over which noise is correlated."""
@@ -46,3 +52,9 @@ def structured_light(depth: Float32, rng: np.random.Generator) -> Float32:
     measured = with_holes(1 / np.maximum(inverse, _DISPARITY), depth, rng)
     in_range = (depth >= _RANGE[0]) & (depth <= _RANGE[1])
     return np.where(in_range, measured, 0).astype(np.float32)
+
+
+def sensed(views: V, seed: int) -> V:
+    """The views, of a room whose depth is exact, with what such a camera measures of it in place of that."""
+    rng = np.random.default_rng(seed)
+    return replace(views, depth=np.stack([structured_light(depth, rng) for depth in views.depth]))

@@ -33,7 +33,7 @@ from ss_flow.flows import settings
 from ss_flow.flows.cli.context import file_digests
 from ss_flow.flows.cli.prepare import RunOptions, prepare
 from ss_flow.flows.generated import RoomParams, generate, generate_desk, write_scene
-from ss_flow.flows.generated.sensor import structured_light
+from ss_flow.flows.generated.sensor import sensed
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import Frame, LabelMap
 from ss_flow.tasks.capture.scene import open_scene
@@ -63,10 +63,7 @@ def folder_of(room: RoomParams, place: Path, sensor: bool = False) -> Path:
     folder = place / f"composite-{room.seed}{'-gripper' * room.gripper}{'-sensor' * sensor}"
     if not folder.exists():
         made = generate(room)
-        if sensor:
-            rng = np.random.default_rng(room.seed)
-            made = replace(made, depth=np.stack([structured_light(depth, rng) for depth in made.depth]))
-        write_scene(made, folder)
+        write_scene(sensed(made, room.seed) if sensor else made, folder)
     return folder
 
 

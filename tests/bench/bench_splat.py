@@ -3,9 +3,10 @@ object.
 
     python tests/bench/bench_splat.py room:10 room:50 CAPTURE [--presets default fast paper] [--set STEP.PARAM=VALUE]
                                       [--jobs 1 2] [--masks degraded] [--plain steps photos] [--seed 0] [--look DIR]
-                                      [--store DIR]
+                                      [--store DIR] [--sensor]
 
-room:N is a generated room of N objects, with degraded masks if not told otherwise. A line for each scene, preset and
+room:N is a generated room of N objects, with degraded masks if not told otherwise, composite one of things of several
+parts; with --sensor, their depth is that of a camera as the first Kinect. A line for each scene, preset and
 number of jobs: held-out PSNR and SSIM; mIoU of the masks after Split, after refinement, and as the merged scene renders
 them; dark fringes, floaters and what taking an object away changes elsewhere (mean over objects, and worst); seconds,
 and instances a minute. --plain trains plain 3DGS from the same points to the same number of Gaussians: for as many
@@ -37,6 +38,7 @@ from ss_flow.flows.capture import capture
 from ss_flow.flows.cli.context import file_digests
 from ss_flow.flows.cli.prepare import RunOptions, prepare
 from ss_flow.flows.generated import RoomParams, generate, write_scene
+from ss_flow.flows.generated.sensor import sensed
 from ss_flow.flows.params import Params
 from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef
@@ -78,16 +80,27 @@ class Outcome:
     splat_seconds: float
 
 
-def folder_of(scene: str, seed: int, masks: Masks, place: Path) -> Path:
-    """The capture that is meant; a room is written first."""
+def room_of(scene: str, seed: int) -> RoomParams | None:
+    """The room that is meant: room:N of N objects, or the one of composite things; None of a capture."""
+    if scene == "composite":
+        return RoomParams(composite=True, views=24, width=480, height=360, seed=seed)
     if not scene.startswith("room:"):
-        return Path(scene)
+        return None
     objects = int(scene.removeprefix("room:"))
     views, width, height = SIZES[objects]
-    folder = place / f"room-{objects}-{seed}-{masks}"
+    return RoomParams(objects=objects, views=views, width=width, height=height, seed=seed)
+
+
+def folder_of(scene: str, seed: int, masks: Masks, place: Path, sensor: bool = False) -> Path:
+    """The capture that is meant; a room is written first. sensor: with the depth of a depth camera."""
+    room = room_of(scene, seed)
+    if room is None:
+        return Path(scene)
+    folder = place / f"{scene.replace(':', '-')}-{seed}-{masks}{'-sensor' * sensor}"
     if not folder.exists():
-        room = generate(RoomParams(objects=objects, views=views, width=width, height=height, seed=seed))
-        write_scene(room, folder, masks=None if masks == "none" else masks, seed=seed)
+        made = generate(room)
+        given = None if masks == "none" else masks
+        write_scene(sensed(made, seed) if sensor else made, folder, masks=given, seed=seed)
     return folder
 
 
@@ -282,6 +295,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, nargs="+", default=[2])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--masks", choices=get_args(Masks), default="degraded", help="of rooms; none: a segmenter's")
+    parser.add_argument("--sensor", action="store_true", help="rooms with the depth of a depth camera")
     parser.add_argument("--plain", nargs="*", choices=["steps", "photos"], default=[])
     parser.add_argument("--objects", action="store_true", help="a line for every object")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
@@ -293,7 +307,7 @@ def main() -> None:
     print("|---" * 20 + "|")
     with tempfile.TemporaryDirectory() as temporary:
         for scene in args.scenes:
-            folder = folder_of(scene, args.seed, args.masks, Path(args.store or temporary))
+            folder = folder_of(scene, args.seed, args.masks, Path(args.store or temporary), args.sensor)
             for preset in args.presets:
                 for jobs in args.jobs:
                     with tempfile.TemporaryDirectory() as own:

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
-from ss_flow.flows.generated.sensor import structured_light
+from ss_flow.flows.generated.room import Views
+from ss_flow.flows.generated.sensor import sensed, structured_light
+from ss_flow.tasks.artifacts import Cameras
 
 
 def measured(distance, size=(120, 160)):
@@ -27,3 +29,15 @@ def test_depth_out_of_range_at_edges_and_here_and_there_is_unknown():
     depth[:, 20:] = 3.0
     found = structured_light(depth, np.random.default_rng(0))
     assert (found[:, 19:21] == 0).mean() > 0.4 > 0.1 > (found[:, :18] == 0).mean()
+
+
+def test_each_view_is_measured_with_noise_of_its_own_and_nothing_else_of_it_changes():
+    nothing = np.zeros(0)
+    cameras = Cameras(("0", "1"), nothing, nothing, nothing, metric=True)
+    depth = np.full((2, 40, 40), 2.0, np.float32)
+    views = Views(nothing, depth, nothing, nothing, nothing, cameras)
+    found = sensed(views, 3)
+    assert not np.array_equal(*found.depth)
+    np.testing.assert_array_equal(found.depth, sensed(views, 3).depth)
+    assert (found.depth != sensed(views, 4).depth).any()
+    assert found.cameras is cameras and found.rgb is nothing and (views.depth == 2).all()
