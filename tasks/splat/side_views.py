@@ -6,6 +6,7 @@ import functools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int64, LabelMap
 from ss_flow.tasks.gaussians.initialise import neighbour_spread
@@ -13,6 +14,7 @@ from ss_flow.tasks.gaussians.objective import Target
 from ss_flow.tasks.gaussians.trainer import PartView
 from ss_flow.tasks.gaussians.views import SceneViews, sample_depth
 from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, surface_of_pixels
+from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.geometry.sampling import cube_of_each, sphere
 
 FEWEST = 20
@@ -31,6 +33,11 @@ SURFACE_PIXELS = 2_000_000
 """Pixels of all views together whose surface points are looked at."""
 LEAST_KNOWN = 0.9
 """Share of an instance's pixels whose depth is known from which its surface is."""
+LEAST_NEARBY = 0.95
+"""The same share where depth that is known nearby counts too."""
+NEARBY = 2.0
+"""Pixels of an image with a diagonal of 800 within which a known depth of the same instance makes up for an unknown
+one: sensors lose single pixels and strips along edges, beside which the surface has points."""
 LEAST_SHARE = 1 / 3
 """Share of a cube's pixels that show an instance from which the cube may be its surface."""
 
@@ -42,7 +49,8 @@ def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], c
     line of sight. But the surface is known, as points: the centres of the Gaussians that come from the labelled points,
     and the surface points of the pixels that show the instance. Alpha is to be 0 where no point is near; what lies
     nearer than half a spacing, and gaps between points, count for nothing. Where the depth of an instance is unknown in
-    a tenth of its pixels or more, points do not tell where it ends: it has no such views.
+    more than a tenth of its pixels, and in more than a twentieth around these too, points do not tell where it ends: it
+    has no such views.
 
     scene: ordered by instance, not yet trained together. masks: exclusive label maps of all views. count: views of each
     instance; fewer, where all instances together would have more than `most`. Returns targets whose alpha counts alone.
@@ -65,7 +73,7 @@ def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], c
 
 def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) -> dict[int, Float32]:
     """By instance: surface points of pixels that show it, [N, 3] world, one for each cube of space a good part of whose
-    pixels, of all views, do so. Instances with too many pixels of unknown depth are left out.
+    pixels, of all views, do so. Instances with too many pixels where no depth is known nearby are left out.
 
     side: of the cubes, world units.
     """
@@ -73,13 +81,17 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
     places: list[Float32] = []
     shown_there: list[Int64] = []
     area = np.zeros(np.iinfo(np.uint16).max + 1, np.int64)
+    known, nearby = np.zeros_like(area), np.zeros_like(area)
     for camera, depth, shown in zip(views.cameras, views.depths, masks, strict=True):
-        z = sample_depth(depth, camera, camera)[::every, ::every]
-        area += np.bincount(shown.ids[::every, ::every].ravel(), minlength=len(area))
+        z = sample_depth(depth, camera, camera)
+        area += np.bincount(shown.ids.ravel(), minlength=len(area))
+        known += np.bincount(shown.ids[z > 0], minlength=len(area))
+        nearby += np.bincount(shown.ids[_known_nearby(z > 0, shown.ids)], minlength=len(area))
+        z, ids = z[::every, ::every], shown.ids[::every, ::every]
         row, column = np.nonzero(z > 0)
         surface = surface_of_pixels(every * column, every * row, z[row, column], camera)
         places.append(surface.astype(np.float32))
-        shown_there.append(shown.ids[::every, ::every][row, column].astype(np.int64))
+        shown_there.append(ids[row, column].astype(np.int64))
     points, ids = np.concatenate(places), np.concatenate(shown_there)
     if not len(points):
         return {}
@@ -88,8 +100,22 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
     _, cube = np.unique(pair // most, return_inverse=True)
     good = (held >= 2) & (held >= LEAST_SHARE * np.bincount(cube, held)[cube])
     pair, first = pair[good] % most, first[good]
-    known = np.bincount(ids, minlength=len(area)) >= LEAST_KNOWN * area
-    return {int(i): points[first[pair == i]] for i in np.unique(pair) if known[i]}
+    shaped = (known >= LEAST_KNOWN * area) | (nearby >= LEAST_NEARBY * area)
+    return {int(i): points[first[pair == i]] for i in np.unique(pair) if shaped[i]}
+
+
+def _known_nearby(known: Bool, ids: NDArray[np.uint16]) -> Bool:
+    """[H, W] where a pixel of the same instance has a known depth, NEARBY at most away."""
+    reach = int(np.ceil(at_diagonal(NEARBY, *known.shape)))
+    shows = np.pad(np.where(known, ids.astype(np.int32), -1), reach, constant_values=-1)
+    row, column = np.nonzero(~known)
+    own, found = ids[row, column], np.zeros(len(row), bool)
+    steps = np.arange(-reach, reach + 1)
+    for down, right in ((y, x) for y in steps for x in steps if np.hypot(y, x) <= reach):
+        found |= shows[row + reach + down, column + reach + right] == own
+    nearby = known.copy()
+    nearby[row, column] = found
+    return nearby
 
 
 def cameras_around(points: Float32, spacing: float, count: int) -> Iterator[Camera]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from ball_and_box import BALL as CENTRE
 from ball_and_box import RADIUS, SmallScene
+from scipy.ndimage import binary_erosion
 
+from ss_flow.tasks.artifacts import Bool
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, neighbour_spread
 from ss_flow.tasks.gaussians.views import SceneViews
 from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view
@@ -104,6 +107,22 @@ def test_an_instance_with_much_unknown_depth_has_no_known_surface(small):
 
     assert found(0.05) == {0, BOX, BALL}
     assert found(0.2) == {0, BOX}
+
+
+def test_single_pixels_and_thin_strips_without_depth_leave_a_surface_known(small):
+    """As depth cameras lose them; but the depth of what lies around a thing does not tell where that ends."""
+
+    def found(lost: Callable[[Bool], Bool]) -> set[int]:
+        depths = [
+            replace(depth, depth=np.where(lost(ids == BALL), 0, depth.depth))
+            for depth, ids in zip(small.depths, small.ids, strict=True)
+        ]
+        return set(shown_surfaces(replace(compared(small), depths=depths), small.maps, 0.03))
+
+    every_second = np.indices(small.ids[0].shape).sum(axis=0) % 2 == 0
+    assert found(lambda ball: ball & every_second) == {0, BOX, BALL}
+    assert found(lambda ball: ball & ~binary_erosion(ball)) == {0, BOX, BALL}
+    assert found(lambda ball: ball & ~binary_erosion(ball, iterations=5)) == {0, BOX}
 
 
 def test_only_instances_that_have_a_shape_are_looked_at(small):
