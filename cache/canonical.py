@@ -97,10 +97,11 @@ class _Encoder:
         pending = self._pending  # the same one after `self.add`, which clears it at most
         pending += b"l" + _LENGTH(len(value))
         for item in value:  # most are digests and names, or pairs with them
-            if type(item) is str:
+            kind = type(item)
+            if kind is str:
                 content = item.encode()
                 pending += b"s" + _LENGTH(len(content)) + content
-            elif type(item) is tuple:
+            elif kind is tuple or kind is list:
                 self._add_items(item)
             else:
                 self.add(item)

@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
 
-from ss_flow.task import Task
+if TYPE_CHECKING:
+    from ss_flow.task import Task
 
 OnError = Literal["fail", "skip"]
 A = TypeVar("A")

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
+from ss_flow.graph import current_flow
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -65,9 +67,7 @@ class Task(Generic[P, R]):
     environment: Callable[[], Mapping[str, str]] | None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        from ss_flow import graph
-
-        flow = graph.current_flow()
+        flow = current_flow()
         return self.function(*args, **kwargs) if flow is None else typing.cast(R, flow.add(self, args, kwargs))
 
     @functools.cached_property
