@@ -38,6 +38,8 @@ millimetres taken for metres."""
 _ENDLESS = 1e6
 """A factor by which depth fits as well as without any motion of the camera between two views. What fits hardly better
 says nothing of scale."""
+_FITS = 0.01
+"""A median difference up to which another factor says nothing."""
 _FAR_PAIRS = 40
 """So many pairs of views are enough to find a far one."""
 _TIED = 1 / 3
@@ -78,19 +80,19 @@ def checks(
     """
     views = [_view(frame, camera_of(cameras, row), depths[row]) for row, frame in enumerate(frames)]
     pairs: list[tuple[int, int]] = []
-    near: list[Float64] = []
+    ahead: list[float] = []
     for row, frame in enumerate(frames):
         for other in nearest_views(cameras, row, _NEIGHBOURS):
             pairs.append((row, other))
-            near.append(_errors(views[row], views[other], _NEAR))
+            ahead.append(_error(views[row], views[other]))
         progress(row + 1, len(frames), frame.name)
-    scale = _scale([(views[row], views[other]) for row, other in pairs], near, params)
+    scale = _scale([(views[row], views[other]) for row, other in pairs], ahead, params)
     error, likeness, gains = np.full(len(frames), np.nan), np.full(len(frames), np.nan), []
     now: dict[int, list[float]] = {}
-    for (row, other), errors in zip(pairs, near, strict=True):
+    for (row, other), error_ahead in zip(pairs, ahead, strict=True):
         # A wrong pose differs both ways. One way alone, as where a view has no depth of what stands close before it and
         # its neighbour has, something hides the rest.
-        differs = np.fmin(errors[_NOW], _errors(views[other], views[row], np.ones(1))[0])
+        differs = np.fmin(error_ahead, _error(views[other], views[row]))
         if np.isfinite(differs):
             now.setdefault(row, []).append(differs)
             error[row] = np.median(now[row])
@@ -189,6 +191,11 @@ def _view(frame: Frame, camera: Camera, depth: DepthMap) -> _View:
     return _View(grey.astype(np.float32), small, sized, points, known)
 
 
+def _error(view: _View, other: _View) -> float:
+    """What `_errors` gives for depth as it is."""
+    return float(_errors(view, other, np.ones(1))[0])
+
+
 def _errors(view: _View, other: _View, scales: Float64) -> Float64:
     """[S] the median relative difference of a view's depth, carried to another one, and that one's, for each factor on
     both; NaN where they share too little."""
@@ -229,12 +236,14 @@ def _difference(carried: Float64, measured: NDArray[np.floating]) -> Float64:
     return np.minimum(np.abs(carried - measured) / np.maximum(measured, 1e-12), _OCCLUDED)
 
 
-def _scale(pairs: Sequence[tuple[_View, _View]], near: Sequence[Float64], params: CheckParams) -> float:
+def _scale(pairs: Sequence[tuple[_View, _View]], ahead: Sequence[float], params: CheckParams) -> float:
     """The factor on the depth that makes neighbours agree best, 1 where it is hardly better than none.
 
-    near: of each pair, the errors for the near factors.
+    ahead: of each pair, the error of depth as it is. Where that is small no factor is looked for.
     """
-    curve = _curve(near)
+    if len(ahead) and np.median(np.nan_to_num(ahead, nan=_OCCLUDED)) <= min(_FITS, params.max_depth_error):
+        return 1.0
+    curve = _curve([_errors(*pair, _NEAR) for pair in pairs])
     best, now = int(curve.argmin()), curve[_NOW]
     if curve[best] > params.max_depth_error:
         some = pairs[:: -(-len(pairs) // _FAR_PAIRS) or 1]
@@ -243,7 +252,7 @@ def _scale(pairs: Sequence[tuple[_View, _View]], near: Sequence[Float64], params
         parallax = _curve([_errors(*pair, np.array([_ENDLESS])) for pair in some])[0]
         if far.min() <= min(params.max_depth_error, parallax / 2):
             return float(around[far.argmin()])
-    clear = curve[best] < (1 - params.min_scale_gain) * now and now > 0.01 and abs(np.log(_NEAR[best])) > 0.07
+    clear = curve[best] < (1 - params.min_scale_gain) * now and now > _FITS and abs(np.log(_NEAR[best])) > 0.07
     return float(_NEAR[best]) if clear else 1.0
 
 

@@ -19,7 +19,7 @@ from ss_flow.tasks.capture.matches import Matches
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
 
-_FEW_PAIRS, _MOST_PAIRS = 6, 12
+_FEW_PAIRS, _MOST_PAIRS = 4, 12
 """Of so many views, evenly chosen, each is compared with its nearest neighbour: of few at first, and of more where
 these leave a doubt."""
 _CLEAR = 0.5

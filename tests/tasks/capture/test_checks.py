@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from ss_flow.flows.generated import Room, RoomParams, generate
 from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Cameras, CaptureChecks, DepthMap, Frame
-from ss_flow.tasks.capture.checks import checks
+from ss_flow.tasks.capture.checks import _errors, checks
 from ss_flow.tasks.geometry.images import encode_png
 
 
@@ -141,3 +142,17 @@ def test_rolling_exposure_is_told_with_its_factor(room: Room) -> None:
     assert "exposure changes by a factor of 1." in said
     assert np.corrcoef(np.log(found.exposure), np.log(factor))[0, 1] > 0.95
     assert found.exposure.max() / found.exposure.min() == pytest.approx(1.3 / 0.7, rel=0.15)
+
+
+def test_of_depth_that_fits_no_other_scale_is_looked_for(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[int] = []
+
+    def errors(view: Any, other: Any, scales: np.ndarray) -> np.ndarray:
+        tried.append(len(scales))
+        return _errors(view, other, scales)
+
+    monkeypatch.setattr("ss_flow.tasks.capture.checks._errors", errors)
+    _checked(room)
+    assert set(tried) == {1}
+    _checked(room, depth=1.3 * room.depth)
+    assert set(tried) > {1}
