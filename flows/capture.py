@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ss_flow.errors import InputError
-from ss_flow.flows.depths import Beside, all_of, depth_source, fitting_depth, measured, without_sensor
+from ss_flow.flows.depths import Beside, all_of, completed_depth, depth_source, fitting_depth, measured, without_sensor
 from ss_flow.flows.params import CaptureParams
 from ss_flow.flows.poses import fitting_poses, poses, refined_poses
 from ss_flow.task import Reference
@@ -124,7 +124,8 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     if sensed is not None:
         advise = params.calibrate == "none"
         placing = registration(frames, cameras, sensed, advise=advise, params=params.registration)
-        depths = presumed = fitting_depth(frames, cameras, sensed, placing, params)
+        fitting = fitting_depth(frames, cameras, sensed, placing, params)
+        depths = presumed = completed_depth(frames, cameras, fitting, names, params)
     elif params.calibrate == "depth":
         raise InputError(
             f"{scene.root} is to be run with depth that no sensor measured (capture.depth={source}), and only a "
@@ -138,7 +139,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     evened: tuple[ColourTransform, ...] = ()
     if params.colours.transform != "none":
         evened = colours(frames, cameras, depths, length, params=params.colours)
-    fitting = checks(frames, cameras, depths, params=params.checks)
+    checked = checks(frames, cameras, depths, params=params.checks)
     return Capture(
         frames=frames,
         cameras=cameras,
@@ -154,7 +155,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         objects=objects,
         registration=placing,
         colours=evened,
-        checks=fitting,
+        checks=checked,
         given=given,
     )
 

@@ -15,6 +15,7 @@ from ss_flow.task import FileRef, Reference
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, Registration
 from ss_flow.tasks.capture import depth as steps
 from ss_flow.tasks.capture import recordings, sensor_depth, views
+from ss_flow.tasks.capture.completion import Gaps, completed, gaps, sized
 from ss_flow.tasks.capture.depth import AgreementParams
 from ss_flow.tasks.capture.given_scene import rendered_depth
 from ss_flow.tasks.capture.mono import mono
@@ -84,9 +85,15 @@ class Beside:
 
     @classmethod
     def of(
-        cls, frames: tuple[Frame, ...], cameras: Cameras, names: tuple[str, ...] | None, params: CaptureParams
+        cls,
+        frames: tuple[Frame, ...],
+        cameras: Cameras,
+        names: tuple[str, ...] | None,
+        params: CaptureParams,
+        sensed: Depths = (),
     ) -> Beside:
-        beside = neighbors(cameras, params=params.neighbors)
+        """sensed: a sensor's depth, where there is one."""
+        beside = neighbors(cameras, sensed, params=params.neighbors)
         return cls(frames, views.by_view(cameras), beside, names, params)
 
     def compared(self) -> tuple[Depths, Depths]:
@@ -97,6 +104,31 @@ class Beside:
             found = self._each(functools.partial(self._refined, found, agreed))
             agreed = self._confirmed(found, self.params.agreement)
         return agreed, self._confirmed(found, self.params.presumed)
+
+    def completed(self, sensor: Depths, gaps: Sequence[int]) -> Depths:
+        """A sensor's depth, and what several views agree on where it has none.
+
+        gaps: the views, by their places, of which that is to be found.
+        """
+        small = each(
+            sensor,
+            self.cameras,
+            names=self.names,
+            build=lambda depth, camera: sized(depth, camera, max_side=self.params.stereo.max_side),
+        )
+
+        def with_sensor(step: Callable[[int, Neighbors], DepthMap], known: Depths = small) -> Depths:
+            def held(view: int, near: Neighbors) -> DepthMap:
+                return completed(known[view], step(view, near)) if view in gaps else known[view]
+
+            return self._each(held)
+
+        found = with_sensor(self._swept)
+        agreed = with_sensor(self._agreeing(found, self.params.agreement))
+        for _ in range(self.params.stereo.rounds):
+            found = with_sensor(functools.partial(self._refined, found, agreed))
+            agreed = with_sensor(self._agreeing(found, self.params.agreement))
+        return with_sensor(lambda view, _: agreed[view], sensor)
 
     def rendered(self, scene: Gaussians) -> Depths:
         """The depth that a scene shows, where neighbours confirm it: at outlines it lies between two surfaces."""
@@ -143,11 +175,32 @@ class Beside:
         )
 
     def _confirmed(self, found: Depths, params: AgreementParams) -> Depths:
-        def confirmed(view: int, near: Neighbors) -> DepthMap:
+        return self._each(self._agreeing(found, params))
+
+    def _agreeing(self, found: Depths, params: AgreementParams) -> Callable[[int, Neighbors], DepthMap]:
+        def agreeing(view: int, near: Neighbors) -> DepthMap:
             around = near.around(view)
             return steps.agree(pick(found, around), pick(self.cameras, around), params=params)
 
-        return self._each(confirmed)
+        return agreeing
+
+
+def completed_depth(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: Depths,
+    names: tuple[str, ...] | None,
+    params: CaptureParams,
+) -> Depths:
+    """A sensor's depth, completed by comparing photos in the views of which it knows little."""
+    if not params.completion.below:
+        return depths
+
+    def completing(found: Gaps) -> Depths:
+        lacking = found.view.tolist()
+        return Beside.of(frames, cameras, names, params, depths).completed(depths, lacking) if lacking else depths
+
+    return expand(gaps(frames, depths, params=params.completion), completing)
 
 
 def without_sensor(

@@ -7,6 +7,7 @@ from typing import Literal
 
 from ss_flow.tasks.capture.checks import CheckParams
 from ss_flow.tasks.capture.colours import ColourParams
+from ss_flow.tasks.capture.completion import CompletionParams
 from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
 from ss_flow.tasks.capture.given_scene import GivenSceneParams
 from ss_flow.tasks.capture.ingest import IngestParams
@@ -72,6 +73,7 @@ class CaptureParams:
     """By which depth Split sees points where views are compared: one other view that agrees is enough, since the points
     are confirmed by themselves. Nothing is trained on it."""
     registration: RegistrationParams = field(default_factory=RegistrationParams)
+    completion: CompletionParams = field(default_factory=CompletionParams)
     mono: MonoParams = field(default_factory=MonoParams)
     given: GivenSceneParams = field(default_factory=GivenSceneParams)
     colours: ColourParams = field(default_factory=ColourParams)

@@ -76,7 +76,8 @@ class DepthMap:
     depth: Float32
     """[h, w] z-depth in world units, 0 where unknown."""
     source: str
-    """Where it came from: "sensor", "mvs", "mono" or "rendered"."""
+    """Where it came from: "sensor", "mvs" (photos compared), "completed" (the sensor, and mvs where it knows nothing),
+    "mono" or "rendered"."""
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, Float64, Int32, ViewLists
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32, ViewLists
 from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view
 from ss_flow.tasks.geometry.plane_sweep import typical_depth, view_scores
 from ss_flow.tasks.ranges import Count
@@ -48,10 +49,13 @@ class Neighbors(ViewLists):
 
 
 @task(name="capture.neighbors")
-def neighbors(cameras: Cameras, *, params: NeighborParams = NeighborParams()) -> Neighbors:
+def neighbors(
+    cameras: Cameras, measured: tuple[DepthMap, ...] = (), *, params: NeighborParams = NeighborParams()
+) -> Neighbors:
     """The views that overlap each view best, and the span of the sparse points that it sees, made somewhat wider.
 
-    Where hardly any are seen, the cameras alone tell how far the scene is.
+    Where hardly any are seen, the cameras alone tell how far the scene is. measured: a sensor's depth of all views,
+    where there is one; the span is then that of the view and its neighbours, which may see what it is blind to.
     """
     by_view = cameras_by_view(cameras)
     guess = typical_depth(by_view)
@@ -60,6 +64,11 @@ def neighbors(cameras: Cameras, *, params: NeighborParams = NeighborParams()) ->
     for view, span in enumerate(spans):
         progress(view, len(spans))
         chosen.append(_best(by_view, view, guess if span is None else float(np.sqrt(span[0] * span[1])), params.count))
+    if measured:
+        depths = [
+            np.concatenate([measured[k].depth.ravel() for k in (view, *near)]) for view, near in enumerate(chosen)
+        ]
+        spans = [_widened(depth[depth > 0], 0.01, 0.99) for depth in depths]
     known = np.array([(np.nan, np.nan) if span is None else span for span in spans], np.float64)
     return Neighbors(span=known.reshape(-1, 2), **Neighbors.arrays(chosen))
 
@@ -75,7 +84,12 @@ def _best(cameras: tuple[Camera, ...], view: int, depth: float, count: int) -> l
 
 def _span(cameras: Cameras, camera: Camera) -> tuple[float, float] | None:
     *_, seen = pixels_in_view(cameras.sparse_points, camera)
-    if len(seen) < _LEAST_POINTS:
+    return _widened(seen, 0.01, 0.98)
+
+
+def _widened(depth: NDArray[np.floating], low: float, high: float) -> tuple[float, float] | None:
+    """The span between two quantiles of known depths, made somewhat wider; None where there are hardly any."""
+    if len(depth) < _LEAST_POINTS:
         return None
-    low, high = np.quantile(seen, (0.01, 0.98))
-    return float(low) * 0.8, float(high) * 1.25
+    near, far = np.quantile(depth, (low, high))
+    return float(near) * 0.8, float(far) * 1.25
