@@ -96,9 +96,9 @@ class SplitParams:
     dense: DenseParams = field(default_factory=DenseParams)
     splatting: DenseSplattingParams = field(default_factory=DenseSplattingParams)
     visibility: VisibilityParams = field(default_factory=VisibilityParams)
-    visible_color: NonNegative = 8.0
+    visible_color: NonNegative = 0.0
     """Where a view has no depth, it sees the points in front whose colour its photo shows: this is how far they may be
-    apart, in CIELAB. 0 = it sees none there."""
+    apart, in CIELAB. 0 = it sees none there; a sensor's gaps are closed before (`capture.completion`)."""
     observe: ObserveParams = field(default_factory=ObserveParams)
     propagate: PropagateParams = field(default_factory=PropagateParams)
     parts: PartsParams = field(default_factory=PartsParams)
