@@ -134,7 +134,10 @@ def better_poses(
             "capture.refine_poses=never keeps the given ones."
         )
         return refined
-    warn(f"The poses that came with this capture may not be exact, but refined ones fit no better: {figures}.")
+    warn(
+        "The poses that came with this capture may not be exact, but refined ones fit no better, so the given ones are "
+        f"kept: {figures}."
+    )
     return given
 
 

@@ -167,9 +167,9 @@ def _tell(given: Cameras, refined: Float64, rows: list[int], errors: tuple[float
     turn = refined[rows, :3, :3] @ given.world_to_camera[rows, :3, :3].transpose(0, 2, 1)
     turned = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     warn(
-        f"The given poses of {len(rows)} of {len(given)} views were refined: they moved by {np.median(moved):.3g} "
-        f"{'m' if given.metric else 'units'} (at most {moved.max():.3g}) and turned by {np.median(turned):.2f} degrees "
-        f"(at most {turned.max():.2f}); points are seen {errors[1]:.2f} pixels off their place instead of "
+        f"Bundle adjustment moves the given poses of {len(rows)} of {len(given)} views by {np.median(moved):.3g} "
+        f"{'m' if given.metric else 'units'} (at most {moved.max():.3g}) and turns them by {np.median(turned):.2f} "
+        f"degrees (at most {turned.max():.2f}); points are seen {errors[1]:.2f} pixels off their place instead of "
         f"{errors[0]:.2f} (medians)."
     )
 

@@ -64,7 +64,7 @@ def test_jittered_poses_of_a_room_come_back_and_the_run_says_how_far_they_moved(
     assert turned(given, true) > 0.8
     assert turned(refined, true) < turned(given, true) / 3
     (told,) = warnings_of(called)
-    assert told.startswith("The given poses of 12 of 12 views were refined: they moved by 0.0")
+    assert told.startswith("Bundle adjustment moves the given poses of 12 of 12 views by 0.0")
     assert told in called.err
     same = run_tiny(scenes[1], store, *UNTIL, "--set", "capture.refine_poses=always")
     assert (same.computed(), same.results()) == ({}, called.results())
