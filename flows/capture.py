@@ -137,7 +137,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     objects = scene.hints.objects if scene.hints is not None else ()
     by_view, length = views.by_view(cameras), views.unit(cameras, depths)
     evened: tuple[ColourTransform, ...] = ()
-    if params.colours.transform != "none":
+    if params.colours.transform != "none" and given is None:  # whose Gaussians keep the colours they have
         evened = colours(frames, cameras, depths, length, params=params.colours)
     checked = checks(frames, cameras, depths, params=params.checks)
     return Capture(

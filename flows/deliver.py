@@ -68,7 +68,7 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
         "params": settings.flat(params),
         "models": models,
         "given_scene": None if scene.given_scene is None else str(scene.given_scene),
-        "reference_photo": store.get(wanted["colours"][0]).reference if "colours" in wanted else None,
+        "reference_photo": (store.get(wanted["colours"][0]).reference or None) if "colours" in wanted else None,
         "metrics": {
             METRICS[name]: store.get(value).values
             for name, value in wanted.items()

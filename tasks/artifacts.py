@@ -95,7 +95,8 @@ class ColourTransform:
     name: str
     """Of the view."""
     reference: str
-    """The view whose colours are the scene's; its own transform changes nothing."""
+    """The view whose colours are the scene's; its own transform changes nothing. "" where all photos stay as they are,
+    whose transforms change nothing either."""
     matrix: Float64
     """[3, 4] affine: RGB (r, g, b, 1) of the photo, 0..1, to RGB of the scene, which may lie beyond 0..1."""
 

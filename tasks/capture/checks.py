@@ -157,10 +157,7 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterab
         )
     low, high = np.quantile(found.exposure, (0.05, 0.95))
     if high / low > params.max_exposure:
-        yield (
-            f"The photos' exposure changes by a factor of {high / low:.2f} between nearby views; "
-            "capture.colours.transform=affine takes it out before training."
-        )
+        yield f"The photos' exposure changes by a factor of {high / low:.2f} between nearby views."
 
 
 @dataclass(frozen=True)

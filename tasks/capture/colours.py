@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ss_flow.running import progress
+from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Float32, Float64, Frame, Int32, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
@@ -40,14 +40,14 @@ _FEW = 200
 class ColourParams:
     """How the exposure and white balance of photos are evened out."""
 
-    transform: Literal["affine", "none"] = "none"
+    transform: Literal["affine", "none"] = "affine"
     """What each photo's colours go through before Gaussians are trained on them: "none", as in the paper, or "affine",
-    a 3 x 4 matrix."""
+    a 3 x 4 matrix, where photos differ (min_gain)."""
     points: Count = 10_000
     """Surface points that are looked up in the photos."""
     prior: Positive = 1e-2
     """How strongly a transform is drawn towards plain gains of its channels: the weight of a share of its points."""
-    min_gain: Fraction = 0.2
+    min_gain: Fraction = 0.35
     """Photos stay as they are unless so large a share of the disagreement about a point's colour goes, on points that
     the maps were not fitted to."""
 
@@ -70,14 +70,21 @@ def colours(
     """The transform of each photo's colours to those of one of them; identity for a photo that shares no surface.
 
     All are identity where photos agree already (`min_gain`): a fixed exposure is better than an estimate of it. Pixels
-    of unknown depth, those that a frame masks out and those near black or white count nowhere.
+    of unknown depth, those that a frame masks out and those near black or white count nowhere. Says so where colours
+    are changed.
     """
     found = _observations(frames, cameras, depths, unit, params.points)
+    gained = gain(found, len(frames), params.prior)
+    if gained < params.min_gain:
+        return tuple(ColourTransform(frame.name, "", np.eye(4)[:3]) for frame in frames)
     to_photo = photo_maps(found, len(frames), params.prior)
-    if gain(found, len(frames), params.prior) < params.min_gain:
-        to_photo = _affine(np.ones((len(frames), 3)))
     reference = int(np.abs(to_photo - np.eye(4)[:3]).sum(axis=(1, 2)).argmin())
     in_scene = _square(to_photo[reference]) @ np.linalg.inv(_square(to_photo))
+    warn(
+        f"Exposure or white balance change from photo to photo: Gaussians are trained in the colours of photo "
+        f"{frames[reference].name}, which takes {gained:.0%} of the differences away. "
+        "capture.colours.transform=none leaves photos as they are."
+    )
     return tuple(
         ColourTransform(frame.name, frames[reference].name, matrix[:3])
         for frame, matrix in zip(frames, in_scene, strict=True)

@@ -51,7 +51,7 @@ def novel_view(
 ) -> Metrics:
     """Render the scene from the held-out cameras and compare with the photos, as 8-bit images.
 
-    colours: what the photos that were trained on went through, one each of `cameras_trained`; empty where they stayed.
+    colours: what the photos that were trained on went through, one each of `cameras_trained`.
     background: colour where nothing is, 0..1. perception: the network of LPIPS. Pixels that a frame's `valid` mask
     excludes count in no measure.
     Returns psnr (dB) and ssim, and psnr_colour_fitted, the PSNR after `colour_fitted`; where photos went through
@@ -67,7 +67,8 @@ def novel_view(
         raise InputError("There is no held-out view; at least one is needed to evaluate novel views.")
     if names != cameras_held_out.names:
         raise InputError("The held-out frames and cameras are not the same views in the same order.")
-    beside = NeighbourColours.of(scene, cameras_trained, colours) if colours else None
+    changed = any(one.reference for one in colours)
+    beside = NeighbourColours.of(scene, cameras_trained, colours) if changed else None
     found: list[dict[str, float]] = []
     for view, frame in enumerate(frames_held_out):
         valid = decode_valid(frame)

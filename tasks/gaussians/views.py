@@ -258,7 +258,7 @@ def _crop(
     if photo.shape[:2] != (camera.height, camera.width):
         photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     image = photo.astype(np.float32) / np.float32(255)
-    if scene.colours:
+    if scene.colours and scene.colours[view].reference:
         image = transformed(image, scene.colours[view])
     valid = decode_valid(frame)[np.ix_(row, column)]
     ids = channels[np.ix_(row, column)]

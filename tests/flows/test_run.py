@@ -131,9 +131,12 @@ def test_photos_that_are_scaled_down_on_the_way_in_give_masks_of_their_own_size(
 
 def test_views_kept_back_are_measured_and_the_photo_whose_colours_the_scene_has_is_named(tmp_path):
     room = write_room(tmp_path / "room", params=RoomParams(objects=1, views=4, width=64, height=48, held_out=2))
-    called = run_tiny(room, tmp_path / "store", "--set", "colours.transform=affine", out=tmp_path / "out")
+    for photo in sorted((room / "color").iterdir())[::2]:
+        cv2.imwrite(str(photo), cv2.imread(str(photo)) // 2)
+    called = run_tiny(room, tmp_path / "store", out=tmp_path / "out")
     assert called.code == 0, called.err
     assert called.document()["reference_photo"] in {path.stem for path in (room / "color").iterdir()}
+    assert any("change from photo to photo" in said["text"] for said in called.document()["warnings"])
     measured = called.document()["metrics"]["novel_view"]
     assert 5 < measured["psnr"] < 60 and measured["psnr"] < measured["psnr_colour_fitted"]
     assert 5 < measured["psnr_neighbour_colours"] < measured["psnr_colour_fitted"] + 0.1

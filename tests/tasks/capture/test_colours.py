@@ -63,6 +63,7 @@ def test_only_what_holds_for_other_points_too_is_gained():
 
 def test_photos_of_one_exposure_stay_as_they_are_to_the_bit():
     for transform in colours(*captured(np.ones((6, 3))), SceneUnit(1.0), params=ColourParams()):
+        assert transform.reference == ""
         np.testing.assert_array_equal(transform.matrix, IDENTITY)
 
 
@@ -91,9 +92,11 @@ def test_photos_of_a_room_in_changing_light_come_to_the_colours_of_the_reference
     gains = np.random.default_rng(6).uniform(0.55, 1.0, (8, 1)) * np.array([1.0, 0.97, 0.94])
     frames, cameras, depths = captured(gains)
     even, _, _ = captured(np.ones((8, 3)))
-    found = colours(frames, cameras, depths, SceneUnit(1.0), params=ColourParams())
+    with pytest.warns(UserWarning, match="change from photo to photo: Gaussians are trained in the colours of photo") as told:
+        found = colours(frames, cameras, depths, SceneUnit(1.0), params=ColourParams())
     assert [t.name for t in found] == list(cameras.names)
     (reference,) = {t.reference for t in found}
+    assert f"photo {reference}," in str(told[0].message)
     own = cameras.names.index(reference)
     np.testing.assert_allclose(found[own].matrix, IDENTITY, atol=1e-12)
     for view, transform in enumerate(found):
@@ -114,5 +117,6 @@ def test_pixels_that_do_not_count_and_unknown_depth_say_nothing():
 
 def test_the_same_photos_give_the_same_bytes():
     made = captured(np.linspace(0.6, 1.0, 5)[:, None] * np.ones(3))
-    first, second = (colours(*made, SceneUnit(1.0), params=ColourParams()) for _ in range(2))
+    with pytest.warns(UserWarning, match="change from photo to photo"):
+        first, second = (colours(*made, SceneUnit(1.0), params=ColourParams()) for _ in range(2))
     assert [t.matrix.tobytes() for t in first] == [t.matrix.tobytes() for t in second]
