@@ -1,7 +1,9 @@
 """Pieces of a label that lie apart in space, and that the views do not show as one: labels of their own.
 
 A mask of a table's shadow may hold the floor beside it, and one of the face of a box what stands behind it. Where two
-such masks are united, so is what they hold, though most views tell it apart. Beyond Split&Splat.
+such masks are united, so is what they hold, though most views tell it apart, or no view shows both. Pieces that lie
+farther apart than the larger of them is long are no thing that masks alone could vouch for: a mask of a plant holds the
+window behind its leaves. Beyond Split&Splat.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Int32, Observation, PointCloud
+from ss_flow.tasks.artifacts import Bool, Float32, Int32, Observation, PointCloud
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
 from ss_flow.tasks.split.observe import membership
 from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence
@@ -27,14 +29,16 @@ def part_labels(
     rate: float,
     first: int,
 ) -> Int32:
-    """Part the labels of points whose pieces the views hold apart: [N].
+    """Part the labels of points whose pieces the views hold apart, or lie far apart: [N].
 
     label: [N] of the cloud's points, 0 = none. reach: distance between two points of a piece, in the world's unit.
     share, min_points: of a label's points that a piece needs to be asked about; smaller ones stay with the largest.
-    rate: as for masks (`votes.at_once`), by whose rule the pieces of a label are clustered. first: the number of the
-    first new label; the largest cluster keeps the old one, and so do those that no view sees together with it.
+    rate: as for masks (`votes.at_once`), by whose rule the pieces of a label are clustered; what is far from the rest
+    of its cluster is none of it. first: the number of the first new label; the largest cluster keeps the old one, and
+    so do those near it that no view sees together with it.
     """
     from scipy.sparse import coo_array, csr_array
+    from scipy.sparse.csgraph import connected_components
 
     pieces: list[Int32] = []
     of: list[int] = []
@@ -60,10 +64,22 @@ def part_labels(
     cluster = correlation_clusters(together, said, np.ones(len(pieces), np.int32), rate)
     parted = label.copy()
     for own in rows_by_label(whole).values():
-        clusters = [own[cluster[own] == number] for number in np.unique(cluster[own])]
-        largest, *others = sorted(clusters, key=lambda rows: -int(size[rows].sum()))
+        near = _near([cloud.points[pieces[row]] for row in own])
+        _, group = connected_components(csr_array(near & (cluster[own] == cluster[own][:, None])), directed=False)
+        groups = [np.flatnonzero(group == number) for number in np.unique(group)]
+        largest, *others = sorted(groups, key=lambda rows: -int(size[own[rows]].sum()))
         for rows in others:
-            if said[rows].sum(axis=0) @ said[largest].sum(axis=0) > 0:
-                parted[np.concatenate([pieces[row] for row in rows])] = first
+            seen_together = said[own[rows]].sum(axis=0) @ said[own[largest]].sum(axis=0) > 0
+            if seen_together or not near[np.ix_(rows, largest)].any():
+                parted[np.concatenate([pieces[row] for row in own[rows]])] = first
                 first += 1
     return parted
+
+
+def _near(pieces: Sequence[Float32]) -> Bool:
+    """[P, P] whether pieces, [n, 3] points each, lie no farther apart than the larger of them is long, by the boxes
+    around them."""
+    low, high = (np.array([extreme(points, axis=0) for points in pieces]) for extreme in (np.min, np.max))
+    length = np.linalg.norm(high - low, axis=1)
+    gap = np.maximum(np.maximum(low[:, None] - high, low - high[:, None]), 0)
+    return np.linalg.norm(gap, axis=2) <= np.maximum(length[:, None], length)
