@@ -32,27 +32,46 @@ def part_labels(
     """Part the labels of points whose pieces the views hold apart, or lie far apart: [N].
 
     label: [N] of the cloud's points, 0 = none. reach: distance between two points of a piece, in the world's unit.
-    share, min_points: of a label's points that a piece needs to be asked about; smaller ones stay with the largest.
-    rate: as for masks (`votes.at_once`), by whose rule the pieces of a label are clustered; what is far from the rest
-    of its cluster is none of it. first: the number of the first new label; the largest cluster keeps the old one, and
-    so do those near it that no view sees together with it.
+    share, min_points: of a label's points that a piece needs to be asked about; smaller ones stay with the largest, or
+    lose their label where they are far from it. rate: as for masks (`votes.at_once`), by whose rule the pieces of a
+    label are clustered; what is far from the rest of its cluster is none of it. first: the number of the first new
+    label; the largest cluster keeps the old one, and so do those near it that no view sees together with it.
     """
+    rows_of = rows_by_label(label)
+    rows_of.pop(0, None)
+    large: dict[int, list[Int32]] = {}
+    small: dict[int, list[Int32]] = {}
+    for name, rows in rows_of.items():
+        component = dbscan(cloud.points[rows], reach, min_samples=1)
+        pieces = [rows[inside].astype(np.int32) for inside in rows_by_label(component).values()]
+        enough = max(min_points, share * len(rows))
+        large[name] = [piece for piece in pieces if len(piece) >= enough]
+        small[name] = [piece for piece in pieces if len(piece) < enough]
+    several = {name: pieces for name, pieces in large.items() if len(pieces) > 1}
+    parted = _parted(label, cloud, observations, several, rate, first) if several else label.copy()
+    for name, crumbs in small.items():
+        kept = [piece for piece in large[name] if parted[piece[0]] == name]
+        if kept and crumbs:
+            near = _near([cloud.points[piece] for piece in kept + crumbs])[len(kept) :, : len(kept)].any(axis=1)
+            for crumb, stays in zip(crumbs, near.tolist(), strict=True):
+                parted[crumb] = name if stays else 0
+    return parted
+
+
+def _parted(
+    label: Int32,
+    cloud: PointCloud,
+    observations: Sequence[Observation],
+    pieces_of: dict[int, list[Int32]],
+    rate: float,
+    first: int,
+) -> Int32:
+    """The labels [N] once pieces (rows of points) of labels that have several are clustered."""
     from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import connected_components
 
-    pieces: list[Int32] = []
-    of: list[int] = []
-    rows_of = rows_by_label(label)
-    rows_of.pop(0, None)
-    for name, rows in rows_of.items():
-        component = dbscan(cloud.points[rows], reach, min_samples=1)
-        large = np.flatnonzero(np.bincount(component) >= max(min_points, share * len(rows)))
-        if len(large) > 1:
-            pieces += [rows[component == number].astype(np.int32) for number in large]
-            of += [name] * len(large)
-    if not pieces:
-        return label
-    whole = np.array(of, np.int32)
+    pieces = [piece for some in pieces_of.values() for piece in some]
+    whole = np.repeat(np.array(list(pieces_of), np.int32), [len(some) for some in pieces_of.values()])
     size = np.array([len(rows) for rows in pieces])
     view = np.repeat(np.arange(len(observations), dtype=np.int32), [len(seen.mask) for seen in observations])
     masks = [seen.inside(j) for seen in observations for j in range(len(seen.mask))]

@@ -18,11 +18,14 @@ def view(*masks: range | list[int]) -> Observation:
     return Observation("", seen, number, first, row, np.full(len(row), INSIDE, np.uint8))
 
 
-def parted(*views: Observation, label: int = 1, below: float = 15.0) -> list[int]:
-    """The labels of table, which is 19 long, floor and crumb when they were one. below: of the floor from the table."""
+def parted(*views: Observation, label: int = 1, below: float = 15.0, above: float = 10.0) -> list[int]:
+    """The labels of table, which is 19 long, floor and crumb when they were one.
+
+    below, above: how far the floor lies below the table, and the crumb, which is 13 beside it, above.
+    """
     place = np.zeros((34, 3), np.float32)
     place[:, 0] = np.arange(34)
-    for piece, height in ((FLOOR, below), (CRUMB, 90.0)):
+    for piece, height in ((FLOOR, below), (CRUMB, -above)):
         place[list(piece), 2] = height
     cloud = PointCloud(place, np.zeros((34, 3), np.uint8), 1.0, 1.0)
     before = np.full(34, label, np.int32)
@@ -55,6 +58,12 @@ def test_pieces_that_no_view_sees_together_stay_one():
 def test_pieces_farther_apart_than_the_larger_is_long_are_labels_of_their_own(views):
     assert parted(*views, below=18.0) == [1, 1, 1]
     assert parted(*views, below=20.0) == [1, 9, 1]
+
+
+def test_a_crumb_farther_off_than_the_largest_piece_is_long_loses_its_label():
+    assert parted(BOTH, above=13.0) == [1, 1, 1]
+    assert parted(BOTH, above=14.0) == [1, 1, 0]
+    assert parted(APART, above=14.0) == [1, 9, 0]
 
 
 def test_what_lies_between_two_pieces_holds_them_together():
