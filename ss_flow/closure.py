@@ -11,43 +11,19 @@ from __future__ import annotations
 
 import ast
 import functools
-import importlib.util
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 from blake3 import blake3
+
+from ss_flow.sources import Imports, Module, imports_of, module_of, native_sources, source_digest, source_of
 
 FOLLOWED = ("ss_flow.tasks", "ss_flow.flows")
 """Packages whose definitions are followed, besides the package of the function itself."""
 
 ENGINE = "ss_flow"
-
-NATIVE_SOURCES = "NATIVE_SOURCES"
-"""A module-level tuple of file names, relative to the module: sources of the native code it loads."""
-
-Origin = tuple[str, str | None]
-"""(module, name in it), or (module, None) for the module itself."""
-Imports = dict[str, list[Origin]]
-"""What each local name may be: more than one thing, where it is imported in one branch and in another."""
-
-
-@dataclass(frozen=True)
-class _Source:
-    path: Path
-    is_package: bool
-    text: str
-
-
-@dataclass
-class _Module:
-    name: str
-    path: Path
-    is_package: bool
-    definitions: dict[str, list[ast.stmt]] = field(default_factory=dict)
-    imports: Imports = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -87,23 +63,8 @@ def code_closure(function: Callable[..., Any]) -> dict[str, str]:
 
 def forget() -> None:
     """Read the sources anew the next time; a process reads each of them once."""
-    for remembered in (_closure, _digests, _needed, _read, _module, _source, source_digest):
+    for remembered in (_closure, _digests, _needed, _read, module_of, source_of, source_digest):
         remembered.cache_clear()
-
-
-@functools.cache
-def source_digest(name: str) -> str:
-    """The digest of a module's source, or of the native source "module:file"; "" when there is none."""
-    module, _, native = name.partition(":")
-    source = _source(module)
-    if source is None:
-        return ""
-    if not native:  # in a package, relative imports mean others
-        return blake3(f"{source.is_package} {source.text}".encode()).hexdigest()
-    try:
-        return blake3((source.path.parent / native).read_bytes()).hexdigest()
-    except FileNotFoundError:
-        return ""
 
 
 @functools.cache
@@ -118,7 +79,7 @@ def _closure(module_name: str, function_name: str) -> Closure:
     while pending:
         module_name, name = pending.pop()
         sources.add(module_name)
-        module = _module(module_name)
+        module = module_of(module_name)
         if module is None or f"{module_name}.{name}" in found:
             continue
         if name not in module.definitions:
@@ -141,19 +102,19 @@ def _closure(module_name: str, function_name: str) -> Closure:
 @functools.cache
 def _digests(module_name: str, name: str) -> dict[str, str]:
     """The digest of one definition, and of the native sources of its module."""
-    module = _module(module_name)
+    module = module_of(module_name)
     assert module is not None
-    native = {(file := f"{module_name}:{source}"): source_digest(file) for source in _native_sources(module)}
+    native = {(file := f"{module_name}:{source}"): source_digest(file) for source in native_sources(module)}
     return {f"{module_name}.{name}": blake3(_read(module_name, name)[0].encode()).hexdigest()} | native
 
 
 @functools.cache
 def _needed(module_name: str, name: str, followed: tuple[str, ...]) -> _Needs:
     """What one definition leads to in the packages that are followed."""
-    module = _module(module_name)
+    module = module_of(module_name)
     assert module is not None
     nodes = _read(module_name, name)[1]
-    own = _imports(module, nodes)
+    own = imports_of(module, nodes)
     named = {node.id for node in nodes if isinstance(node, ast.Name)} & module.imports.keys()
     origins = [*own.values(), *(module.imports[name] for name in named)]
     imported = {origin.partition(".")[0] for several in origins for origin, _ in several}
@@ -165,14 +126,14 @@ def _needed(module_name: str, name: str, followed: tuple[str, ...]) -> _Needs:
 @functools.cache
 def _read(module_name: str, name: str) -> tuple[str, list[ast.AST]]:
     """One definition as canonical text, and the nodes that count in it."""
-    module = _module(module_name)
+    module = module_of(module_name)
     assert module is not None
     nodes: list[ast.AST] = []
     return "\n".join(_canonical(statement, nodes) for statement in module.definitions[name]), nodes
 
 
 def _dependencies(
-    module: _Module, nodes: list[ast.AST], local: Imports, followed: tuple[str, ...], looked_for: set[str]
+    module: Module, nodes: list[ast.AST], local: Imports, followed: tuple[str, ...], looked_for: set[str]
 ) -> Iterator[tuple[str, str]]:
     for node in nodes:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
@@ -183,7 +144,7 @@ def _dependencies(
                     yield origin, node.attr
                     continue
                 looked_for.add(f"{origin}.{attribute}")
-                if _source(f"{origin}.{attribute}"):
+                if source_of(f"{origin}.{attribute}"):
                     yield f"{origin}.{attribute}", node.attr
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
             if node.id in module.definitions:
@@ -202,94 +163,6 @@ def _loaded_by_name(nodes: list[ast.AST]) -> Iterator[str]:
                 args=[ast.Constant(value=str(name)), *_],
             ):
                 yield name.partition(".")[0]
-
-
-@functools.cache
-def _source(name: str) -> _Source | None:
-    """A module as it is written; None when there is none, or none in Python."""
-    parent = _source(package) if (package := name.rpartition(".")[0]) else None
-    if parent is not None and not parent.is_package:
-        return None  # a name in a module; to look further would import that
-    try:
-        spec = importlib.util.find_spec(name)
-    except (ImportError, ValueError):
-        return None
-    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
-        return None
-    path = Path(spec.origin)
-    return _Source(path, spec.submodule_search_locations is not None, path.read_text(encoding="utf-8"))
-
-
-@functools.cache
-def _module(name: str) -> _Module | None:
-    source = _source(name)
-    if source is None:
-        return None
-    module = _Module(name, source.path, source.is_package)
-    tree = ast.parse(source.text)
-    for statement in _top_level(tree.body):
-        for bound in _bound_names(statement):
-            module.definitions.setdefault(bound, []).append(statement)
-    module.imports = _imports(module, _top_level(tree.body))
-    return module
-
-
-def _top_level(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    """The statements of a module, those under `if` and `try` included; what only type checkers see is not."""
-    for statement in body:
-        if isinstance(statement, ast.If):
-            if "TYPE_CHECKING" not in ast.dump(statement.test):
-                yield from _top_level(statement.body)
-            yield from _top_level(statement.orelse)
-        elif isinstance(statement, ast.Try):
-            for part in (statement.body, *(h.body for h in statement.handlers), statement.orelse, statement.finalbody):
-                yield from _top_level(part)
-        else:
-            yield statement
-
-
-def _bound_names(statement: ast.stmt) -> list[str]:
-    match statement:
-        case ast.FunctionDef(decorator_list=decorators):
-            return [statement.name, *dict.fromkeys(_dispatching(decorators))]
-        case ast.AsyncFunctionDef() | ast.ClassDef():
-            return [statement.name]
-        case ast.Assign():
-            return [n.id for target in statement.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
-        case ast.AnnAssign(target=ast.Name(id=name)) | ast.AugAssign(target=ast.Name(id=name)):
-            return [name]
-    return []
-
-
-def _dispatching(decorators: list[ast.expr]) -> Iterator[str]:
-    """The functions of `functools.singledispatch` that `@f.register` and `@f.register(type)` add a branch to."""
-    for decorator in decorators:
-        match decorator.func if isinstance(decorator, ast.Call) else decorator:
-            case ast.Attribute(value=ast.Name(id=function), attr="register"):
-                yield function
-
-
-def _imports(module: _Module, nodes: Any) -> Imports:
-    found: Imports = {}
-    for node in nodes:
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                found.setdefault(alias.asname or alias.name.partition(".")[0], []).append((alias.name, None))
-        elif isinstance(node, ast.ImportFrom):
-            package = module.name if module.is_package else module.name.rpartition(".")[0]
-            for _ in range(node.level - 1):
-                package = package.rpartition(".")[0]
-            origin = f"{package}.{node.module}" if node.level and node.module else node.module or package
-            for alias in node.names:
-                found.setdefault(alias.asname or alias.name, []).append((origin, alias.name))
-    return found
-
-
-def _native_sources(module: _Module) -> tuple[str, ...]:
-    for statement in module.definitions.get(NATIVE_SOURCES, ()):
-        if isinstance(statement, ast.Assign):
-            return tuple(ast.literal_eval(statement.value))
-    return ()
 
 
 def _canonical(node: Any, counted: list[ast.AST]) -> str:

@@ -22,11 +22,13 @@ from typing import Any
 
 from blake3 import blake3
 
-from ss_flow import closure
+from ss_flow import closure, sources
 from ss_flow.cache.files import write_atomically
-from ss_flow.closure import Closure, closure_of, source_digest
+from ss_flow.closure import Closure, closure_of
+from ss_flow.sources import source_digest
 
-_SIGNS = {"python": platform.python_version(), "analysis": blake3(Path(closure.__file__).read_bytes()).hexdigest()}
+_ANALYSIS = b"".join(Path(file).read_bytes() for file in (closure.__file__, sources.__file__))
+_SIGNS = {"python": platform.python_version(), "analysis": blake3(_ANALYSIS).hexdigest()}
 """What a closure depends on besides what it is read from."""
 
 
@@ -54,10 +56,9 @@ def _read(file: Path) -> Closure | None:
     content = json.loads(text)
     if any(content[name] != value for name, value in _SIGNS.items()):
         return None
-    sources = content["sources"]
-    if any(source_digest(name) != known for name, known in sources.items()):
+    if any(source_digest(name) != known for name, known in content["sources"].items()):
         return None
-    return Closure(content["definitions"], frozenset(content["modules"]), sources)
+    return Closure(content["definitions"], frozenset(content["modules"]), content["sources"])
 
 
 def _digest(text: str) -> str:

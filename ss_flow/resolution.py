@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from ss_flow.graph import Call, Expand, Flow, Gather, Item, Node, Otherwise, Pick, Stored
@@ -19,6 +19,14 @@ class Failure:
     label: str
     """The node that failed first."""
     error: BaseException
+
+
+@dataclass
+class KnownCalls:
+    """How many calls of a flow are needed, as far as the graph is known."""
+
+    total: int = 0
+    of_step: Counter[str] = field(default_factory=Counter)
 
 
 class NotRun(RuntimeError):
@@ -37,8 +45,7 @@ class Resolution:
     ) -> None:
         self._load, self._call, self._skipped = load, call, skipped
         self.values: dict[Node, Value | Failure] = {}
-        self.known_calls: dict[Flow, Counter[str]] = defaultdict(Counter)
-        """How many calls of each step are needed, as far as the graph is known; under "" of all steps."""
+        self.known_calls: dict[Flow, KnownCalls] = defaultdict(KnownCalls)
         self._unresolved: dict[Node, int] = {}
         self._consumers: dict[Node, list[Node]] = defaultdict(list)
         self._awaited: dict[Node, list[Callable[[], None]]] = defaultdict(list)
@@ -58,8 +65,8 @@ class Resolution:
                 continue
             if isinstance(node, Call):
                 known = self.known_calls[node.flow]
-                known[node.step] += 1
-                known[""] += 1
+                known.total += 1
+                known.of_step[node.step] += 1
             sources = list(dict.fromkeys(node.waits_for()))
             self._await(node, sources)
             pending.extend(sources)

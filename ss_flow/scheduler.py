@@ -286,7 +286,8 @@ class Scheduler:
 
     def _about(self, node: Node) -> dict[str, Any]:
         known = self._graph.known_calls[node.flow]
-        return {"label": node.label, "step": node.step, "item": node.item, "of": known[node.step], "known": known[""]}
+        of_step = known.of_step[node.step]
+        return {"label": node.label, "step": node.step, "item": node.item, "of": of_step, "known": known.total}
 
 
 def _described(error: BaseException) -> str:
