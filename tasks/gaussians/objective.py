@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -65,11 +64,6 @@ def decayed(start: float, final: float, share: float) -> float:
     if start <= 0 or final <= 0:
         return start + (final - start) * share
     return float(start * (final / start) ** share)
-
-
-def along_cosine(start: float, final: float, share: float) -> float:
-    """From `start` to `final` along half a cosine."""
-    return final + (start - final) * (1 + math.cos(math.pi * share)) / 2
 
 
 @dataclass(frozen=True)

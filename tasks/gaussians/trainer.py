@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
 from ss_flow.tasks.artifacts import Float32, Gaussians
-from ss_flow.tasks.gaussians.backends import AdamStep, Array, Backend, Values, backend_for
+from ss_flow.tasks.gaussians.backends import AdamStep, Backend, Values, backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecord, Schedule, Seen
+from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import Settings
-from ss_flow.tasks.gaussians.objective import Objective, Target, Weights, along_cosine, decayed
+from ss_flow.tasks.gaussians.objective import Objective, Target, Weights
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.gaussians.render import channels_of
@@ -30,48 +31,6 @@ CHECKPOINT_SECONDS = 60.0
 
 class TrainingDiverged(RuntimeError):
     """The loss or a parameter is no longer finite."""
-
-
-@dataclass(frozen=True)
-class LearningRates:
-    """Adam's learning rates, for trainings of hundreds of steps; those of 3DGS, for 30,000, are several times lower."""
-
-    position: NonNegative = 3.2e-4
-    """Of the means at the first step, times the extent of what is trained."""
-    position_final: NonNegative = 3.2e-6
-    """Of the means at the last step, times the extent."""
-    color: NonNegative = 1e-2
-    """Of the colours; a twentieth above degree 0."""
-    opacity: NonNegative = 0.05
-    """Of the opacity logits."""
-    scale: NonNegative = 2e-2
-    """Of the logarithmic scales."""
-    rotation: NonNegative = 3e-3
-    """Of the quaternions."""
-    final_share: Fraction = 1.0
-    """What is left at the last step of the rates of colours, opacities, scales and quaternions; 1 = they stay, as in
-    3DGS."""
-    fall: Literal["exponential", "cosine"] = "exponential"
-    """How rates get from the first step's to the last one's: "exponential", as in 3DGS; or along half a "cosine", which
-    stays high for longer (Loshchilov and Hutter 2017)."""
-
-    def at(self, done_share: float) -> LearningRates:
-        """The rates of a step. done_share: 0 for the first, 1 for the last."""
-        fallen = decayed if self.fall == "exponential" else along_cosine
-        rest = fallen(1.0, self.final_share, done_share)
-        return replace(
-            self,
-            position=fallen(self.position, self.position_final, done_share),
-            color=rest * self.color,
-            opacity=rest * self.opacity,
-            scale=rest * self.scale,
-            rotation=rest * self.rotation,
-        )
-
-
-SLOW_RATES = LearningRates(position=1.6e-4, position_final=1.6e-6, scale=5e-3, rotation=1e-3)
-"""For trainings of thousands of steps, and where centres must not leave a surface without texture: 3DGS's but for the
-colours."""
 
 
 @dataclass(frozen=True)
@@ -252,8 +211,7 @@ class _Training:
             for name, gradient in towards.items():
                 found.gradients[name][rows] += gradient
         self._losses[self.step - 1] = found.loss
-        now = params.rates.at(done_share)
-        rates = _by_name(now, now.position * self._extents[parameters.origin])
+        rates = params.rates.at(done_share).by_parameter(self._extents[parameters.origin])
         parameters.step(found.gradients, AdamStep(self.step, rates, degree))
         if params.max_scale:
             parameters.limit_scale(self._longest[parameters.origin])
@@ -332,14 +290,3 @@ def _control(params: TrainParams, record: GradientRecord, extent: float) -> Adap
         most=params.max_gaussians or sys.maxsize,
         prune_opacity=params.prune_opacity,
     )
-
-
-def _by_name(rates: LearningRates, means: Array) -> dict[str, Any]:
-    return {
-        "means": means,
-        "quaternions": rates.rotation,
-        "log_scales": rates.scale,
-        "opacity_logits": rates.opacity,
-        "sh": rates.color,
-        "sh_rest": rates.color / 20,
-    }

@@ -12,10 +12,11 @@ from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, extents, select
+from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import (
     IGNORED,
     NONE_OF_MINE,

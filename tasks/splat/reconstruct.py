@@ -13,9 +13,10 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import REFINED, Float32, Gaussians, InstanceMasks, Int32
 from ss_flow.tasks.gaussians.densification import Schedule
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, initialise, laid_flat
+from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import (
     NONE_OF_MINE,
     CropParams,

@@ -10,10 +10,11 @@ from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Frame, Gaussians, PointCloud, SceneUnit
 from ss_flow.tasks.gaussians.initialise import SH_ZERO, initialise
+from ss_flow.tasks.gaussians.learning_rates import SLOW_RATES
 from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import SceneViews, TrainView, whole_view
 from ss_flow.tasks.geometry.cameras import cameras_by_view
 from ss_flow.tasks.geometry.fusion import VoxelSums, sum_by_voxel, with_sparse_points

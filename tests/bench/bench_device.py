@@ -22,10 +22,11 @@ import torch
 from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians.initialise import initialise, with_sh_degree
+from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, rasterize
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.torch_backend import TorchBackend
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
 

@@ -26,8 +26,9 @@ from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.evaluate.neighbour_colours import NeighbourColours
 from ss_flow.tasks.evaluate.novel_view import colour_fitted, psnr, ssim, to_8bit
 from ss_flow.tasks.gaussians.initialise import initialise
+from ss_flow.tasks.gaussians.learning_rates import SLOW_RATES
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import SLOW_RATES, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, transformed

@@ -47,8 +47,9 @@ from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.evaluate.novel_view import novel_view, to_8bit
 from ss_flow.tasks.evaluate.objects import change_elsewhere, floaters, fringe_share
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
+from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import CropParams, crop_camera
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png

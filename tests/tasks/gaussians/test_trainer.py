@@ -13,10 +13,11 @@ from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians.backends import NativeBackend
 from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify, rotations
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, laid_flat, select
+from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.trainer import LearningRates, PartView, TrainingDiverged, TrainParams, train
+from ss_flow.tasks.gaussians.trainer import PartView, TrainingDiverged, TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
 
