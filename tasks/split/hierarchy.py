@@ -23,7 +23,6 @@ from ss_flow.tasks.artifacts import (
     Float32,
     Float64,
     Hierarchy,
-    Int32,
     PointCloud,
     PointLabels,
     Tally,
@@ -31,6 +30,7 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.split.agreement import View, agreement_of, ramp, views_of
 from ss_flow.tasks.split.edges import convex_edges
 from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
 from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
@@ -38,14 +38,6 @@ from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
-_IOU = (0.5, 0.8)
-"""IoU of a mask with the pieces from which on it begins to show them as one, and from which it does."""
-_REST = (0.3, 0.7)
-"""The same for the share that it holds of all but the largest piece, which alone may make up most of the IoU."""
-_OWN = 0.75
-"""IoU with a single piece from which a mask is the piece's own."""
-_BALANCED = 0.1
-"""Share of the smaller pieces in what a view sees of all, from which on the view counts in full."""
 _ON_TOP = 0.5
 """What is left of an agreement when one piece stands on the others: the views show a group."""
 _ALONE = 0.5
@@ -124,7 +116,8 @@ def hierarchy(
     edges = np.zeros((len(names), len(names)), bool)
     if params.convex:
         edges = convex_edges(points, cameras, visibility, labels.label, ends)
-    pieces = _Pieces.of(names, tallies, is_stuff, contact, edges, mounds, sheets, params)
+    own: list[tuple[int, ...]] = [(row,) for row in range(len(names))]
+    pieces = _Pieces(views_of(names, tallies), is_stuff, contact, edges, own, mounds, sheets, params)
     node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
     top = list(range(len(names)))  # the tree's row of each piece
     lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
@@ -149,29 +142,11 @@ def hierarchy(
 
 
 @dataclass(frozen=True)
-class _View:
-    """One view's counts, a column for each piece; 0 where it sees too little of a piece."""
-
-    seen: Float32
-    """[G]."""
-    held: Float32
-    """[M, G]."""
-    quality: Float64
-    """[M] how sure the segmenter is of each mask."""
-    own: Float64
-    """[G] quality of the best mask that is a piece's own, 0 where there is none."""
-
-
-@dataclass(frozen=True)
 class _Pieces:
     """G pieces that may be united, and what the K views say about sets of them."""
 
-    seen: list[Float32]
-    """K x [G] points of each piece that a view sees."""
-    held: list[Float32]
-    """K x [M, G] those under each of its masks."""
-    quality: list[Float64]
-    """K x [M] how sure the segmenter is of each mask."""
+    views: list[View]
+    """K."""
     stuff: Bool
     """[G]."""
     contact: Float32
@@ -184,41 +159,12 @@ class _Pieces:
     sheets: Sheets
     params: HierarchyParams
 
-    @staticmethod
-    def of(
-        names: Int32,
-        tallies: Sequence[Tally],
-        stuff: Bool,
-        contact: Float32,
-        edges: Bool,
-        mounds: Mounds,
-        sheets: Sheets,
-        params: HierarchyParams,
-    ) -> _Pieces:
-        """Each label on its own."""
-        seen, held, quality = [], [], []
-        for tally in {_content(tally): tally for tally in tallies}.values():  # a second copy of a view says nothing
-            column = np.searchsorted(names, tally.label)
-            seen.append(np.zeros(len(names), np.float32))  # counts are exact in it, and take half the memory
-            seen[-1][column] = tally.seen
-            held.append(np.zeros((len(tally.held), len(names)), np.float32))
-            held[-1][:, column] = tally.held
-            quality.append(tally.quality.astype(np.float64))
-        own: list[tuple[int, ...]] = [(row,) for row in range(len(names))]
-        return _Pieces(seen, held, quality, stuff, contact, edges, own, mounds, sheets, params)
-
     @functools.cached_property
-    def views(self) -> list[_View]:
-        """What counts of each view."""
-        most = np.max(self.seen, axis=0, initial=0)
-        views = []
-        for of_view, under, sure in zip(self.seen, self.held, self.quality, strict=True):
-            enough = (of_view >= self.params.min_points) & (of_view >= self.params.min_visible * most)
-            count, inside = of_view * enough, under * enough
-            iou = inside / np.maximum(inside.sum(axis=1, keepdims=True) + count - inside, 1)
-            own = np.where(iou >= _OWN, sure[:, None], 0).max(axis=0, initial=0)
-            views.append(_View(count, inside, sure, own))
-        return views
+    def counted(self) -> list[View]:
+        """What counts of each view: the pieces of which it sees enough."""
+        most = np.max([view.seen for view in self.views], axis=0, initial=0)
+        least, share = self.params.min_points, self.params.min_visible
+        return [view.only((view.seen >= least) & (view.seen >= share * most)) for view in self.views]
 
     def united(self, unions: list[tuple[int, ...]]) -> _Pieces:
         """What is left when each of these sets has become one piece: the others first, then the unions."""
@@ -230,8 +176,7 @@ class _Pieces:
             joined[list(members), column] = 1
         return replace(
             self,
-            seen=[seen @ joined for seen in self.seen],
-            held=[held @ joined for held in self.held],
+            views=[view.joined(joined) for view in self.views],
             stuff=self.stuff[[members[0] for members in groups]],
             contact=(joined.T @ self.contact @ joined * ~np.eye(len(groups), dtype=bool)).astype(np.float32),
             edges=joined.T @ self.edges @ joined * ~np.eye(len(groups), dtype=bool) > 0,
@@ -249,14 +194,17 @@ class _Pieces:
         member = np.zeros((len(sets), len(self.stuff)), np.float32)
         for row, members in enumerate(sets):
             member[row, list(members)] = 1
-        agreement = self._agreement(member)
-        agreement += (1 - agreement) * self.params.alone * self._alone(member)
-        least = np.where([members in faces for members in sets], self.params.convex, 0)
+        params = self.params
+        agreement = agreement_of(
+            self.counted, member, doubt=params.doubt, prior=params.prior, prior_agreement=params.prior_agreement
+        )
+        agreement += (1 - agreement) * params.alone * self._alone(member)
+        least = np.where([members in faces for members in sets], params.convex, 0)
         agreement = np.maximum(agreement * np.where(group, _ON_TOP, 1.0), least).astype(np.float64).round(6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
-            if agreement[row] < max(self.params.min_agreement, 1e-6):
+            if agreement[row] < max(params.min_agreement, 1e-6):
                 break
             if not taken & set(sets[row]):
                 chosen.append((sets[row], float(agreement[row])))
@@ -267,9 +215,9 @@ class _Pieces:
         """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
         on the others. With each, whether something still does."""
         shown: Counter[tuple[int, ...]] = Counter()
-        for view in self.views:
-            for held in (view.held >= 0.5 * view.seen) & (view.seen > 0):
-                members = tuple(np.flatnonzero(held).tolist())
+        for view in self.counted:
+            for shows in view.shows:
+                members = tuple(np.flatnonzero(shows).tolist())
                 if len(members) > 1 and len(set(self.stuff[list(members)].tolist())) == 1:
                     shown[members] += 1
         on_top = {members: self._standing(members) for members in shown}
@@ -285,11 +233,9 @@ class _Pieces:
         """The pairs of things that meet in a convex edge, and that the views do not deny to be one."""
         a, b = np.nonzero(np.triu(self.edges) & ~self.stuff & ~self.stuff[:, None])
         both, together = np.zeros((2, len(a)))
-        for view in self.views:
-            seen = view.seen > 0
-            holds = (view.held >= 0.5 * view.seen) & seen
-            both += seen[a] & seen[b]
-            together += (holds[:, a] & holds[:, b]).any(axis=0)
+        for view in self.counted:
+            both += (view.seen[a] > 0) & (view.seen[b] > 0)
+            together += (view.shows[:, a] & view.shows[:, b]).any(axis=0)
         one = (together > 0) & (together >= _TOGETHER * both)
         return set(zip(a[one].tolist(), b[one].tolist(), strict=True))
 
@@ -306,37 +252,4 @@ class _Pieces:
         inside = np.einsum("sg,gh,sh->s", member, self.contact, member, optimize=True) / 2
         outside = np.einsum("sg,gh,sh->s", member, self.contact, (1 - member) * ~self.stuff, optimize=True)
         things = (member @ self.stuff) == 0
-        return things * _ramp(inside / (inside + outside + _TOUCH), _ALONE, 1.0)
-
-    def _agreement(self, member: Float32) -> Float64:
-        """[S] share of the views that show each set of pieces [S, G] as one, of those that see at least two of them:
-        the mean of the share's posterior, as a beta distribution with the prior."""
-        agreed, asked = np.zeros(len(member)), np.zeros(len(member))
-        for view in self.views:
-            seen = member * view.seen
-            total, largest = seen.sum(axis=1), seen.max(axis=1)
-            weight = np.minimum((1 - largest / np.maximum(total, 1)) / _BALANCED, 1)
-            rows = np.flatnonzero((total > 0) & (weight > 0))
-            asked[rows] += weight[rows]
-            if not rows.size or not len(view.held):
-                continue
-            total, largest, seen = total[rows, None], largest[rows, None], seen[rows]
-            inside = member[rows] @ view.held.T
-            iou = inside / np.maximum(view.held.sum(axis=1) + total - inside, 1)
-            rest = (inside - view.held[:, seen.argmax(axis=1)].T) / (total - largest)
-            surest_piece = np.where(seen > 0, view.own, 0).max(axis=1)
-            doubt = (surest_piece[:, None] - view.quality) / max(self.params.doubt, 1e-9)
-            fit = _ramp(iou, *_IOU) * _ramp(rest, *_REST) * np.clip(1 - doubt, 0, 1)
-            agreed[rows] += weight[rows] * fit.max(axis=1)
-        prior = self.params.prior
-        return (agreed + prior * self.params.prior_agreement) / np.maximum(asked + prior, 1e-9)
-
-
-def _content(tally: Tally) -> tuple[object, ...]:
-    """What a tally says, whatever the order of its masks."""
-    masks = sorted((float(quality), held.tobytes()) for quality, held in zip(tally.quality, tally.held, strict=True))
-    return tally.label.tobytes(), tally.seen.tobytes(), tuple(masks)
-
-
-def _ramp(value: Float64, low: float, high: float) -> Float64:
-    return np.clip((value - low) / (high - low), 0, 1)
+        return things * ramp(inside / (inside + outside + _TOUCH), _ALONE, 1.0)
