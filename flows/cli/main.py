@@ -5,7 +5,9 @@ Exit codes: 0 done, 1 failed, 2 bad usage or bad input, 3 done but degraded, 130
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import io
 import os
 import signal
 import sys
@@ -39,15 +41,7 @@ def main(arguments: list[str]) -> int:
         print(f"ss-flow {version('ss-flow')}")
         return 0
     try:
-        command: Any = tyro.cli(
-            chosen(arguments),
-            prog="ss-flow",
-            description="From a capture to instance-labelled 3D Gaussians; nothing is computed twice. "
-            "`ss-flow demo` shows it on a room of its own, `ss-flow run PATH` takes yours.",
-            args=arguments,
-            config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-        )
-        return int(command.run())
+        return int(_read(arguments).run())
     except InputError as error:
         _complain(str(error))
         return BAD_INPUT
@@ -67,6 +61,33 @@ def main(arguments: list[str]) -> int:
             raise
         _complain(f"failed: {type(error).__name__}: {error}", "Set SS_FLOW_DEBUG=1 to see where.")
         return FAILED
+
+
+def _read(arguments: list[str]) -> Any:
+    """The command that the arguments call. Raises InputError about a word that nobody knows."""
+
+    def read(arguments: list[str], **more: Any) -> Any:
+        return tyro.cli(
+            chosen(arguments),
+            prog="ss-flow",
+            description="From a capture to instance-labelled 3D Gaussians; nothing is computed twice. "
+            "`ss-flow demo` shows it on a room of its own, `ss-flow run PATH` takes yours.",
+            args=arguments,
+            config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+            **more,
+        )
+
+    if {"-h", "--help"} & set(arguments) or arguments[0].startswith("--tyro"):
+        return read(arguments)
+    left: list[str] = []
+    with contextlib.suppress(SystemExit), contextlib.redirect_stderr(io.StringIO()):
+        command, left = read(arguments, return_unknown_args=True)
+        if not left:
+            return command
+    from ss_flow.flows.cli.unknown import refuse_unknown
+
+    refuse_unknown(arguments, left, read)
+    return read(arguments)  # says what else is wrong, and exits
 
 
 def _complain(problem: str, *more: str, style: str = "red") -> None:

@@ -74,7 +74,7 @@ class RunOptions:
     @property
     def target(self) -> str | None:
         """The step of --until; "split.propagate" is "propagate", and so is one node of a step, "propagate[3]"."""
-        return self.until.partition("[")[0].rpartition(".")[2] if self.until else None
+        return self.until.partition("[")[0].rpartition(".")[2] if self.until is not None else None
 
     @property
     def delivers(self) -> bool:
@@ -95,7 +95,7 @@ class RunOptions:
         except ValueError as error:
             raise InputError(f"--memory {error}") from None
         if self.memory is not None and memory_mb == 0:
-            raise InputError(f"--memory {self.memory} is out of range; it must be 1 MiB or more.")
+            raise InputError(f"--memory {self.memory} is out of range; it must be 1 MiB or more, such as 8GB.")
         return {
             "jobs": self.jobs,
             "memory_mb": memory_mb,

@@ -109,7 +109,7 @@ def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions,
     """Run the DAG on a scene, write the output folder, print what came out. Returns the exit code."""
     params = settings.apply(params, options.texts)
     engine = options.engine()
-    if options.delivers:
+    if options.until is None:
         check_place(out)
     store = options.store.open_store()
     digests = file_digests(store, verify=options.verify)

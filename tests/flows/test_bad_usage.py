@@ -84,6 +84,11 @@ RUNS: dict[str, tuple[Make, str]] = {
         lambda base, scene: [scene, "--until", "train"],
         "--until 'train' names no step; there are ingest",
     ),
+    "no step at all": (lambda base, scene: [scene, "--until", ""], "--until '' names no step; there are ingest"),
+    "a dry run into what holds other things": (
+        lambda base, scene: [scene, "--dry-run", "--out", file(folder(base / "papers") / "a.txt").parent],
+        "papers holds something else than an earlier result",
+    ),
     "an unknown executor": (lambda base, scene: [scene, "--executor", "slurm"], "choose one of: threads, processes"),
     "a negative number of jobs": (lambda base, scene: [scene, "--jobs", "-1"], "--jobs -1 is out of range"),
     "an output that is a file": (
@@ -200,9 +205,8 @@ def test_a_bad_input_leaves_an_earlier_result_as_it_was(broken, warm, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["paint"], "paint"),
         (["run"], "required"),
-        (["run", "x", "--colour"], "Unrecognized"),
+        (["cache"], "Expected one of"),
         (["run", "x", "--jobs", "many"], "jobs"),
         (["run", "x", "--calibrate", "poses"], "calibrate"),
         (["query", "x"], "required"),
@@ -214,6 +218,27 @@ def test_a_wrong_command_line_is_refused_with_a_hint(arguments, says):
     assert called.code == 2
     assert says in called.out + called.err
     assert "Traceback" not in called.out + called.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["paint"], r"`ss-flow` has no command 'paint'; `ss-flow --help` lists all"),
+        (["rum", "x"], "has no command 'rum'; did you mean run"),
+        (["cache", "lss"], "`ss-flow cache` has no command 'lss'; did you mean ls"),
+        (["."], r"has no command '\.'; `ss-flow run PATH` runs a capture"),
+        (["--colour"], "`ss-flow` has no option --colour; `ss-flow --help` lists all"),
+        (["run", "x", "--colour"], "`ss-flow run` has no option --colour; `ss-flow run --help` lists all"),
+        (["run", "x", "-o", "out"], "has no option -o; did you mean --out"),
+        (["run", "-o", "out", "x"], "has no option -o; did you mean --out"),
+        (["run", "--output=out", "x"], "has no option --output; did you mean --out"),
+        (["run", "x", "--dryrun"], "has no option --dryrun; did you mean --dry-run"),
+        (["cache", "ls", "--png", "x.png"], "`ss-flow cache ls` has no option --png"),
+        (["run", "my", "photos"], "`ss-flow run` has no use for 'photos'; a name with blanks"),
+    ],
+)
+def test_a_word_nobody_knows_is_refused_with_what_may_have_been_meant(arguments, expected):
+    assert_refused(ss_flow(*arguments), expected)
 
 
 QUERIES: dict[str, tuple[Callable[[Path], list[str]], str]] = {
