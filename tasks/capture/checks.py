@@ -45,6 +45,8 @@ _FAR_PAIRS = 40
 _TIED = 1 / 3
 """Weight of an exposure of 1 against a factor between neighbours: errors of many factors must not add up over a walk.
 Slow changes are told as less than they are."""
+_OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Between a camera's axes in OpenGL and in OpenCV."""
 _SAME_PICTURE = 1.0
 """Mean difference of grey values, of 255, below which two photos are the same."""
 
@@ -103,17 +105,15 @@ def checks(
     names, exposure = tuple(frame.name for frame in frames), _exposures(len(frames), gains)
     duplicates = _duplicates(names, [view.grey for view in views])
     result = CaptureChecks(names, error, likeness, exposure, scale, duplicates)
-    for text in _told(result, cameras, params):
+    known = error[np.isfinite(error)]
+    misfit = bool(pairs) and scale == 1 and not (len(known) and np.median(known) <= params.max_depth_error)
+    for text in _told(result, cameras, params, _exchanged(views, cameras, params) if misfit else ""):
         warn(text)
-    if pairs and scale == 1 and not np.isfinite(error).any():
-        warn(
-            "No view's depth is met in the views beside it: poses, intrinsics and depth disagree, or nothing overlaps."
-        )
     return result
 
 
-def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterable[str]:
-    """What is to be said, with figures."""
+def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams, exchanged: str) -> Iterable[str]:
+    """What is to be said, with figures. exchanged: what would make poses fit that do not."""
     names = np.array(found.names)
     if found.duplicates:
         share = len(found.duplicates) / len(names)
@@ -125,7 +125,8 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterab
         width, height = cameras.sizes[worst]
         yield (
             f"The principal point of {(off > params.max_center).sum()} views lies far from the middle, that of "
-            f"{names[worst]} at ({cx:.0f}, {cy:.0f}) of {width} x {height} pixels; are its intrinsics exchanged?"
+            f"{names[worst]} at ({cx:.0f}, {cy:.0f}) of {width} x {height} pixels; are its intrinsics exchanged, or "
+            "those of a photo of another size?"
         )
     known = found.depth_error[np.isfinite(found.depth_error)]
     usual = float(np.median(known)) if len(known) else None
@@ -137,8 +138,16 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterab
             "its unit right?"
         )
     elif usual is not None and usual > params.max_depth_error:
-        yield f"Depth carried from view to view differs by {usual:.1%} (median): poses, intrinsics and depth disagree."
-    if np.isnan(found.likeness).all():
+        yield (
+            f"Depth carried from view to view differs by {usual:.1%} (median): poses, intrinsics and depth disagree"
+            f"{exchanged}."
+        )
+    elif usual is None and len(names) > 1:
+        yield (
+            "No view's depth is met in the views beside it: poses, intrinsics and depth disagree, or nothing overlaps"
+            f"{exchanged}."
+        )
+    if np.isnan(found.likeness).all() or exchanged:  # by such poses the wrong pixels are compared
         return
     with np.errstate(invalid="ignore"):
         odd = found.depth_error > max(params.max_view_error * (usual or 0), 0.01)
@@ -158,6 +167,25 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams) -> Iterab
     low, high = np.quantile(found.exposure, (0.05, 0.95))
     if high / low > params.max_exposure:
         yield f"The photos' exposure changes by a factor of {high / low:.2f} between nearby views."
+
+
+def _exchanged(views: Sequence[_View], cameras: Cameras, params: CheckParams) -> str:
+    """Which exchange of conventions makes poses fit depth, as the end of a sentence; "" where none does.
+
+    Only how cameras lie to each other counts, so the axes of the world are of no concern.
+    """
+    inverse = np.linalg.inv(cameras.world_to_camera)
+    inverted = "the poses are inverted: camera-to-world and world-to-camera are exchanged"
+    turned = "y and z of the cameras are turned: OpenGL's axes and OpenCV's are exchanged"
+    flipped = _OTHER_AXES @ cameras.world_to_camera
+    for meant, words in ((inverse, inverted), (_OTHER_AXES @ inverse, inverted), (flipped, turned)):
+        moved = [replace(v, camera=replace(v.camera, world_to_camera=m)) for v, m in zip(views, meant, strict=True)]
+        changed = replace(cameras, world_to_camera=meant)
+        pairs = ((row, other) for row in range(len(views)) for other in nearest_views(changed, row, _NEIGHBOURS))
+        errors = [_error(moved[row], moved[other]) for row, other in pairs]
+        if errors and np.median(np.nan_to_num(errors, nan=_OCCLUDED)) <= params.max_depth_error:
+            return f"; they agree once {words}"
+    return ""
 
 
 @dataclass(frozen=True)

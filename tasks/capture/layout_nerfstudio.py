@@ -35,7 +35,10 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     places = [(frame, _photo(root, frame["file_path"])) for frame in listed]
     found = [(frame, photo) for frame, photo in places if photo is not None]
     if not found:
-        raise InputError(f"{path} lists {len(listed)} photos, and none of them exists; put them into {root}.")
+        first = root / listed[0]["file_path"]
+        raise InputError(
+            f"{path} lists {len(listed)} photos, and none of them exists; the first is looked for at {first}."
+        )
     frames, photos = [frame for frame, _ in found], tuple(photo for _, photo in found)
     missing = tuple(Path(frame["file_path"]).stem for frame, photo in places if photo is None)
     with_depth = [f for f in frames if f.get("depth_file_path")]

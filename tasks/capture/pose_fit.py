@@ -124,6 +124,14 @@ def better_poses(
 
     before, after: how the given and the refined poses fit. Says which it is, and why.
     """
+    if np.array_equal(
+        given.world_to_camera, refined.world_to_camera
+    ):  # and why, was told where they were to be refined
+        warn(
+            "The poses that came with this capture may not be exact: matched points lie "
+            f"{1000 * before.distance:.2f} thousandths of the photo's longer side off their epipolar lines (median)."
+        )
+        return given
     side = f"{1000 * after.distance:.2f} instead of {1000 * before.distance:.2f} thousandths of the photo's longer side"
     depth = f"; depth carried from view to view differs by {after.depth:.2%} instead of {before.depth:.2%}"
     figures = f"matched points lie {side} off their epipolar lines{depth if np.isfinite(after.depth) else ''} (medians)"

@@ -58,7 +58,7 @@ def _rolling(room: Room) -> Room:
 _DISAGREE = "poses, intrinsics and depth disagree"
 _SCALE = "Depth fits the poses 0.2 times as large"
 _REPEATED = "2 photos (20%) repeat an earlier one: 0003, 0007."
-_EXCHANGED = "(30, 40) of 80 x 60 pixels; are its intrinsics exchanged?"
+_EXCHANGED = "(30, 40) of 80 x 60 pixels; are its intrinsics exchanged, or those of a photo of another size?"
 _STRANGE = "1 photos do not show what their neighbours do"
 _EXPOSURE = "exposure changes by a factor of 1."
 SENTENCES = {_DISAGREE, _SCALE, _REPEATED, _EXCHANGED, _STRANGE, _EXPOSURE}

@@ -220,7 +220,7 @@ def transforms_of_a_panorama(root):
     return made.nerfstudio(root, camera_model="EQUIRECTANGULAR")
 
 
-@case("transforms.json", "none of them exists")
+@case("transforms.json", "none of them exists; the first is looked for at ")
 def listed_photos_missing(root):
     shutil.rmtree(made.nerfstudio(root) / "images")
     return root

@@ -106,11 +106,30 @@ def test_depth_of_a_wrong_scale_is_told_with_the_right_one(room: Room, factor: f
     assert np.nanmin(found.likeness) > 0.8, "photos are compared by the depth that fits"
 
 
-def test_poses_the_wrong_way_round_are_told(room: Room) -> None:
-    heard, _ = _checked(
-        room, cameras=replace(room.cameras, world_to_camera=np.linalg.inv(room.cameras.world_to_camera))
-    )
+@pytest.mark.parametrize(
+    ("mistake", "says"),
+    [
+        (
+            lambda poses, flip: np.linalg.inv(poses),
+            "the poses are inverted: camera-to-world and world-to-camera are exchanged.",
+        ),
+        (lambda poses, flip: flip @ np.linalg.inv(poses) @ flip, "the poses are inverted: camera-to-world"),
+        (lambda poses, flip: flip @ poses, "y and z of the cameras are turned: OpenGL's axes and OpenCV's are"),
+    ],
+    ids=["inverted", "inverted, of OpenGL", "axes of OpenGL"],
+)
+def test_exchanged_conventions_of_poses_are_told_and_nothing_that_follows_from_them(
+    room: Room, mistake: Any, says: str
+) -> None:
+    poses = mistake(room.cameras.world_to_camera, np.diag([1.0, -1.0, -1.0, 1.0]))
+    (said,), _ = _checked(room, cameras=replace(room.cameras, world_to_camera=poses))
+    assert "poses, intrinsics and depth disagree" in said and f"; they agree once {says}" in said
+
+
+def test_of_poses_that_are_merely_wrong_no_convention_is_blamed(room: Room) -> None:
+    heard, _ = _checked(room, cameras=_jittered(room, 0.0, 0.3, range(len(room))))
     assert any("poses, intrinsics and depth disagree" in said for said in heard)
+    assert not any("they agree" in said for said in heard)
 
 
 def test_duplicates_are_counted_and_named(room: Room) -> None:
@@ -125,7 +144,10 @@ def test_exchanged_intrinsics_are_told_by_the_principal_point(room: Room) -> Non
     wrong = room.cameras.intrinsics.copy()
     wrong[:, 2:] = wrong[:, 3:1:-1]
     heard, _ = _checked(room, cameras=replace(room.cameras, intrinsics=wrong))
-    assert any("(36, 48) of 96 x 72 pixels; are its intrinsics exchanged?" in said for said in heard)
+    assert any(
+        "(36, 48) of 96 x 72 pixels; are its intrinsics exchanged, or those of a photo of another size?" in said
+        for said in heard
+    )
 
 
 def test_a_turned_photo_is_named(room: Room) -> None:

@@ -127,3 +127,10 @@ def test_refined_poses_are_used_where_photos_fit_clearly_better_and_depth_no_wor
     with pytest.warns(UserWarning, match="refined ones are used" if used else "refined ones fit no better"):
         chosen = better_poses(cameras, refined, PoseFit(0.002, 0.005), after)
     assert chosen is (refined if used else cameras)
+
+
+def test_of_poses_that_could_not_be_refined_nothing_is_compared(scene):
+    cameras, fit = scene[0], PoseFit(0.002, 0.005)
+    with pytest.warns(UserWarning, match=r"may not be exact: matched points lie 2\.00 thousandths of") as said:
+        assert better_poses(cameras, replace(cameras), fit, fit) is cameras
+    assert "instead of" not in str(said[0].message)
