@@ -171,7 +171,7 @@ class _Call:
         if found is None:
             names = self.objects.names()
             close = _hint(value, names) if isinstance(value, str) else ""
-            raise ValueError(f"no instance goes by it at this point; instances.json lists ids and names{close}")
+            raise ValueError(f"no instance goes by {value!r} at this point; instances.json lists ids and names{close}")
         if self.op in _MOVING and not self.objects.solid(found):
             raise ValueError(f"{found} has no Gaussians (too few views show it); name one that has")
         return found

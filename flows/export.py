@@ -22,7 +22,7 @@ from ss_flow.tasks.deliver.export.usda import usda
 Gaussian = Literal["ply", "labelled-ply", "compressed-ply", "splat", "spz", "sog", "gltf", "usda"]
 Surface = Literal["mesh-ply", "mesh-obj", "mesh-glb"]
 Workspace = Literal["colmap", "nerfstudio"]
-Format = Gaussian | Surface | Literal["coco"] | Workspace
+Format = Literal[Gaussian, Surface, "coco", Workspace]  # a union of them would be told of in any order
 SURFACES, WORKSPACES = get_args(Surface), get_args(Workspace)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 from rich.markup import escape
@@ -61,6 +61,7 @@ class Export:
         folder = several or workspace
         out = self.out or Path("ss-flow-export") / (run.name + ("" if folder else formats.suffix_of(self.format)))
         _check_place(out, folder=folder)
+        self._check_suffix(out, folder=folder)
         if workspace:
             return self._write_workspace(out, run)
         pixels = _masks_and_photos(run) if self.format == "coco" else ((), ())
@@ -93,6 +94,13 @@ class Export:
             raise InputError("--each is for formats of Gaussians and meshes; coco tells all instances in one file.")
         if self.jobs < 0:
             raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
+
+    def _check_suffix(self, out: Path, *, folder: bool) -> None:
+        """Raises InputError for a file that would be taken for one of another format by its name."""
+        own = formats.suffix_of(self.format)
+        others = {formats.suffix_of(name) for name in get_args(formats.Format)} - {""}
+        if not folder and out.suffix in others and not own.endswith(out.suffix):
+            raise InputError(f"{out} is named like another format; a file of {self.format} ends in {own}.")
 
     def _write_workspace(self, out: Path, run: FinishedRun) -> int:
         """Write the photos and cameras that the run worked with."""
@@ -147,7 +155,9 @@ class Export:
         for failure in failures:
             words.print(f"[red]failed[/] {escape(failure['label'])}: {escape(failure['error'])}")
         size = sum(file["bytes"] for file in files) / 1e6
-        words.print(escape(f"{status}: {out} ({self.format}, {len(files)} files, {size:.1f} MB)"))
+        words.print(
+            escape(f"{status}: {out} ({self.format}, {len(files)} file{'s' * (len(files) != 1)}, {size:.1f} MB)")
+        )
         return STATUS_EXIT[status]
 
 

@@ -133,6 +133,7 @@ def test_the_background_is_an_instance_when_it_is_asked_for(tiny, tmp_path):
         (["--format", "ply", "--jobs", "-1"], "out of range"),
         (["--format", "colmap", "--instance", "1"], "holds photos and cameras"),
         (["--format", "coco", "--each"], "tells all instances in one file"),
+        (["--format", "gltf"], "a.ply is named like another format; a file of gltf ends in .glb."),
     ],
 )
 def test_bad_usage_gets_one_sentence(tiny, tmp_path, more, said):

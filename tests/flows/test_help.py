@@ -148,3 +148,9 @@ def test_help_says_what_to_give_and_not_that_it_may_be_left_out(command):
     shown = ss_flow(*command, "--help")
     assert shown.code == 0 and "usage: ss-flow " + " ".join(command) in shown.out
     assert "None" not in shown.out and "(default: )" not in shown.out
+
+
+def test_choices_are_told_in_the_order_in_which_they_are_documented():
+    called = ss_flow("export", "--help")
+    choices = re.search(r"--format\s+\{([^}]*)\}", re.sub(r"[│\s]+", " ", called.out))
+    assert choices and choices[1].replace(" ", "").split(",")[:3] == ["ply", "labelled-ply", "compressed-ply"]
