@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 failed, 2 bad usage or bad input, 3 done but degraded, 130
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import io
 import os
@@ -59,7 +60,12 @@ def main(arguments: list[str]) -> int:
     except Exception as error:
         if os.environ.get("SS_FLOW_DEBUG"):
             raise
-        _complain(f"failed: {type(error).__name__}: {error}", "Set SS_FLOW_DEBUG=1 to see where.")
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            _complain(
+                f"the output cannot be written: {error.strerror}; what was computed is kept, run again with room."
+            )
+        else:
+            _complain(f"failed: {type(error).__name__}: {error}", "Set SS_FLOW_DEBUG=1 to see where.")
         return FAILED
 
 

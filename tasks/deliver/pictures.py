@@ -63,7 +63,8 @@ def film(pictures: Sequence[FileContent], *, what: What, fps: int) -> FileConten
     """The pictures of `picture` as an MP4 file (MPEG-4 part 2), at most 8 bits a channel.
 
     Ids are painted in their colours, depth in one colour scale for all pictures, near = red. Sizes are made even by
-    repeating the last row or column. Raises InputError when this OpenCV cannot write such a file, or sizes differ.
+    repeating the last row or column. Raises InputError when this OpenCV cannot write such a file, or sizes differ;
+    OSError when there is no room for it.
     """
     import cv2
 
@@ -85,6 +86,8 @@ def film(pictures: Sequence[FileContent], *, what: What, fps: int) -> FileConten
             even = np.pad(painted, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             writer.write(np.ascontiguousarray(even[..., ::-1]))
         writer.release()
+        if cv2.VideoCapture(str(file)).get(cv2.CAP_PROP_FRAME_COUNT) != len(frames):  # OpenCV does not tell of it
+            raise OSError(f"the film could not be written whole to {Path(folder).parent}; is there room?")
         return FileContent.of(file.read_bytes())
 
 

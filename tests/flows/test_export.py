@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 
 import cv2
 import numpy as np
@@ -153,3 +155,13 @@ def test_a_folder_of_something_else_stays_as_it_is(tiny, tmp_path):
 def test_a_folder_that_is_no_result_is_said_to_be_none(tmp_path):
     answer = ss_flow("export", tmp_path, "--format", "ply")
     assert answer.code == 2 and "is not the output folder of a run" in answer.err
+
+
+def test_a_full_disk_gets_one_sentence_and_leaves_no_part(tiny, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    answer = export(tiny, "--format", "ply", "--out", tmp_path / "a.ply")
+    assert answer.code == 1 and not list(tmp_path.iterdir())
+    assert "the output cannot be written: No space left on device; what was computed is kept" in answer.err

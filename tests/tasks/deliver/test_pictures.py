@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from dataclasses import replace
 
 import cv2
@@ -11,9 +12,11 @@ from made_gaussians import made_cameras, made_gaussians
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.deliver.export.content import FileContent
 from ss_flow.tasks.deliver.pictures import film, picture
 from ss_flow.tasks.gaussians.initialise import SH_ZERO, select
 from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.images import encode_png
 
 CAMERA = camera_of(made_cameras(), 0)
 
@@ -83,3 +86,16 @@ def test_a_film_has_all_frames_even_sizes_and_the_same_bytes_again(tmp_path, wha
 def test_pictures_of_several_sizes_make_no_film():
     with pytest.raises(InputError, match="pictures of 2 sizes"):
         film([shown(disc(), "alpha", 20), shown(disc(), "alpha", 30)], what="alpha", fps=5)
+
+
+def test_a_film_that_finds_no_room_is_no_film():
+    noise = np.random.default_rng(0).integers(0, 256, (12, 96, 96, 3), np.uint8)
+    frames = [FileContent(encode_png(one)) for one in noise]
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (16384, hard))  # as a disk of so many bytes
+    try:
+        with pytest.raises(OSError, match=r"could not be written whole to .*; is there room\?"):
+            film(frames, what="colour", fps=24)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert len(film(frames, what="colour", fps=24).content) > 16384
