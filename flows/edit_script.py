@@ -68,7 +68,8 @@ def _step(number: int, raw: object, objects: Objects, folder: Path) -> Step | No
     op = raw.get("op")
     if not isinstance(op, str) or op not in _OPERATIONS:
         raise InputError(
-            f"operation {number}: op is {op!r}; it must be one of {', '.join(_OPERATIONS)}{_hint(op, _OPERATIONS)}."
+            f"operation {number}: op is {op!r}; it must be one of {', '.join(_OPERATIONS)}"
+            f"{_hint(op, _OPERATIONS) or '.'}"
         )
     call = _Call(number, op, dict(raw), objects, folder)
     call.take("op", str)
@@ -81,6 +82,10 @@ def _step(number: int, raw: object, objects: Objects, folder: Path) -> Step | No
 def _hint(word: object, known: Sequence[str] | Mapping[str, Any]) -> str:
     close = difflib.get_close_matches(str(word), list(known), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _ended(sentence: str) -> str:
+    return sentence if sentence.endswith((".", "?")) else f"{sentence}."
 
 
 class _Call:
@@ -105,7 +110,7 @@ class _Call:
 
     def fault(self, name: str, value: object, error: Exception) -> InputError:
         """What is wrong with a field."""
-        return InputError(f"operation {self.number} ({self.op}): {name} is {value!r}; {str(error).rstrip('.')}.")
+        return InputError(f"operation {self.number} ({self.op}): {name} is {value!r}; {_ended(str(error))}")
 
     def step(
         self, apply: Callable[[EditedScene], EditedScene], leaving: tuple[int, ...] = (), *, fill: bool = False
@@ -118,7 +123,7 @@ class _Call:
         for name in self._raw:
             raise InputError(
                 f"operation {self.number} ({self.op}): the field {name!r} is unknown; it takes "
-                f"{', '.join(self._known)}{_hint(name, self._known)}."
+                f"{', '.join(self._known)}{_hint(name, self._known) or '.'}"
             )
 
     def instance(self, field: str = "instance") -> int:

@@ -81,7 +81,13 @@ class FinishedRun:
         return self.results.store
 
     def require(self, needed: Sequence[str]) -> None:
-        """Raises InputError when the store no longer holds one of these results."""
+        """Raises InputError when the store no longer holds one of these results, or an edited run never had it."""
+        never = [name for name in needed if name not in self.document["results"]]
+        if never and "edit" in self.document:
+            raise InputError(
+                f"{self.folder} is an edited run, which has no {', '.join(never)} of its own; take its source, "
+                f"{self.document['edit']['source']}."
+            )
         if gone := self.results.missing(needed):
             what = f"the store {self.store.location} no longer holds {', '.join(gone)} of {self.folder}"
             raise InputError(f"{what}; run it again.")

@@ -26,6 +26,8 @@ from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorte
 from ss_flow.tasks.geometry.images import suffix_of
 
 MANIFEST = "export.json"
+_ALSO_NEEDED = {"coco": ("ingest", "masks"), "colmap": ("ingest", "masks"), "nerfstudio": ("ingest",)}
+"""Results of a run that only some formats are made of: an edited run has no masks."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Export:
     def run(self) -> int:
         workspace = self.format in formats.WORKSPACES
         self._check_options()
-        run = open_run(self.result, self.store, ("scene", "cameras", "ingest", "masks"))
+        run = open_run(self.result, self.store, ("scene", "cameras", *_ALSO_NEEDED.get(self.format, ())))
         several = self.each or self.format in formats.MESHES
         by_instance = several or self.format == "coco" or self.format in formats.SURFACES
         ids = run.ids(self.instance) if self.instance else run.all_ids() if by_instance else None

@@ -122,6 +122,19 @@ def test_an_edited_run_is_edited_through_its_script(warm):
     assert asked.code == 2 and f"search its source, {warm.out.resolve()}" in asked.err
 
 
+def test_an_edited_run_is_exported_but_for_what_its_photos_do_not_show(warm):
+    gone = biggest(warm.out)
+    _, place = edit(warm, {"op": "remove", "instances": gone})
+    ply = place.parent / "edited.ply"
+    called = ss_flow("export", place, "--format", "labelled-ply", "--out", ply, "--cache", warm.store)
+    assert called.code == 0, called.err
+    assert ply.read_bytes() == (place / "scene_labeled.ply").read_bytes()
+    for format in ("coco", "colmap"):
+        refused = ss_flow("export", place, "--format", format, "--out", place.parent / "x", "--cache", warm.store)
+        assert refused.code == 2
+        assert f"edited run, which has no masks of its own; take its source, {warm.out.resolve()}." in refused.err
+
+
 def test_a_scene_that_the_store_no_longer_holds_is_refused(warm, tmp_path):
     script = tmp_path / "script.json"
     script.write_text('{"operations": []}')

@@ -68,8 +68,9 @@ def applied(*steps: object) -> tuple[EditedScene, Objects]:
     ],
 )  # fmt: skip
 def test_a_fault_is_told_with_the_operation_the_field_and_what_would_be_right(step, sentence):
-    with pytest.raises(InputError, match=re.escape(sentence)):
+    with pytest.raises(InputError, match=re.escape(sentence)) as refused:
         checked(step)
+    assert str(refused.value).endswith((".", "?")) and "?." not in str(refused.value)
 
 
 @pytest.mark.parametrize(
