@@ -33,9 +33,9 @@ from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.agreement import View, agreement_of, ramp, views_of
 from ss_flow.tasks.split.edges import convex_edges
 from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
-from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
+from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 _ON_TOP = 0.5

@@ -3,7 +3,7 @@ import pytest
 
 from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
-from ss_flow.tasks.split.shadows import ShadowParams, lit_surfaces
+from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 STEP = 0.02
