@@ -174,11 +174,11 @@ def _exchanged(views: Sequence[_View], cameras: Cameras, params: CheckParams) ->
 
     Only how cameras lie to each other counts, so the axes of the world are of no concern.
     """
-    inverse = np.linalg.inv(cameras.world_to_camera)
+    inverse = np.linalg.inv(cameras.world_to_camera).astype(np.float64)
     inverted = "the poses are inverted: camera-to-world and world-to-camera are exchanged"
     turned = "y and z of the cameras are turned: OpenGL's axes and OpenCV's are exchanged"
-    flipped = _OTHER_AXES @ cameras.world_to_camera
-    for meant, words in ((inverse, inverted), (_OTHER_AXES @ inverse, inverted), (flipped, turned)):
+    inverse_turned, flipped = ((_OTHER_AXES @ poses).astype(np.float64) for poses in (inverse, cameras.world_to_camera))
+    for meant, words in ((inverse, inverted), (inverse_turned, inverted), (flipped, turned)):
         moved = [replace(v, camera=replace(v.camera, world_to_camera=m)) for v, m in zip(views, meant, strict=True)]
         changed = replace(cameras, world_to_camera=meant)
         pairs = ((row, other) for row in range(len(views)) for other in nearest_views(changed, row, _NEIGHBOURS))

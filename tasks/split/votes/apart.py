@@ -52,9 +52,9 @@ def part_labels(
     for name, crumbs in small.items():
         kept = [piece for piece in large[name] if parted[piece[0]] == name]
         if kept and crumbs:
-            near = _near([cloud.points[piece] for piece in kept + crumbs])[len(kept) :, : len(kept)].any(axis=1)
-            for crumb, stays in zip(crumbs, near.tolist(), strict=True):
-                parted[crumb] = name if stays else 0
+            near = _near([cloud.points[piece] for piece in kept + crumbs])
+            for row, crumb in enumerate(crumbs, len(kept)):
+                parted[crumb] = name if near[row, : len(kept)].any() else 0
     return parted
 
 
