@@ -25,6 +25,9 @@ from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import check_place
 from ss_flow.tasks.gaussians.read_ply import read_columns
 
+_MOST_LABELS = 3
+"""So many nodes of a step that would run for one reason are told by name."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -147,8 +150,12 @@ def _tell_plan(report: Report, out: Console, *, json_wanted: bool) -> int:
     if json_wanted:
         print(json.dumps({"would_run": would}))
         return 0
+    alike: dict[tuple[str, str], list[str]] = {}
     for node in would:
-        out.print(escape(f"would run {node['label']}: {node['why']}"))
+        alike.setdefault((node["label"].partition("[")[0], node["why"]), []).append(node["label"])
+    for (step, why), labels in alike.items():
+        what = ", ".join(labels) if len(labels) <= _MOST_LABELS else f"{step} {len(labels)} times"
+        out.print(escape(f"would run {what}: {why}"))
     for label in dict.fromkeys(n["step"] for n in follow):
         out.print(f"would follow {label}")
     out.print(

@@ -180,7 +180,7 @@ def _exchanged(views: Sequence[_View], cameras: Cameras, params: CheckParams) ->
     inverse_turned, flipped = ((_OTHER_AXES @ poses).astype(np.float64) for poses in (inverse, cameras.world_to_camera))
     for meant, words in ((inverse, inverted), (inverse_turned, inverted), (flipped, turned)):
         moved = [replace(v, camera=replace(v.camera, world_to_camera=m)) for v, m in zip(views, meant, strict=True)]
-        changed = replace(cameras, world_to_camera=meant)
+        changed = replace(cameras, world_to_camera=np.asarray(meant, np.float64))
         pairs = ((row, other) for row in range(len(views)) for other in nearest_views(changed, row, _NEIGHBOURS))
         errors = [_error(moved[row], moved[other]) for row, other in pairs]
         if errors and np.median(np.nan_to_num(errors, nan=_OCCLUDED)) <= params.max_depth_error:

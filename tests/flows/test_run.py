@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from tiny_runs import run_tiny, ss_flow, write_room
+from tiny_runs import SHORT, run_tiny, ss_flow, write_room
 
 from ss_flow.cache.store import Store
 from ss_flow.flows.generated import RoomParams
@@ -205,6 +206,13 @@ def test_a_dry_run_tells_what_would_run_and_runs_nothing(warm, tmp_path):
     assert sorted((warm.store / "actions").rglob("*.json")) == actions
     assert sorted((warm.store / "roots/runs").iterdir()) == runs
     assert not (tmp_path / "new").exists()
+
+
+def test_a_dry_run_tells_of_many_nodes_of_a_step_once(warm, tmp_path):
+    more = ["--preset", "fast", *SHORT, "--dry-run", "--set", "split.visibility.tau_depth=0.5"]
+    words = ss_flow("run", warm.scene, "--cache", warm.store, *more, "--out", tmp_path / "new").out
+    (line,) = (line for line in words.splitlines() if line.startswith("would run split.visibility"))
+    assert re.fullmatch(r"would run split\.visibility \d+ times: parameter tau_depth .* -> 0\.5", line)
 
 
 @pytest.fixture
