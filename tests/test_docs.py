@@ -8,13 +8,21 @@ import re
 from pathlib import Path
 
 import pytest
+from registered_tasks import registered_tasks
 
 from ss_flow.flows import settings
+from ss_flow.flows.measures import NAMES as FIGURES
+from ss_flow.flows.measures import names_of
 from ss_flow.flows.params import Params
 
 ROOT = Path(__file__).parents[1]
+FOLDERS = ("cache", "ss_flow", "tasks", "flows", "tests", "docs")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+TO_WRITE = {"on_slurm.py", "ss_flow_growth.py"}
+"""Examples that the reader is told to write."""
+TASKS = registered_tasks()
+SOURCES = {file.name for folder in FOLDERS for file in (ROOT / folder).rglob("*.*")}
 
 
 def script(name: str):
@@ -28,6 +36,12 @@ def script(name: str):
 @pytest.fixture(scope="module")
 def maker():
     return script("make_parameters")
+
+
+def groups(parameter: str) -> list[str]:
+    """The groups that a parameter is in, from the outermost on."""
+    parts = parameter.split(".")
+    return [".".join(parts[:count]) for count in range(1, len(parts))]
 
 
 def anchors(page: Path) -> set[str]:
@@ -81,6 +95,17 @@ def test_every_source_file_and_parameter_that_a_page_names_exists(page):
         assert (ROOT / name).exists(), f"{page.name} names {name}"
     for name in re.findall(r"(?:--set |`)((?:capture|split|splat|semantics|evaluate)(?:\.\w+)+)=", text):
         settings.find(Params(), name)
+    for name in re.findall(r"`(\w+\.(?:py|h|cpp|jinja))`", text):
+        assert name in SOURCES or name in TO_WRITE, f"{page.name} names {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_dotted_name_of_a_page_is_a_parameter_a_group_of_them_a_step_or_a_figure(page):
+    known = {*TASKS, *names_of(FIGURES)} | {name for one in settings.flat(Params()) for name in groups(one)}
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:capture|split|splat|semantics|evaluate)(?:\.\w+)+)`", text):
+        if name not in known and not name.endswith((".md", ".py")):
+            settings.find(Params(), name)  # a short name
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
