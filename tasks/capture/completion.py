@@ -14,6 +14,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import DepthMap, Float32, Frame, Int32
 from ss_flow.tasks.capture.sensor_depth import resampled
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.geometry.images import decode_valid, size_within
 from ss_flow.tasks.ranges import Fraction
 
@@ -23,7 +24,8 @@ class CompletionParams:
     """Which views of a depth sensor are completed."""
 
     below: Fraction = 0.9
-    """Share of a photo's pixels, below which a sensor's depth is completed by comparing photos; 0 = it never is."""
+    """Share of a photo's pixels, below which a sensor's depth is completed by comparing photos; 0 = it never is. Holes
+    of at most two pixels across within one surface count as known."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,10 @@ class Gaps:
 def gaps(
     frames: tuple[Frame, ...], depths: tuple[DepthMap, ...], *, params: CompletionParams = CompletionParams()
 ) -> Gaps:
-    """The views of whose valid pixels a sensor knows less than `below`; depths: the sensor's, of all frames."""
+    """The views of whose valid pixels a sensor knows less than `below`; depths: the sensor's, of all frames.
+
+    Thin holes, as a warp leaves them between known pixels, are nothing that the sensor is blind to.
+    """
     known = np.array([_known(frame, depth.depth) for frame, depth in zip(frames, depths, strict=True)])
     return Gaps(np.flatnonzero(known < params.below).astype(np.int32))
 
@@ -58,6 +63,6 @@ def completed(sensor: DepthMap, found: DepthMap) -> DepthMap:
 
 
 def _known(frame: Frame, depth: Float32) -> float:
-    """Share of a frame's valid pixels whose depth is known."""
+    """Share of a frame's valid pixels whose depth is known, or would be without thin holes."""
     valid = resampled(decode_valid(frame), *depth.shape)
-    return float((depth[valid] > 0).mean()) if valid.any() else 1.0
+    return float((close_holes(depth)[valid] > 0).mean()) if valid.any() else 1.0

@@ -22,6 +22,13 @@ def test_gaps_are_the_views_of_whose_valid_pixels_too_few_are_known():
     assert gaps(frames, maps(whole, half, half), params=CompletionParams(below=0.5)).view.tolist() == []
 
 
+def test_thin_holes_between_known_pixels_are_no_gaps():
+    frames, _, _ = views([(0, 0, 0)], width=40, height=20)
+    lattice = np.ones((20, 40))
+    lattice[4::9], lattice[:, 4::9] = 0, 0
+    assert (lattice > 0).mean() < 0.9 and not len(gaps(frames, maps(lattice)).view)
+
+
 def test_a_sensor_keeps_what_it_knows_and_gets_the_rest_at_its_own_size():
     (sensor,) = maps([[0, 2, 2, 0], [0, 2, 2, 2]])
     (found,) = maps([[3, 5]])
