@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ss_flow.running import progress, warn
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Float32, Float64, Frame, Int32, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, size_within
@@ -63,7 +63,7 @@ class Observations(NamedTuple):
     """[M, 3] RGB, 0..1."""
 
 
-@task(name="capture.colours")
+@task(name="capture.colours", resources=Resources(memory_mb=800))
 def colours(
     frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...], unit: SceneUnit, *, params: ColourParams
 ) -> tuple[ColourTransform, ...]:
