@@ -107,13 +107,17 @@ def checks(
     result = CaptureChecks(names, error, likeness, exposure, scale, duplicates)
     known = error[np.isfinite(error)]
     misfit = bool(pairs) and scale == 1 and not (len(known) and np.median(known) <= params.max_depth_error)
-    for text in _told(result, cameras, params, _exchanged(views, cameras, params) if misfit else ""):
+    exchanged = _exchanged(views, cameras, params) if misfit else ""
+    for text in _told(result, cameras, params, compared=bool(pairs), exchanged=exchanged):
         warn(text)
     return result
 
 
-def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams, exchanged: str) -> Iterable[str]:
-    """What is to be said, with figures. exchanged: what would make poses fit that do not."""
+def _told(
+    found: CaptureChecks, cameras: Cameras, params: CheckParams, *, compared: bool, exchanged: str
+) -> Iterable[str]:
+    """What is to be said, with figures. compared: whether any view has others beside it. exchanged: what would make
+    poses fit that do not."""
     names = np.array(found.names)
     if found.duplicates:
         share = len(found.duplicates) / len(names)
@@ -142,7 +146,7 @@ def _told(found: CaptureChecks, cameras: Cameras, params: CheckParams, exchanged
             f"Depth carried from view to view differs by {usual:.1%} (median): poses, intrinsics and depth disagree"
             f"{exchanged}."
         )
-    elif usual is None and len(names) > 1:
+    elif usual is None and compared:
         yield (
             "No view's depth is met in the views beside it: poses, intrinsics and depth disagree, or nothing overlaps"
             f"{exchanged}."
