@@ -65,8 +65,7 @@ class PropagateParams:
     """Points below which a label is dropped in the end."""
     apart: bool = True
     """Whether pieces of a label that lie apart in space, each with the share of its points that label_clusters keeps,
-    become labels of their own where the views do not show them as one (see at_once.rate), or where they lie farther
-    apart than the larger is long."""
+    become labels of their own where the views do not show them as one (see at_once.rate)."""
     min_label_views: Count = 2
     """Views that must show a label by a mask, where as many see at least a tenth of it; else it is dropped in the end.
     1 keeps all."""

@@ -333,7 +333,7 @@ def test_a_label_that_one_view_shows_goes_to_the_background_where_many_others_lo
 def test_a_small_piece_of_a_label_stays_where_views_see_it_inside_of_masks(inside_in, tau_piece, stays):
     # A seat of 100 points and, well apart, a leg of 4, under one mask of both views.
     seat = np.stack([*np.indices((10, 10)).reshape(2, -1), np.zeros(100)], axis=1)
-    leg = np.array([[20.0, 0, 0], [21, 0, 0], [22, 0, 0], [23, 0, 0]])
+    leg = np.array([[40.0, 0, 0], [41, 0, 0], [42, 0, 0], [43, 0, 0]])
     cloud = PointCloud(np.concatenate([seat, leg]).astype(np.float32), np.zeros((104, 3), np.uint8), 1.0, 1.0)
     everything = np.arange(104, dtype=np.int32)
     observations = []
