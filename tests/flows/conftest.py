@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +13,7 @@ from tiny_runs import Called, run_tiny, write_room
 
 @dataclass(frozen=True)
 class TinyRun:
-    """A finished run; its files are not to be changed."""
+    """A finished run."""
 
     scene: Path
     store: Path
@@ -39,8 +39,8 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny(room: Path, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
-    """A run of it."""
+def first_run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
+    """A run of it, of which tests get copies."""
     base = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SS_FLOW_MODELS", "")
@@ -50,10 +50,23 @@ def tiny(room: Path, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
     return TinyRun(room, base / "store", base / "out", called)
 
 
+def copied(run: TinyRun, folder: Path) -> TinyRun:
+    """The run in another folder, with a store of its own."""
+    store, out = folder / "store", folder / "out"
+    shutil.copytree(run.store, store)
+    shutil.copytree(run.out, out)
+    record = out / "run.json"
+    record.write_text(record.read_text().replace(str(run.store), str(store)))
+    return replace(run, store=store, out=out)
+
+
+@pytest.fixture(scope="module")
+def tiny(first_run: TinyRun, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
+    """A copy for a module to look at: exports and queries keep what they compute, which other modules would find."""
+    return copied(first_run, tmp_path_factory.mktemp("module"))
+
+
 @pytest.fixture
-def warm(tiny: TinyRun, tmp_path: Path) -> TinyRun:
-    """A copy of the run's store and output, to go on from."""
-    store, out = tmp_path / "store", tmp_path / "out"
-    shutil.copytree(tiny.store, store)
-    shutil.copytree(tiny.out, out)
-    return TinyRun(tiny.scene, store, out, tiny.called)
+def warm(first_run: TinyRun, tmp_path: Path) -> TinyRun:
+    """A copy for one test to go on from."""
+    return copied(first_run, tmp_path)

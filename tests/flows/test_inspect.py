@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import shutil
 
 import cv2
 import numpy as np
@@ -15,18 +14,6 @@ from tiny_runs import run_tiny, ss_flow
 from ss_flow.cache.store import Store
 from ss_flow.runs import latest_runs
 from ss_flow.tasks import artifacts
-
-
-@pytest.fixture(scope="module")
-def tiny(tiny, tmp_path_factory):
-    """The run with a store that knows of no later one, as other tests leave some behind."""
-    store = tmp_path_factory.mktemp("inspect") / "store"
-    shutil.copytree(tiny.store, store)
-    *later, first = latest_runs(store / "roots/runs")
-    for run in later:
-        shutil.rmtree(run.folder)
-    assert first.scene == str(tiny.scene)
-    return dataclasses.replace(tiny, store=store)
 
 
 def test_status_counts_what_each_step_did(tiny):

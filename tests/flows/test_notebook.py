@@ -15,7 +15,7 @@ from ss_flow.flows.results import open_finished
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebooks" / "finished_run.ipynb"
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def run(tiny):
     return open_finished(tiny.out)
 

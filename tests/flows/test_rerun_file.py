@@ -20,12 +20,12 @@ needs_rerun = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def run(tiny):
     return open_finished(tiny.out)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def recorded(run, tmp_path_factory) -> dict[tuple[str, str], list]:
     """What the recording holds: by entity and component, the values in order."""
     from rerun.chunk import RrdReader

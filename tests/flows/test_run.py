@@ -107,9 +107,9 @@ def test_run_json_holds_what_was_asked_what_was_done_and_what_was_measured(tiny)
     assert all(n["peak_rss_mb"] > 0 and n["seconds"] >= 0 for n in nodes)
 
 
-def test_with_json_stdout_holds_one_document_and_it_is_run_json(tiny):
-    on_disk = json.loads((tiny.out / "run.json").read_text())
-    printed = tiny.called.document()
+def test_with_json_stdout_holds_one_document_and_it_is_run_json(first_run):
+    on_disk = json.loads((first_run.out / "run.json").read_text())
+    printed = first_run.called.document()
     assert {k: v for k, v in on_disk.items() if k != "delivered"} == {
         k: v for k, v in printed.items() if k != "delivered"
     }

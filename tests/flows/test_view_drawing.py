@@ -41,12 +41,12 @@ def scene(server):
     return server.scene
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def results(tiny) -> Results:
     return Results(Store(Path(tiny.store)), tiny.called.results())
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def around(results) -> Around:
     return Around(results.all("ingest"), results.one("cameras"), results.one("dense"))
 

@@ -24,20 +24,20 @@ from ss_flow.tasks.geometry.cameras import Camera, looking
 pytest.importorskip("websockets", reason="needs the extra `view`, whose websockets drive the browser")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def run(tiny):
     document = read_run(tiny.out)
     return finished_run(tiny.out, document, Store(tiny.store), ())
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def file(run, tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("page") / "room.html"
     write_page(file, run)
     return file
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def page(file):
     """The page in a browser; tests leave all objects shown."""
     with browser_page(1000, 640) as page:

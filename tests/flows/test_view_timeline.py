@@ -18,7 +18,7 @@ from ss_flow.tasks.splat.collisions import MergePlan
 viser = pytest.importorskip("viser", reason="needs the extra `view`")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def run(tiny):
     return finished_run(tiny.out, read_run(tiny.out), Store(tiny.store), ())
 
