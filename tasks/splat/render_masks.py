@@ -27,6 +27,8 @@ _SOLID = 0.5
 _BENEFIT = 0.5
 """A pixel keeps its refined id while that weighs at least this share of the heaviest: borders of good masks are finer
 than Gaussians, and those of bad masks are off by more than that."""
+_CRUMB = 0.01
+"""Masks that cover less of a view than this are often crumbs of others, and the scene rightly takes them whole."""
 _FRINGE = 5.0
 """How far a mask's border may be off, in pixels of an image with a diagonal of 800."""
 
@@ -43,6 +45,9 @@ class RenderMasksParams:
     strips: Literal["photo", "scene"] = "photo"
     """Whose the thin strips are that the scene would take off a mask: "photo" - that one's of the two whose borders lie
     where the photo changes; or the "scene"'s, as in the paper."""
+    most: Fraction = 0.5
+    """How much of a mask other instances may take in a view. Where they would take more, they take nothing: that is not
+    about borders but about which thing is there, and the mask has the votes of all views. 1 = all of it."""
 
 
 @task(
@@ -62,7 +67,8 @@ def render_masks(
     0 where that is the background, where the scene leaves a hole, and where a frame is not valid. A pixel keeps its
     refined id where that weighs half as much or more, and where `params` holds the other instance or the background
     off; an instance that has masks but no Gaussians keeps what the scene calls background. Where depth and colour are
-    some pixels apart, so are Gaussians and photo: thin strips are settled by the photo.
+    some pixels apart, so are Gaussians and photo: thin strips are settled by the photo. A mask of which others would
+    take most loses nothing to them.
 
     views: all of the scene. refined: their exclusive masks after refinement.
     """
@@ -77,6 +83,7 @@ def render_masks(
         ids = np.where((ids == 0) & keeps, known.ids, ids)
         if params.strips == "photo":
             ids = settled_by_photo(decode_rgb(frame), known.ids, ids, reach)
+        ids = _without_swallowed(known.ids, ids, params.most)
         ids[~decode_valid(frame)] = 0
         maps.append(LabelMap(known.name, ids))
         progress(view + 1, len(refined), known.name)
@@ -101,3 +108,13 @@ def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap, share: float
     keeps = (of_known > 0) & (of_known >= _BENEFIT * heaviest)
     keeps |= (ids > 0) & (heaviest < share * whole.alpha)
     return np.where(keeps, known.ids, ids)
+
+
+def _without_swallowed(masks: np.ndarray, shown: np.ndarray, most: float) -> np.ndarray:
+    """What a view shows, [H, W], where no mask loses more than `most` of its pixels to other instances."""
+    taken = (shown != masks) & (shown > 0)
+    area = np.bincount(masks.ravel())
+    swallowed = np.bincount(masks[taken], minlength=len(area)) > most * area
+    swallowed &= area >= _CRUMB * masks.size
+    swallowed[0] = False
+    return np.where(taken & swallowed[masks], masks, shown)

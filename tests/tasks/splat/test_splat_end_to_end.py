@@ -226,6 +226,27 @@ def test_an_instance_takes_a_pixel_from_another_only_where_it_makes_up_most_of_i
     assert left
 
 
+def test_a_mask_of_which_others_would_take_most_loses_nothing_to_them_unless_it_is_a_crumb(built, whole):
+    swallowed = replace(whole, instance_id=np.where(whole.instance_id == 2, 1, whole.instance_id))
+    swallowed.instance_id[np.flatnonzero(whole.instance_id == 2)[:5]] = 2
+    crumbs = []
+    for map in built.scene.maps:
+        mask = map.ids == 2
+        mask[:, np.flatnonzero(mask.any(axis=0))[4:]] = False  # four columns: less than a hundredth of the picture
+        crumbs.append(replace(map, ids=np.where(mask, 2, 0).astype(np.uint16)))
+    pairs = zip(drawn(built, swallowed), drawn(built, swallowed, most=1.0), built.scene.maps, strict=True)
+    cases = [(ours.ids, scene.ids, truth.ids == 2) for ours, scene, truth in pairs]
+    whole_ones = [mask for *_, mask in cases if mask.mean() >= 0.01]
+    assert len(whole_ones) > 2
+    for ours, scene, mask in cases:
+        assert mask.mean() < 0.01 or not (ours[mask] == 1).any()
+        assert not mask.any() or (scene[mask] == 1).mean() > 0.5
+        np.testing.assert_array_equal(ours[~mask], scene[~mask])
+    for ours, crumb in zip(drawn(built, swallowed, crumbs), crumbs, strict=True):
+        mask = crumb.ids == 2
+        assert not mask.any() or (mask.mean() < 0.01 and (ours.ids[mask] == 1).mean() > 0.5)
+
+
 def test_no_mask_covers_what_a_frame_excludes(built, whole):
     valid = np.full(built.scene.maps[0].ids.shape, 255, np.uint8)
     valid[:, 40:] = 0
