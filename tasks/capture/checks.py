@@ -120,17 +120,17 @@ def _told(
     poses fit that do not."""
     names = np.array(found.names)
     if found.duplicates:
-        share = len(found.duplicates) / len(names)
-        yield f"{len(found.duplicates)} photos ({share:.0%}) repeat an earlier one: {first_of(found.duplicates)}."
+        number = f"{len(found.duplicates)} of {len(names)}"
+        yield f"Photos that repeat an earlier one: {number}, {first_of(found.duplicates)}."
     off = np.abs(cameras.intrinsics[:, 2:] - cameras.sizes / 2).max(axis=1) / cameras.sizes.max(axis=1)
     if len(off) and off.max() > params.max_center:
         worst = int(off.argmax())
         cx, cy = cameras.intrinsics[worst, 2:]
         width, height = cameras.sizes[worst]
         yield (
-            f"The principal point of {(off > params.max_center).sum()} views lies far from the middle, that of "
-            f"{names[worst]} at ({cx:.0f}, {cy:.0f}) of {width} x {height} pixels; are its intrinsics exchanged, or "
-            "those of a photo of another size?"
+            f"The principal point of {(off > params.max_center).sum()} of {len(off)} views lies far from the middle, "
+            f"that of {names[worst]} at ({cx:.0f}, {cy:.0f}) of {width} x {height} pixels; are its intrinsics "
+            "exchanged, or those of a photo of another size?"
         )
     known = found.depth_error[np.isfinite(found.depth_error)]
     usual = float(np.median(known)) if len(known) else None
@@ -159,14 +159,16 @@ def _told(
     if strange.any():
         worst = int(np.nanargmin(found.likeness))
         yield (
-            f"{strange.sum()} photos do not show what their neighbours do (correlation {found.likeness[worst]:.2f}, "
-            f"usually {np.nanmedian(found.likeness):.2f}): {first_of(names[strange].tolist())}; turned, or elsewhere?"
+            f"Photos that differ from what their neighbours show: {strange.sum()} of {len(names)}, "
+            f"{first_of(names[strange].tolist())} (correlation {found.likeness[worst]:.2f}, usually "
+            f"{np.nanmedian(found.likeness):.2f}); turned, or elsewhere?"
         )
     if found.depth_scale == 1 and (odd & ~strange).any():
         worst = int(np.nanargmax(np.where(odd & ~strange, found.depth_error, np.nan)))
         yield (
-            f"The poses of {(odd & ~strange).sum()} views do not fit their depth (difference to neighbours "
-            f"{found.depth_error[worst]:.1%}, usually {usual:.1%}): {first_of(names[odd & ~strange].tolist())}."
+            f"The poses of {(odd & ~strange).sum()} of {len(names)} views do not fit their depth (difference to "
+            f"neighbours {found.depth_error[worst]:.1%}, usually {usual:.1%}): "
+            f"{first_of(names[odd & ~strange].tolist())}."
         )
     low, high = np.quantile(found.exposure, (0.05, 0.95))
     if high / low > params.max_exposure:

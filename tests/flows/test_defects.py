@@ -57,9 +57,9 @@ def _rolling(room: Room) -> Room:
 
 _DISAGREE = "poses, intrinsics and depth disagree"
 _SCALE = "Depth fits the poses 0.2 times as large"
-_REPEATED = "2 photos (20%) repeat an earlier one: 0003, 0007."
+_REPEATED = "Photos that repeat an earlier one: 2 of 10, 0003, 0007."
 _EXCHANGED = "(30, 40) of 80 x 60 pixels; are its intrinsics exchanged, or those of a photo of another size?"
-_STRANGE = "1 photos do not show what their neighbours do"
+_STRANGE = "Photos that differ from what their neighbours show: 1 of 10"
 _EXPOSURE = "exposure changes by a factor of 1."
 SENTENCES = {_DISAGREE, _SCALE, _REPEATED, _EXCHANGED, _STRANGE, _EXPOSURE}
 DEFECTS: dict[str, tuple[Callable[[Room], Room], set[str]]] = {

@@ -177,7 +177,7 @@ def test_kill_ends_a_call_that_gives_no_sign(store, executor, tmp_path):
     pid = pid_in(tmp_path / "pid")
     executor.pool.kill()
     assert isinstance(future.exception(PATIENCE), WorkerDied | Cancelled)
-    wait_for(lambda: not psutil.pid_exists(pid), 5)
+    wait_for(lambda: not psutil.pid_exists(pid))
 
 
 def test_a_missing_input_is_gone(store, executor):
@@ -481,7 +481,7 @@ def test_a_run_on_a_cluster_of_its_own_prints_nothing_and_leaves_no_process(tmp_
     assert output == "done\n"
     assert sorted(errors.splitlines()) == ["noise", "noise of native code"]
     assert len(children) >= 2
-    wait_for(lambda: not any(child.is_running() for child in children), 5)
+    wait_for(lambda: not any(child.is_running() for child in children))
 
 
 def test_ctrl_c_reaches_our_process_alone_and_leaves_no_other(tmp_path):
@@ -493,7 +493,7 @@ def test_ctrl_c_reaches_our_process_alone_and_leaves_no_other(tmp_path):
     output, errors = process.communicate(timeout=PATIENCE)
     assert (output, errors) == ("interrupted\n", "")
     assert list(tmp_path.glob("store/checkpoints/*.npz"))
-    wait_for(lambda: not any(child.is_running() for child in children), 5)
+    wait_for(lambda: not any(child.is_running() for child in children))
 
 
 def test_the_workers_of_a_killed_run_end_with_it(tmp_path):
@@ -504,7 +504,7 @@ def test_the_workers_of_a_killed_run_end_with_it(tmp_path):
     process.kill()
     process.communicate()
     assert len(children) >= 3
-    wait_for(lambda: not any(child.is_running() for child in children), 5)
+    wait_for(lambda: not any(child.is_running() for child in children))
 
 
 def test_threads_may_submit_to_dask_at_once(store, cluster):

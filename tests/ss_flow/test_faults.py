@@ -309,7 +309,7 @@ def test_a_killed_run_leaves_no_worker_behind(store, tmp_path):
     worker = int((tmp_path / "pid").read_text())
     process.kill()
     process.communicate()
-    wait_for(lambda: not psutil.pid_exists(worker), 5)
+    wait_for(lambda: not psutil.pid_exists(worker))
 
 
 def test_a_run_goes_on_where_a_killed_one_was(store, tmp_path):
@@ -321,7 +321,7 @@ def test_a_run_goes_on_where_a_killed_one_was(store, tmp_path):
     report = run(store, lambda: {"source": toy.source(values=(2.0,))})
     assert computed(report) == []
     second = start(store, f"toy.slow_elsewhere(x(), pid_file={str(tmp_path / 'pid2')!r})")
-    wait_for(lambda: (tmp_path / "pid2").exists(), 5)  # the claim of the dead holds nobody up
+    wait_for(lambda: (tmp_path / "pid2").exists())  # the claim of the dead holds nobody up
     second.kill()
     second.communicate()
 

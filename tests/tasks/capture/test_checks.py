@@ -137,7 +137,7 @@ def test_duplicates_are_counted_and_named(room: Room) -> None:
     for view in (3, 7):
         rgb[view], depth[view], poses[view] = rgb[view - 1], depth[view - 1], poses[view - 1]
     (said,), found = _checked(room, rgb, depth, replace(room.cameras, world_to_camera=poses))
-    assert found.duplicates == ("0003", "0007") and said == "2 photos (17%) repeat an earlier one: 0003, 0007."
+    assert found.duplicates == ("0003", "0007") and said == "Photos that repeat an earlier one: 2 of 12, 0003, 0007."
 
 
 def test_exchanged_intrinsics_are_told_by_the_principal_point(room: Room) -> None:
@@ -154,7 +154,9 @@ def test_a_turned_photo_is_named(room: Room) -> None:
     rgb = room.rgb.copy()
     rgb[4] = rgb[4][::-1, ::-1]
     (said,), found = _checked(room, rgb)
-    assert "do not show what their neighbours do" in said and "0004" in said and int(np.nanargmin(found.likeness)) == 4
+    assert (
+        "differ from what their neighbours show" in said and "0004" in said and int(np.nanargmin(found.likeness)) == 4
+    )
 
 
 def test_rolling_exposure_is_told_with_its_factor(room: Room) -> None:
