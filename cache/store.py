@@ -34,16 +34,12 @@ import math
 import os
 import re
 import socket
-import threading
 import time
 import uuid
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import DIGEST, digest
@@ -51,6 +47,7 @@ from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, writing
 from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder
 from ss_flow.cache.plain_json import reader
+from ss_flow.cache.recent import Recent
 
 MEMORY_BYTES = 2 << 30
 """How much of what was read lately a process keeps in memory."""
@@ -100,10 +97,7 @@ class Store:
 
     def __init__(self, root: Path, *, memory_bytes: int = MEMORY_BYTES) -> None:
         self.root = root
-        self._memory_bytes = memory_bytes
-        self._recent: OrderedDict[str, Any] = OrderedDict()
-        self._held = 0
-        self._lock = threading.Lock()
+        self._recent = Recent(memory_bytes)
         self._actions = f"{root}/actions"
         self._objects = f"{root}/objects"
         for name in ("objects", "actions", "parts", "claims", "roots/runs", "roots/pins", "tmp"):
@@ -169,12 +163,10 @@ class Store:
         Raises Gone when the store holds no such object, or one that is damaged, which is then taken out; OtherVersion
         when its type has other fields by now.
         """
-        with self._lock:
-            if object_digest in self._recent:
-                self._recent.move_to_end(object_digest)
-                return self._recent[object_digest]
-        value = self._load(object_digest)
-        self._remember(object_digest, value)
+        value = self._recent.get(object_digest)
+        if value is None:
+            value = self._load(object_digest)
+            self._recent.keep(object_digest, value)
         return value
 
     def _load(self, object_digest: str) -> Any:
@@ -208,9 +200,7 @@ class Store:
 
     def discard(self, object_digest: str, *, unused_since: float = math.inf) -> bool:
         """Take an object out, at once for all readers; False when it is not there, or was used since."""
-        with self._lock:
-            if object_digest in self._recent:
-                self._held -= _array_bytes(self._recent.pop(object_digest))
+        self._recent.drop(object_digest)
         return self._take_out(self.object_path(object_digest), unused_since)
 
     def forget(self, key: str, *, unused_since: float = math.inf) -> bool:
@@ -243,16 +233,6 @@ class Store:
         """Every action."""
         for folder in entries(self._actions):
             yield from _records(folder.path)
-
-    def _remember(self, object_digest: str, value: Any) -> None:
-        size = _array_bytes(value)
-        with self._lock:
-            if size > self._memory_bytes // 4 or object_digest in self._recent:
-                return
-            self._recent[object_digest] = value
-            self._held += size
-            while self._held > self._memory_bytes:
-                self._held -= _array_bytes(self._recent.popitem(last=False)[1])
 
     def action(self, key: str, *, whole: bool = True) -> Action | None:
         """The record under a key, or None when there is none; with `whole`, also when one of its outputs is gone.
@@ -374,7 +354,3 @@ def verified(folder: Path, object_digest: str) -> Any:
     if digest(value) != object_digest:
         raise ValueError("its content is not what its name says")
     return value
-
-
-def _array_bytes(value: Any) -> int:
-    return 256 + sum(item.nbytes for item in vars(value).values() if isinstance(item, np.ndarray))

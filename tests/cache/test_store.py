@@ -119,14 +119,6 @@ def test_only_dataclasses_of_arrays_and_plain_data_are_stored(store):
         codec.write(Metrics({"a": object()}), store.root / "tmp" / "y")  # type: ignore[dict-item]
 
 
-def test_memory_holds_no_more_than_its_share(tmp_path):
-    store = Store(tmp_path, memory_bytes=40_000)
-    digests = [store.put(LabelMap(str(i), np.full((50, 50), i, np.uint16))) for i in range(20)]
-    for object_digest in digests:
-        store.get(object_digest)
-    assert store._held <= 40_000
-
-
 def test_large_arrays_are_chunked_and_gaussians_keep_their_ids(store):
     n = 400_000
     gaussians = Gaussians(

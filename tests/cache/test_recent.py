@@ -1,0 +1,48 @@
+"""Values in memory."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ss_flow.cache.recent import Recent
+from ss_flow.cache.store import Store
+from ss_flow.tasks.artifacts import LabelMap
+
+
+def value(number: int, side: int = 50) -> LabelMap:
+    """5,000 bytes of labels, and 256 that every value counts besides."""
+    return LabelMap(str(number), np.full((side, side), number, np.uint16))
+
+
+def test_what_was_asked_for_longest_ago_goes_first():
+    recent = Recent(5 * 5256)
+    values = [value(i) for i in range(6)]
+    for i in range(5):
+        recent.keep(str(i), values[i])
+    assert recent.get("0") is values[0]
+    recent.keep("5", values[5])
+    assert [number for number in range(6) if recent.get(str(number)) is values[number]] == [0, 2, 3, 4, 5]
+    assert recent.get("1") is None and recent.bytes == 5 * 5256
+
+
+def test_a_value_that_would_drive_out_most_others_is_not_kept():
+    recent = Recent(40_000)
+    recent.keep("small", value(1))
+    recent.keep("large", value(2, side=80))
+    assert recent.get("large") is None and recent.get("small") is not None and recent.bytes == 5256
+
+
+def test_what_is_dropped_counts_no_longer():
+    recent = Recent(40_000)
+    recent.keep("a", value(1))
+    recent.drop("a")
+    recent.drop("b")
+    assert recent.get("a") is None and recent.bytes == 0
+
+
+def test_a_store_gives_the_same_value_again_while_there_is_room_for_it(tmp_path):
+    store = Store(tmp_path, memory_bytes=4 * 5256)
+    digests = [store.put(value(i)) for i in range(20)]
+    first = [store.get(digest) for digest in digests]
+    assert [store.get(digest) is known for digest, known in zip(digests[-4:], first[-4:], strict=True)] == [True] * 4
+    assert store.get(digests[0]) is not first[0]
