@@ -34,6 +34,8 @@ from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
 
 ANSWER_FILE = "answer.json"
+ROWS = 10
+"""So many instances are named at least; all that match are."""
 
 
 @dataclass(frozen=True)
@@ -134,11 +136,15 @@ class Query:
             out.print(f"nothing in the scene matches {found.text!r} ({found.encoder}); the nearest are:")
         part = ["part"] if self.parts else []
         table = Table("", "id", *part, "name", "score", "delta", box=None)
-        for row in document["instances"][:10]:
+        rows = document["instances"]
+        shown = rows[: max(ROWS, 1 + max((i for i, row in enumerate(rows) if row["matched"]), default=0))]
+        for row in shown:
             mark = "[green]match[/]" if row["matched"] else ""
             place = [str(row[column]) for column in ("id", *part)]
             table.add_row(mark, *place, row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}")
         print_table(table, out)
+        if len(shown) < len(rows):
+            out.print(f"{len(rows) - len(shown)} more are farther off; --json names all.")
 
 
 def query_params(document: dict[str, Any]) -> QueryParams:

@@ -64,6 +64,17 @@ def test_words_for_people_name_the_instances(tiny, tau):
     assert "score" in answer.out
 
 
+def test_all_that_match_are_named_and_the_others_counted(tiny, monkeypatch):
+    monkeypatch.setattr("ss_flow.flows.cli.query.ROWS", 1)
+    options = ("query", tiny.out, "white", "--cache", tiny.store)
+    many = ss_flow(*options, "--json").document()["instances"]
+    matching = [row for row in many if row["matched"]]
+    assert 1 <= len(matching) < len(many)
+    told = ss_flow(*options).out
+    assert told.count("match ") == len(matching)
+    assert f"{len(many) - len(matching)} more are farther off; --json names all." in told
+
+
 def test_what_nothing_matches_is_said(tiny):
     present = colours(tiny)
     absent = next(c for c in ("purple", "pink", "orange", "green", "blue", "yellow", "red") if c not in present)
