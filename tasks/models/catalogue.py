@@ -61,8 +61,7 @@ class ModelEntry:
     """npm package and version, or empty."""
     files: tuple[FileEntry, ...]
     parameters: tuple[tuple[str, float], ...]
-    texts: tuple[tuple[str, str], ...]
-    wires: tuple[tuple[str, str, str], ...] = ()
+    names_inside: tuple[tuple[str, str], ...]
     extra: str = ""
     """The extra of this distribution that installs the packages in which files of it lie, or empty."""
     on_request: bool = False
@@ -104,10 +103,8 @@ class Model:
     files: tuple[ModelFile, ...]
     parameters: tuple[tuple[str, float], ...]
     """Numbers that hold for this model alone, such as its stability threshold."""
-    texts: tuple[tuple[str, str], ...]
-    """Names inside its networks."""
-    wires: tuple[tuple[str, str, str], ...] = ()
-    """Nodes of its networks that shall read another tensor than the file says: node, tensor, the other."""
+    names_inside: tuple[tuple[str, str], ...]
+    """Names here, and in its files, of arrays inside its networks."""
 
     def file(self, role: str) -> FileRef:
         """The file of a role. Raises KeyError when the model has none."""
@@ -116,10 +113,6 @@ class Model:
     def parameter(self, name: str) -> float:
         """A number of the model. Raises KeyError when it has none of this name."""
         return dict(self.parameters)[name]
-
-    def text(self, name: str) -> str:
-        """A name inside the model's networks. Raises KeyError when it has none."""
-        return dict(self.texts)[name]
 
 
 @functools.cache
@@ -153,8 +146,7 @@ def _entry(name: str, table: dict[str, Any]) -> ModelEntry:
         table.get("npm", ""),
         files,
         tuple(table.get("parameters", {}).items()),
-        tuple(table.get("texts", {}).items()),
-        tuple((node, old, new) for node, old, new in table.get("wires", [])),
+        tuple(table.get("names_inside", {}).items()),
         table.get("extra", ""),
         table.get("on_request", False),
     )
@@ -205,7 +197,7 @@ def find(
     files = tuple(
         ModelFile(file.role, FileRef(path, digest_file(path))) for file, path in zip(entry.files, paths, strict=True)
     )
-    return Model(entry.name, entry.kind, files, entry.parameters, entry.texts, entry.wires)
+    return Model(entry.name, entry.kind, files, entry.parameters, entry.names_inside)
 
 
 def _paths(entry: ModelEntry, folders: Sequence[Path]) -> list[Path] | None:

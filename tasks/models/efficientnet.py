@@ -60,7 +60,7 @@ def _network(weights: Mapping[str, Float32]) -> bytes:
         tensor = _block(graph, tensor, f"_blocks.{number}.", stride)
     tensor = _convolution(graph, tensor, "_conv_head", "_bn1", clipped=True)
     pooled = graph.operator("Flatten", graph.operator("GlobalAveragePool", tensor))
-    return graph.finished("pixels", ("n", 3, SIDE, SIDE), graph.linear(pooled, "_fc"))
+    return graph.finished({"pixels": ("n", 3, SIDE, SIDE)}, graph.linear(pooled, "_fc"))
 
 
 def _block(graph: GraphWriter, tensor: str, name: str, stride: int) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Bool, Float32, UInt8
 from ss_flow.tasks.models.catalogue import Model
-from ss_flow.tasks.models.onnx import open_written, run
+from ss_flow.tasks.models.onnx import all_weights_of, open_written, run
 from ss_flow.tasks.models.onnx_graph import GraphWriter, read_state
 
 _BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
@@ -36,12 +36,8 @@ class Lpips:
         features, linear = model.file("features"), model.file("linear")
         self._session = open_written(features, lambda: _network(read_state(features)), threads=threads)
         weights = read_state(linear)
-        try:
+        with all_weights_of(linear):
             self._weights = [weights[f"lin{block}.model.1.weight"].ravel() for block in range(len(_BLOCKS))]
-        except KeyError as error:
-            raise InputError(
-                f"{linear.path} has no weights {error}: it is another network than the catalogue describes."
-            ) from error
 
     def differences(self, image: UInt8, reference: UInt8, *, lowest: float = -1.0) -> tuple[Float32, ...]:
         """Where the features of two pictures differ: five maps [h, w], each over the whole picture, ever coarser.
@@ -108,4 +104,4 @@ def _network(weights: Mapping[str, Float32]) -> bytes:
             kernel, bias = (weights[f"features.{layer}.{part}"] for part in ("weight", "bias"))
             tensor = graph.operator("Relu", graph.operator("Conv", tensor, kernel, bias, pads=[1, 1, 1, 1]))
         taps.append(tensor)
-    return graph.finished("pixels", (1, 3, "h", "w"), *taps)
+    return graph.finished({"pixels": (1, 3, "h", "w")}, *taps)

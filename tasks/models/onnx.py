@@ -1,10 +1,11 @@
-"""Networks in ONNX form: sessions that are opened once, and graphs cut at an inner tensor."""
+"""Networks in ONNX form: sessions that are opened once."""
 
 from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import distributions, version
 from pathlib import Path
 from types import ModuleType
@@ -19,13 +20,14 @@ from ss_flow.tasks.device import VARIABLE, has_device, wanted
 from ss_flow.tasks.processor import on_this_processor, widest_instruction_set
 
 if TYPE_CHECKING:
-    import onnx
     import onnxruntime
 
 
 _CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 _CUDA_OPTIONS = {"arena_extend_strategy": "kSameAsRequested", "cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"}
 """Others share the device, and the algorithm must not be what happened to be fastest this time."""
+_SLOW_FUSIONS = ("SkipLayerNormFusion", "BiasGeluFusion")
+"""What ONNX Runtime puts in the place of two operators and, on a CPU, computes without vector instructions."""
 
 
 def network_identity() -> dict[str, str]:
@@ -91,24 +93,15 @@ def load_onnxruntime() -> ModuleType:
     return cast(ModuleType, onnxruntime)
 
 
-def open_session(
-    file: FileRef,
-    *,
-    threads: int = 1,
-    outputs: tuple[str, ...] = (),
-    batched: tuple[str, ...] = (),
-    wires: tuple[tuple[str, str, str], ...] = (),
-    inputs: tuple[str, ...] = (),
-) -> onnxruntime.InferenceSession:
-    """The session of a network, one a process for each file content, thread count and cut; on CUDA where it can be.
+def open_session(file: FileRef, *, threads: int = 1, inputs: tuple[str, ...] = ()) -> onnxruntime.InferenceSession:
+    """The session of a network, one a process for each file content and thread count; on CUDA where it can be.
 
     file: an ONNX file. threads: cores that one run may use; nodes run one after the other in a fixed order, so the
-    count does not change what a node is given. outputs, batched, wires: how to cut the graph (see `expose`); no outputs
-    keeps the graph as it is. inputs: names that the network has to take.
+    count does not change what a node is given. inputs: names that the network has to take.
     Raises InputError when the file is missing, is damaged, is no ONNX graph, or lacks one of the names.
     """
     providers()  # warns, also where the session is open already
-    session = _open(str(file.path), file.digest, threads, outputs, batched, wires)
+    session = _open(str(file.path), file.digest, threads)
     taken = [node.name for node in session.get_inputs()]
     missing = [name for name in inputs if name not in taken]
     if missing:
@@ -125,30 +118,30 @@ def open_written(weights: FileRef, write: Callable[[], bytes], *, threads: int =
     write: gives the network as an ONNX file's content. threads: as for `open_session`.
     Raises InputError when the file lacks a weight that the network has.
     """
+    with all_weights_of(weights):
+        return _session(write(), str(weights.path), threads, _SLOW_FUSIONS)
+
+
+@contextmanager
+def all_weights_of(file: FileRef) -> Iterator[None]:
+    """Says of a KeyError inside, a weight that is missing, which file lacks it: an InputError."""
     try:
-        return _session(write(), str(weights.path), threads)
+        yield
     except KeyError as error:
         raise InputError(
-            f"{weights.path} has no weights {error}: it is another network than the catalogue describes."
+            f"{file.path} has no weights {error}: it is another network than the catalogue describes."
         ) from error
 
 
 @functools.lru_cache(maxsize=8)
-def _open(
-    path: str,
-    digest: str,
-    threads: int,
-    outputs: tuple[str, ...],
-    batched: tuple[str, ...],
-    wires: tuple[tuple[str, str, str], ...],
-) -> onnxruntime.InferenceSession:
+def _open(path: str, digest: str, threads: int) -> onnxruntime.InferenceSession:
     if not Path(path).is_file():
         raise InputError(f"{path} does not exist; it should be an ONNX network.")
-    return _session(expose(Path(path), outputs, batched, wires) if outputs else path, path, threads)
+    return _session(path, path, threads)
 
 
-def _session(source: str | bytes, path: str, threads: int) -> onnxruntime.InferenceSession:
-    """source: a file, or its content. path: what to call it."""
+def _session(source: str | bytes, path: str, threads: int, but: tuple[str, ...] = ()) -> onnxruntime.InferenceSession:
+    """source: a file, or its content. path: what to call it. but: ONNX Runtime's rewritings that are left out."""
     onnxruntime = load_onnxruntime()
     options = onnxruntime.SessionOptions()
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -157,7 +150,7 @@ def _session(source: str | bytes, path: str, threads: int) -> onnxruntime.Infere
     options.use_deterministic_compute = True
     options.log_severity_level = 3
     try:
-        return onnxruntime.InferenceSession(source, options, providers=providers())
+        return onnxruntime.InferenceSession(source, options, providers=providers(), disabled_optimizers=list(but))
     except Exception as error:  # onnxruntime has a class for every cause, with no common base
         raise InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.") from error
 
@@ -175,73 +168,6 @@ def run(session: onnxruntime.InferenceSession, inputs: Mapping[str, np.ndarray])
             f"the network refuses the inputs {shapes} ({_first_line(error)}); "
             "its file is not the one that the catalogue describes."
         ) from error
-
-
-def expose(
-    path: Path,
-    outputs: tuple[str, ...],
-    batched: tuple[str, ...] = (),
-    wires: tuple[tuple[str, str, str], ...] = (),
-) -> bytes:
-    """An ONNX graph cut so that inner tensors become its outputs, in memory; nothing is written.
-
-    path: the file. outputs: names of the float32 tensors wanted, in this order; nodes and inputs that they do not need
-    are dropped. batched: inputs whose first size, fixed by the export, is set free. wires: (node, tensor,
-    other): the node reads the other tensor instead.
-    Raises InputError when the file is damaged or has no such tensor or wire.
-    """
-    import onnx
-
-    try:
-        model = onnx.load(str(path))
-    except Exception as error:  # protobuf's own exceptions, which depend on its backend
-        raise InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.") from error
-    graph = model.graph
-    for name, old, new in wires:
-        readers = [node for node in graph.node if node.name == name and old in node.input]
-        if not readers:
-            raise InputError(
-                f"{path} has no node {name} that reads {old}: it is another network than the catalogue describes."
-            )
-        for node in readers:
-            node.input[list(node.input).index(old)] = new
-    produced = {name for node in graph.node for name in node.output}
-    missing = [name for name in outputs if name not in produced]
-    if missing:
-        raise InputError(
-            f"{path} has no tensor {', '.join(missing)}: it is another network than the catalogue describes."
-        )
-
-    needed = set(outputs)
-    kept: list[onnx.NodeProto] = []
-    for node in reversed(graph.node):
-        if needed.intersection(node.output):
-            kept.append(node)
-            needed.update(_names_read(node))
-    kept.reverse()
-    inputs = [entry for entry in graph.input if entry.name in needed]
-    for entry in inputs:
-        if entry.name in batched:
-            entry.type.tensor_type.shape.dim[0].dim_param = "batch"
-    cut = onnx.helper.make_graph(
-        kept,
-        graph.name,
-        inputs,
-        [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None) for name in outputs],
-        [tensor for tensor in graph.initializer if tensor.name in needed],
-    )
-    result: Any = onnx.helper.make_model(cut, opset_imports=model.opset_import, ir_version=model.ir_version)
-    return bytes(result.SerializeToString())
-
-
-def _names_read(node: onnx.NodeProto) -> set[str]:
-    names = set(node.input)
-    for attribute in node.attribute:
-        for graph in (attribute.g, *attribute.graphs):
-            for inner in graph.node:
-                names |= _names_read(inner)
-            names.update(entry.name for entry in graph.output)
-    return names - {""}
 
 
 def _first_line(error: Exception) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Float32
+
+if TYPE_CHECKING:
+    import onnx
 
 _OPSET, _IR_VERSION = 20, 9  # ONNX 1.15, which has GELU; read by ONNX Runtime from 1.17 on
 
@@ -37,17 +40,17 @@ class GraphWriter:
         product = self.operator("MatMul", tensor, np.ascontiguousarray(self.weights[f"{name}.weight"].T))
         return self.operator("Add", product, self.weights[f"{name}.bias"])
 
-    def finished(self, entry: str, shape: Sequence[int | str], *results: str) -> bytes:
-        """The network as a file's content: one input of this name and shape, and these outputs; all are float32.
+    def finished(self, entries: Mapping[str, Sequence[int | str]], *results: str) -> bytes:
+        """The network as a file's content: these inputs and outputs, all float32.
 
-        shape: a word stands for a size that varies.
+        entries: shapes by name; a word stands for a size that varies.
         """
         from onnx import TensorProto, helper
 
         graph = helper.make_graph(
             self._nodes,
             "network",
-            [helper.make_tensor_value_info(entry, TensorProto.FLOAT, shape)],
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in entries.items()],
             [helper.make_tensor_value_info(result, TensorProto.FLOAT, None) for result in results],
             self._constants,
         )
@@ -58,7 +61,7 @@ class GraphWriter:
         from onnx import numpy_helper
 
         name = f"c{len(self._constants)}"
-        self._constants.append(numpy_helper.from_array(array, name))
+        self._constants.append(numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name))
         return name
 
 
@@ -72,3 +75,18 @@ def read_state(file: FileRef) -> dict[str, Float32]:
     except Exception as error:  # torch passes on those of zip files and of unpickling
         reason = type(error).__name__
         raise InputError(f"{file.path} cannot be read as PyTorch weights ({reason}); install it again.") from error
+
+
+def read_graph(file: FileRef) -> tuple[Sequence[onnx.NodeProto], dict[str, Float32]]:
+    """The nodes of an ONNX file, and its constant arrays by name. Raises InputError when the file is missing or holds
+    no network."""
+    import onnx
+
+    if not file.path.is_file():
+        raise InputError(f"{file.path} does not exist; it should be an ONNX network.")
+    try:
+        graph = onnx.load(str(file.path)).graph
+    except Exception as error:  # protobuf's own exceptions, which depend on its backend
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise InputError(f"{file.path} cannot be read as an ONNX network ({reason}); fetch it again.") from error
+    return graph.node, {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}

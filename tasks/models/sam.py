@@ -10,11 +10,12 @@ from ss_flow.task import Bundle
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, UInt8
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import open_session, run
+from ss_flow.tasks.models.sam_decoder import FINE, MASKS, SIDE, open_decoder
 
 FRAME = 1024
 """Side of the square frame that the network sees, in pixels."""
-LOW = 256
-"""Side of the masks that the network gives."""
+LOW = SIDE * FINE
+"""Side of a mask of the whole frame, in its pixels."""
 _MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _DEVIATION = np.array([58.395, 57.12, 57.375], np.float32)
 
@@ -34,6 +35,12 @@ class Embedding:
         """Pixels of the network's frame per pixel of the image."""
         return FRAME / max(self.height, self.width)
 
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Rows and columns of the network's cells that show the image, in part at least."""
+        rows, columns = (-(-round(side * self.scale) * SIDE // FRAME) for side in (self.height, self.width))
+        return rows, columns
+
 
 @dataclass(frozen=True)
 class EmbeddedPhoto(Bundle):
@@ -47,25 +54,17 @@ class Sam:
     """A Segment Anything network of the catalogue.
 
     The decoder has four masks for each prompt: 0 is the one for prompts of several points, 1 to 3 are the alternatives
-    (part, whole, group) for an ambiguous single point. The exported graph gives only the mask it likes best, so it is
-    cut where all four still exist.
+    (part, whole, group) for an ambiguous single point.
     """
 
-    BATCH = 16
+    BATCH = 8
     """Prompts a run; more of them cost memory and save no time."""
 
     def __init__(self, model: Model, threads: int = 1) -> None:
         """Open the two networks. Raises InputError when a file is missing, damaged or another network."""
         self.name = model.name
         self._encoder = open_session(model.file("encoder"), threads=threads, inputs=("input",))
-        self._decoder = open_session(
-            model.file("decoder"),
-            threads=threads,
-            outputs=(model.text("masks_tensor"), model.text("scores_tensor")),
-            batched=("point_coords", "point_labels"),
-            wires=model.wires,
-            inputs=("image_embeddings", "point_coords", "point_labels", "mask_input", "has_mask_input"),
-        )
+        self._decoder = open_decoder(model.file("decoder"), model.names_inside, threads)
 
     def encode(self, rgb: UInt8) -> Embedding:
         """The embedding of an image: rgb is [H, W, 3] uint8."""
@@ -89,7 +88,7 @@ class Sam:
         """The four masks of each of M single-point prompts.
 
         points: [M, 2] x, y in pixels of the image. labels: [M] 1 = inside (the default), 0 = outside.
-        Returns logits: [M, 4, 256, 256] (see `upsample`), predicted_iou: [M, 4].
+        Returns logits: [M, 4, h, w] (see `upsample`), predicted_iou: [M, 4].
         """
         if labels is None:
             labels = np.ones(len(points), np.int32)
@@ -98,7 +97,8 @@ class Sam:
             for start in range(0, len(points), self.BATCH)
         ]
         if not parts:
-            return np.zeros((0, 4, LOW, LOW), np.float32), np.zeros((0, 4), np.float32)
+            rows, columns = embedding.cells
+            return np.zeros((0, MASKS, rows * FINE, columns * FINE), np.float32), np.zeros((0, MASKS), np.float32)
         return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
 
     def predict_prompt(
@@ -117,7 +117,10 @@ class Sam:
         return self.upsample(embedding, logits[0, best : best + 1])[0] > 0, float(scores[0, best])
 
     def upsample(self, embedding: Embedding, logits: Float32) -> Float32:
-        """Logits at the size of the image, bilinear: [M, 256, 256] -> [M, H, W]."""
+        """Logits at the size of the image, bilinear: [M, h, w] -> [M, H, W].
+
+        They begin at the image's upper left corner, and 256 of their pixels are as long as its longer side.
+        """
         import cv2
 
         step = embedding.scale * LOW / FRAME
@@ -135,18 +138,5 @@ class Sam:
         return result
 
     def _decode(self, embedding: Embedding, points: Float32 | Float64, labels: Int32) -> tuple[Float32, Float32]:
-        count = len(points)
-        # The network was traced with a padding point after the prompt's own.
-        coords = np.concatenate([points * embedding.scale, np.zeros((count, 1, 2))], axis=1).astype(np.float32)
-        marks = np.concatenate([labels, np.full((count, 1), -1)], axis=1).astype(np.float32)
-        logits, scores = run(
-            self._decoder,
-            {
-                "image_embeddings": embedding.features,
-                "point_coords": coords,
-                "point_labels": marks,
-                "mask_input": np.zeros((1, 1, LOW, LOW), np.float32),
-                "has_mask_input": np.zeros(1, np.float32),
-            },
-        )
-        return logits, scores
+        places = np.asarray(points, np.float64) * embedding.scale
+        return self._decoder(embedding.features, (places + 0.5) / FRAME, labels, *embedding.cells)

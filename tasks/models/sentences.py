@@ -87,7 +87,7 @@ def _network(weights: Mapping[str, Float32]) -> bytes:
         tensor = _normalised(graph, graph.operator("Add", narrow, tensor), f"{layer}.output.LayerNorm")
     mean = graph.operator("ReduceMean", tensor, np.array([1], np.int64), keepdims=0)
     width = weights[f"{_EMBEDDINGS}.LayerNorm.weight"].shape[0]
-    return graph.finished("embedded", ("n", "t", width), mean)
+    return graph.finished({"embedded": ("n", "t", width)}, mean)
 
 
 def _attention(graph: GraphWriter, tensor: str, name: str) -> str:

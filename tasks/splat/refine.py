@@ -260,19 +260,20 @@ def _replacement(
         return None
     if prompt is None:
         return shown if rendered.support >= params.min_support else None
+    wanted, least, most = params.tau_iou, 0.0, float(shown.size)
+    if old is not None:
+        wanted = iou(old, shown) + (0 if drawn else params.margin)
+        if params.max_change and not drawn:
+            least, most = old.sum() / params.max_change, old.sum() * params.max_change
+    area = shown.sum()
+    if min(1.0, most / area, area / max(least, 1.0)) < wanted:
+        return None  # no mask of a size that is taken could agree so well, so the segmenter need not be asked
     places = np.stack([column, row], axis=-1) + 0.5
     taken = greedy_farthest(places, params.prompts, alpha=params.prompt_alpha, drop_hull=params.drop_hull)
     candidate, score = prompt(places[taken])
     candidate = grown(without_speckles(candidate, params.speckle), params.dilation) & valid
-    agreement = iou(candidate, shown)
-    if params.pred_iou and score < params.pred_iou:
+    if score < params.pred_iou or not least <= candidate.sum() <= most:
         return None
-    if old is None:
-        return candidate if agreement > params.tau_iou else None
-    wanted = iou(old, shown)
-    if not drawn:
-        before, after = int(old.sum()), int(candidate.sum())
-        if params.max_change and max(before, after) > params.max_change * min(before, after):
-            return None
-        wanted += params.margin
-    return candidate if agreement > wanted or (params.tie == "new" and agreement == wanted) else None
+    agreement = iou(candidate, shown)
+    equal = old is not None and params.tie == "new" and agreement == wanted
+    return candidate if agreement > wanted or equal else None

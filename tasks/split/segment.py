@@ -84,7 +84,7 @@ class _Candidates:
     """Masks at the network's own resolution, cropped to the image."""
 
     logits: Float32
-    """[N, 256, 256]."""
+    """[N, h', w'], at least as large."""
     masks: Bool
     """[N, h, w]."""
     predicted_iou: Float32
@@ -201,7 +201,7 @@ def _ask(
 def _filter(
     logits: Float32, scores: Float32, level: int, valid: Bool, params: SegmentParams, model: Model
 ) -> tuple[_Candidates, Int32]:
-    """The masks that are good enough, and the prompt of each: logits [M, 4, 256, 256], scores [M, 4], valid [h, w]."""
+    """The masks that are good enough, and the prompt of each: logits [M, 4, h', w'], scores [M, 4], valid [h, w]."""
     h, w = valid.shape
     # The first of the four answers a prompt of several points; for a single point it is the worst.
     good = scores[:, 1:] >= params.pred_iou
@@ -240,7 +240,8 @@ def _box_iou(masks: Bool) -> Float32:
 
 
 def _low_resolution(valid: Bool) -> Bool:
-    """Which pixels of the network's masks show valid image: the top left part of [256, 256] that the image fills."""
+    """Which pixels of the network's masks show valid image: the upper left part of
+    [256, 256] that the image fills."""
     from ss_flow.tasks.models.sam import LOW
 
     height, width = valid.shape

@@ -58,7 +58,7 @@ def test_a_block_is_what_torch_makes_of_its_formula(kernel, stride, size):
     pixels = np.random.default_rng(1).normal(0, 1, (2, 4, size, size)).astype(np.float32)
     graph = GraphWriter(weights)
     result = efficientnet._block(graph, "pixels", "b.", stride)
-    network = graph.finished("pixels", ("n", 4, size, size), result)
+    network = graph.finished({"pixels": ("n", 4, size, size)}, result)
     session = open_written(FileRef("block", "block"), lambda: network)
     expected = reference_block(weights, pixels, kernel, stride)
     np.testing.assert_allclose(run(session, {"pixels": pixels})[0], expected, atol=1e-5)

@@ -1,4 +1,4 @@
-"""Sessions of networks, and cut graphs."""
+"""Sessions of networks."""
 
 import re
 import subprocess
@@ -16,12 +16,13 @@ from ss_flow.errors import InputError
 from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef
 from ss_flow.tasks.models import onnx as networks
-from ss_flow.tasks.models.onnx import expose, open_session, run
+from ss_flow.tasks.models.onnx import open_session, run
+from ss_flow.tasks.models.onnx_graph import read_graph
 
 
 @pytest.fixture
 def network(tmp_path):
-    """y = (x + 1) * 2 with the inner tensor `inner`; z = x - unused; the batch of x is fixed at 1."""
+    """y = (x + 1) * 2; z = x - unused."""
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
     two = helper.make_tensor("two", TensorProto.FLOAT, [1], [2.0])
     graph = helper.make_graph(
@@ -53,28 +54,9 @@ def test_network_gives_its_own_outputs_in_order(network):
     np.testing.assert_array_equal(z, [[0, 0, 0]])
 
 
-def test_cut_graph_gives_the_inner_tensor_for_batches_and_drops_what_it_does_not_need(network):
-    before = network.path.read_bytes()
-    session = open_session(network, outputs=("inner",), batched=("x",))
-    assert [i.name for i in session.get_inputs()] == ["x"]
-    x = np.arange(6, dtype=np.float32).reshape(2, 3)
-    np.testing.assert_array_equal(run(session, {"x": x})[0], x + 1)
-    assert network.path.read_bytes() == before
-
-
 def test_session_is_opened_once_for_each_content(network):
     assert open_session(network) is open_session(network)
     assert open_session(network) is not open_session(FileRef(network.path, "other"))
-
-
-def test_unknown_inner_tensor_is_refused(network):
-    with pytest.raises(InputError, match="has no tensor nowhere"):
-        expose(network.path, ("nowhere",))
-
-
-def test_a_wire_of_another_network_is_refused(network):
-    with pytest.raises(InputError, match="has no node nobody that reads x"):
-        expose(network.path, ("y",), wires=(("nobody", "x", "z"),))
 
 
 def test_missing_input_names_both_sides(network):
@@ -87,18 +69,19 @@ def test_wrong_shape_is_an_input_error(network):
         run(open_session(network), {"x": np.zeros((2, 3), np.float32), "unused": np.zeros((1, 3), np.float32)})
 
 
-@pytest.mark.parametrize("outputs", [(), ("inner",)], ids=["whole", "cut"])
+@pytest.mark.parametrize("reader", [open_session, read_graph])
 @pytest.mark.parametrize("keep", [0.5, 0.0], ids=["cut off", "text"])
-def test_damaged_file_is_named(network, keep, outputs):
+def test_damaged_file_is_named(network, keep, reader):
     data = network.path.read_bytes()
     network.path.write_bytes(data[: int(len(data) * keep)] or b"<html>not found</html>")
     with pytest.raises(InputError, match=r"small\.onnx cannot be read as an ONNX network"):
-        open_session(FileRef(network.path, f"damaged {keep}"), outputs=outputs)
+        reader(FileRef(network.path, f"damaged {keep}"))
 
 
-def test_missing_file_is_named(tmp_path):
+@pytest.mark.parametrize("reader", [open_session, read_graph])
+def test_missing_file_is_named(tmp_path, reader):
     with pytest.raises(InputError, match=r"gone\.onnx does not exist"):
-        open_session(FileRef(tmp_path / "gone.onnx", "gone"))
+        reader(FileRef(tmp_path / "gone.onnx", "gone"))
 
 
 def test_onnx_runtime_is_told_not_to_report_its_use_before_it_is_imported():

