@@ -135,7 +135,7 @@ def _attending(weights: Mapping[str, Float32]) -> bytes:
     seen = graph.tokens_of_cells(compared, placed, cells, "transformer.final_attn_token_to_image")
     tokens = graph.normalised(graph.added(tokens, seen), "transformer.norm_final_attn")
     quality, *kernels = (
-        graph.perceptron(graph.operator("Gather", tokens, np.array(rows), axis=1), *_layers(head))
+        graph.perceptron(graph.operator("Gather", tokens, np.array(rows), axis=1), *_layers_of(head))
         for rows, head in enumerate(("iou_prediction_head", *(f"output_hypernetworks_mlps.{m}" for m in range(MASKS))))
     )
     kernels = [graph.operator("Unsqueeze", kernel, np.array([1])) for kernel in kernels]
@@ -143,7 +143,7 @@ def _attending(weights: Mapping[str, Float32]) -> bytes:
     return graph.finished(entries, quality, graph.operator("Concat", *kernels, axis=1), cells)
 
 
-def _layers(head: str) -> list[str]:
+def _layers_of(head: str) -> list[str]:
     return [f"{head}.layers.{number}" for number in range(3)]
 
 
@@ -190,7 +190,7 @@ class _Transformer(GraphWriter):
         outward = self.weights[f"{name}.out_proj.weight"].T.reshape(_HEADS, -1, _WIDTH)
         values = self.operator("MatMul", self._heads(told, f"{name}.v_proj"), outward)
         # The shares of each head sum to one, so its values may carry a head's part of the bias.
-        values = self.added(values, self.weights[f"{name}.out_proj.bias"] / _HEADS)
+        values = self.added(values, self.weights[f"{name}.out_proj.bias"] * np.float32(1 / _HEADS))
         return self.operator("MatMul", self.turned(self._stacked(shares, _CELLS), 3), self._stacked(values))
 
     def turned(self, tensor: str, axes: int) -> str:
