@@ -30,7 +30,7 @@ class SegmentParams:
     grids: tuple[Count, ...] = (1, 4, 8, 16)
     """Prompt points a side of each grid, coarse to fine (row 2)."""
     adaptive: bool = True
-    """Whether the finest grid leaves out the points where those before agree, its own among them."""
+    """Whether the finest grid leaves out the points where the coarser ones agree."""
     settled_by: Count = 3
     """A point that lies in the smallest masks of so many prompts is not prompted: it would hardly find more. A mask
     above `max_area` does not count, since any thing may lie in it."""
@@ -124,15 +124,16 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
     valid_low = _low_resolution(valid)
 
     grids: list[_Candidates] = []
-    held: Int32 = np.zeros(valid_low.shape, np.int32)
+    agreed: Int32 = np.zeros(valid_low.shape, np.int32)
     for level, side in enumerate(params.grids):
-        adapts = params.adaptive and level == len(params.grids) - 1
-        points = grid_points(side, frame.width, frame.height)[spread(side) if adapts else slice(None)]
+        points = grid_points(side, frame.width, frame.height)
         points = points[valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
-        settled_by = params.settled_by if adapts else np.inf
-        accepted, prompts = _ask(sam, embedding, points, level, valid_low, held, settled_by, params, model)
+        if params.adaptive and level == len(params.grids) - 1:
+            points = points[_at(points, agreed, frame) < params.settled_by]
+        accepted, held = _ask(sam, embedding, points, level, valid_low, params, model)
         grids.append(accepted)
-        progress(level + 1, len(params.grids), f"{side} x {side}: {prompts} prompts")
+        agreed += held
+        progress(level + 1, len(params.grids), f"{side} x {side}: {len(points)} prompts")
     found = _Candidates.joined(grids)
 
     if params.merge == "child":
@@ -170,39 +171,18 @@ def grid_points(side: int, width: int, height: int) -> Float64:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def spread(side: int) -> Int32:
-    """An order of side x side cells, numbered row by row, in which the first few lie all over the image: [side^2].
-
-    Every second row and column first, and so on within these: by the bits of both numbers, the lowest first.
-    """
-    row, column = np.divmod(np.arange(side * side), side)
-    bits = [number >> bit & 1 for bit in range(side.bit_length()) for number in (row, column)]
-    return np.lexsort(bits[::-1]).astype(np.int32)
-
-
 def _ask(
-    sam: Sam,
-    embedding: Embedding,
-    points: Float64,
-    level: int,
-    valid: Bool,
-    held: Int32,
-    settled_by: float,
-    params: SegmentParams,
-    model: Model,
-) -> tuple[_Candidates, int]:
-    """The masks that the points of one grid find, and the number of points that were asked for.
+    sam: Sam, embedding: Embedding, points: Float64, level: int, valid: Bool, params: SegmentParams, model: Model
+) -> tuple[_Candidates, Int32]:
+    """The masks that the points of one grid find.
 
-    held: for each pixel [h, w] how many prompts have it in the smallest mask that they found, leaving out masks above
-    `max_area`; those of this grid are added. settled_by: points that so many hold are left out.
+    Returns the accepted masks, and for each pixel [h, w] how many of the points have it in the smallest mask that they
+    found, leaving out masks above `max_area`.
     """
     parts: list[_Candidates] = []
-    asked = 0
-    while not parts or len(points):
-        points = points[_at(points, held, embedding) < settled_by]
-        now, points = points[: sam.BATCH], points[sam.BATCH :]
-        asked += len(now)
-        logits, scores = sam.predict(embedding, now)
+    held: Int32 = np.zeros(valid.shape, np.int32)
+    for start in range(0, max(1, len(points)), sam.BATCH):
+        logits, scores = sam.predict(embedding, points[start : start + sam.BATCH])
         passed, prompt = _filter(logits, scores, level, valid, params, model)
         parts.append(passed)
         area = passed.masks.sum(axis=(1, 2))
@@ -214,8 +194,8 @@ def _ask(
         held += passed.masks[things].sum(axis=0, dtype=np.int32)
     found = _Candidates.joined(parts)
     if params.suppression == "masks":
-        return found[suppress(mask_iou(found.masks), found.predicted_iou, params.mask_nms)], asked
-    return found[suppress(_box_iou(found.masks), found.predicted_iou, params.box_nms[level])], asked
+        return found[suppress(mask_iou(found.masks), found.predicted_iou, params.mask_nms)], held
+    return found[suppress(_box_iou(found.masks), found.predicted_iou, params.box_nms[level])], held
 
 
 def _filter(
@@ -239,10 +219,10 @@ def _filter(
     return _Candidates(flat, masks, quality, stability, grid)[passed], prompt[passed].astype(np.int32)
 
 
-def _at(points: Float64, image: Int32, photo: Embedding) -> Int32:
-    """The pixels of an image of any size [h, w] at points [M, 2] of the photo: [M]."""
+def _at(points: Float64, image: Int32, frame: Frame) -> Int32:
+    """The pixels of an image of any size [h, w] at points [M, 2] of the frame: [M]."""
     h, w = image.shape
-    return image[(points[:, 1] * h / photo.height).astype(int), (points[:, 0] * w / photo.width).astype(int)]
+    return image[(points[:, 1] * h / frame.height).astype(int), (points[:, 0] * w / frame.width).astype(int)]
 
 
 def _box_iou(masks: Bool) -> Float32:
@@ -260,8 +240,7 @@ def _box_iou(masks: Bool) -> Float32:
 
 
 def _low_resolution(valid: Bool) -> Bool:
-    """Which pixels of the network's masks show valid image: the upper left part of
-    [256, 256] that the image fills."""
+    """Which pixels of the network's masks show valid image: the top left part of [256, 256] that the image fills."""
     from ss_flow.tasks.models.sam import LOW
 
     height, width = valid.shape
