@@ -272,7 +272,8 @@ def _replacement(
     taken = greedy_farthest(places, params.prompts, alpha=params.prompt_alpha, drop_hull=params.drop_hull)
     candidate, score = prompt(places[taken])
     candidate = grown(without_speckles(candidate, params.speckle), params.dilation) & valid
-    if score < params.pred_iou or not least <= candidate.sum() <= most:
+    doubted = params.pred_iou and score < params.pred_iou
+    if doubted or not least <= candidate.sum() <= most:
         return None
     agreement = iou(candidate, shown)
     equal = old is not None and params.tie == "new" and agreement == wanted

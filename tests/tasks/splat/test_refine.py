@@ -176,6 +176,8 @@ def test_an_answer_that_the_segmenter_itself_doubts_is_not_taken(small, box, mon
     doubted = refined(small, box, few, monkeypatch, right)
     np.testing.assert_array_equal(doubted.packed, few.packed)
     assert len(refined(small, box, few, monkeypatch, right, pred_iou=0.7).views) == VIEWS
+    monkeypatch.setattr(Scripted, "score", -0.1)  # a network may predict that, too
+    assert len(refined(small, box, few, monkeypatch, right, pred_iou=0.0).views) == VIEWS
 
 
 def test_new_masks_leave_out_what_is_not_valid(small, box, monkeypatch):
