@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import distributions, version
 from pathlib import Path
@@ -16,10 +16,12 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import warn
 from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Float32
 from ss_flow.tasks.device import VARIABLE, has_device, wanted
 from ss_flow.tasks.processor import on_this_processor, widest_instruction_set
 
 if TYPE_CHECKING:
+    import onnx
     import onnxruntime
 
 
@@ -135,8 +137,7 @@ def all_weights_of(file: FileRef) -> Iterator[None]:
 
 @functools.lru_cache(maxsize=8)
 def _open(path: str, digest: str, threads: int) -> onnxruntime.InferenceSession:
-    if not Path(path).is_file():
-        raise InputError(f"{path} does not exist; it should be an ONNX network.")
+    _assert_file(Path(path))
     return _session(path, path, threads)
 
 
@@ -152,7 +153,29 @@ def _session(source: str | bytes, path: str, threads: int, but: tuple[str, ...] 
     try:
         return onnxruntime.InferenceSession(source, options, providers=providers(), disabled_optimizers=list(but))
     except Exception as error:  # onnxruntime has a class for every cause, with no common base
-        raise InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.") from error
+        raise _unreadable(path, error) from error
+
+
+def read_graph(file: FileRef) -> tuple[Sequence[onnx.NodeProto], dict[str, Float32]]:
+    """The nodes of an ONNX file, and its constant arrays by name. Raises InputError when the file is missing or holds
+    no network."""
+    import onnx
+
+    _assert_file(file.path)
+    try:
+        graph = onnx.load(str(file.path)).graph
+    except Exception as error:  # protobuf's own exceptions, which depend on its backend
+        raise _unreadable(str(file.path), error) from error
+    return graph.node, {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
+
+
+def _assert_file(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; it should be an ONNX network.")
+
+
+def _unreadable(path: str, error: Exception) -> InputError:
+    return InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.")
 
 
 def run(session: onnxruntime.InferenceSession, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Float32
-
-if TYPE_CHECKING:
-    import onnx
 
 _OPSET, _IR_VERSION = 20, 9  # ONNX 1.15, which has GELU; read by ONNX Runtime from 1.17 on
 
@@ -39,6 +36,11 @@ class GraphWriter:
         """x Wᵀ + b with the weights `name`.weight [out, in] and `name`.bias [out], on the last axis."""
         product = self.operator("MatMul", tensor, np.ascontiguousarray(self.weights[f"{name}.weight"].T))
         return self.operator("Add", product, self.weights[f"{name}.bias"])
+
+    def normalised(self, tensor: str, name: str, epsilon: float = 1e-5) -> str:
+        """Layer normalisation over the last axis, with the gain `name`.weight and the bias `name`.bias."""
+        gain, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
+        return self.operator("LayerNormalization", tensor, gain, bias, axis=-1, epsilon=epsilon)
 
     def finished(self, entries: Mapping[str, Sequence[int | str]], *results: str) -> bytes:
         """The network as a file's content: these inputs and outputs, all float32.
@@ -75,18 +77,3 @@ def read_state(file: FileRef) -> dict[str, Float32]:
     except Exception as error:  # torch passes on those of zip files and of unpickling
         reason = type(error).__name__
         raise InputError(f"{file.path} cannot be read as PyTorch weights ({reason}); install it again.") from error
-
-
-def read_graph(file: FileRef) -> tuple[Sequence[onnx.NodeProto], dict[str, Float32]]:
-    """The nodes of an ONNX file, and its constant arrays by name. Raises InputError when the file is missing or holds
-    no network."""
-    import onnx
-
-    if not file.path.is_file():
-        raise InputError(f"{file.path} does not exist; it should be an ONNX network.")
-    try:
-        graph = onnx.load(str(file.path)).graph
-    except Exception as error:  # protobuf's own exceptions, which depend on its backend
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise InputError(f"{file.path} cannot be read as an ONNX network ({reason}); fetch it again.") from error
-    return graph.node, {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}

@@ -21,8 +21,8 @@ import numpy as np
 
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Float32, Float64, Int32
-from ss_flow.tasks.models.onnx import all_weights_of, open_written, run
-from ss_flow.tasks.models.onnx_graph import GraphWriter, read_graph
+from ss_flow.tasks.models.onnx import all_weights_of, open_written, read_graph, run
+from ss_flow.tasks.models.onnx_graph import GraphWriter
 
 SIDE = 64
 """Cells on a side of the square frame."""
@@ -30,8 +30,8 @@ FINE = 4
 """Pixels of the masks on a side of a cell."""
 MASKS = 4
 _CELLS, _WIDTH, _HEADS, _LAYERS = SIDE * SIDE, 256, 8, 2
-_EPSILON, _FINE_EPSILON = 1e-5, 1e-6
-"""Of layer normalisation, as the network was trained."""
+_FINE_EPSILON = 1e-6
+"""Of the layer normalisation between the cuts, as the network was trained."""
 _FREQUENCIES = "prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"
 _KINDS = ("not_a_point_embed", "point_embeddings.0", "point_embeddings.1")
 """Of tokens: the one of no point, which the network was trained to find after points; points outside and inside."""
@@ -138,8 +138,8 @@ def _attending(weights: Mapping[str, Float32]) -> bytes:
     seen = graph.tokens_of_cells(compared, placed, cells, "transformer.final_attn_token_to_image")
     tokens = graph.normalised(graph.added(tokens, seen), "transformer.norm_final_attn")
     quality, *kernels = (
-        graph.perceptron(graph.operator("Gather", tokens, np.array(rows), axis=1), *_layers_of(head))
-        for rows, head in enumerate(("iou_prediction_head", *(f"output_hypernetworks_mlps.{m}" for m in range(MASKS))))
+        graph.perceptron(graph.operator("Gather", tokens, np.array(token), axis=1), *_layers_of(head))
+        for token, head in enumerate(("iou_prediction_head", *(f"output_hypernetworks_mlps.{m}" for m in range(MASKS))))
     )
     kernels = [graph.operator("Unsqueeze", kernel, np.array([1])) for kernel in kernels]
     entries = {"cells": (_CELLS, _WIDTH), "tokens": ("m", "t", _WIDTH)}
@@ -156,10 +156,6 @@ class _Transformer(GraphWriter):
 
     def added(self, tensor: str, other: str | Float32) -> str:
         return self.operator("Add", tensor, other)
-
-    def normalised(self, tensor: str, name: str) -> str:
-        scale, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
-        return self.operator("LayerNormalization", tensor, scale, bias, epsilon=_EPSILON)
 
     def perceptron(self, tensor: str, *names: str) -> str:
         for name in names[:-1]:

@@ -77,14 +77,14 @@ def _network(weights: Mapping[str, Float32]) -> bytes:
     """
     graph = GraphWriter(weights)
     layers = sum(name.endswith(".attention.self.query.weight") for name in weights)
-    tensor = _normalised(graph, "embedded", f"{_EMBEDDINGS}.LayerNorm")
+    tensor = graph.normalised("embedded", f"{_EMBEDDINGS}.LayerNorm", _EPSILON)
     for number in range(layers):
         layer = f"encoder.layer.{number}"
         seen = graph.linear(_attention(graph, tensor, f"{layer}.attention.self"), f"{layer}.attention.output.dense")
-        tensor = _normalised(graph, graph.operator("Add", seen, tensor), f"{layer}.attention.output.LayerNorm")
+        tensor = graph.normalised(graph.operator("Add", seen, tensor), f"{layer}.attention.output.LayerNorm", _EPSILON)
         wide = graph.operator("Gelu", graph.linear(tensor, f"{layer}.intermediate.dense"))
         narrow = graph.linear(wide, f"{layer}.output.dense")
-        tensor = _normalised(graph, graph.operator("Add", narrow, tensor), f"{layer}.output.LayerNorm")
+        tensor = graph.normalised(graph.operator("Add", narrow, tensor), f"{layer}.output.LayerNorm", _EPSILON)
     mean = graph.operator("ReduceMean", tensor, np.array([1], np.int64), keepdims=0)
     width = weights[f"{_EMBEDDINGS}.LayerNorm.weight"].shape[0]
     return graph.finished({"embedded": ("n", "t", width)}, mean)
@@ -105,8 +105,3 @@ def _attention(graph: GraphWriter, tensor: str, name: str) -> str:
     shares = graph.operator("Softmax", graph.operator("Mul", graph.operator("MatMul", queries, keys), scale), axis=-1)
     mixed = graph.operator("Transpose", graph.operator("MatMul", shares, values), perm=(0, 2, 1, 3))
     return graph.operator("Reshape", mixed, np.array([0, 0, width], np.int64))
-
-
-def _normalised(graph: GraphWriter, tensor: str, name: str) -> str:
-    gain, bias = graph.weights[f"{name}.weight"], graph.weights[f"{name}.bias"]
-    return graph.operator("LayerNormalization", tensor, gain, bias, axis=-1, epsilon=_EPSILON)

@@ -9,6 +9,7 @@ of three rounds, and the largest difference of a logit. The published graph take
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,39 +17,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from published_sam import published
+
 from ss_flow.tasks.artifacts import Float32, Float64
 from ss_flow.tasks.models.catalogue import find
-from ss_flow.tasks.models.onnx import load_onnxruntime
-from ss_flow.tasks.models.sam import LOW, Embedding, Sam
+from ss_flow.tasks.models.sam import Sam
 from ss_flow.tasks.split.segment import grid_points
-
-MASKS = "/Reshape_9_output_0"
-"""The four masks inside the published graph."""
-
-
-def published(file: Path, embedding: Embedding) -> Callable[[Float64], Float32]:
-    """Points [M, 2] in pixels of the photo -> logits [M, 4, 256, 256], by the graph of the file."""
-    import onnx
-
-    network = onnx.load(file)
-    network.graph.output.append(onnx.helper.make_tensor_value_info(MASKS, onnx.TensorProto.FLOAT, None))
-    runtime = load_onnxruntime()
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = runtime.InferenceSession(network.SerializeToString(), options, providers=["CPUExecutionProvider"])
-    same = {
-        "image_embeddings": embedding.features,
-        "mask_input": np.zeros((1, 1, LOW, LOW), np.float32),
-        "has_mask_input": np.zeros(1, np.float32),
-        "orig_im_size": np.array([embedding.height, embedding.width], np.float32),
-        "point_labels": np.array([[1, -1]], np.float32),
-    }
-
-    def answer(points: Float64) -> Float32:
-        coordinates = [np.array([[point, (0, 0)]], np.float32) for point in points * embedding.scale]
-        return np.concatenate([session.run([MASKS], {**same, "point_coords": place})[0] for place in coordinates])
-
-    return answer
 
 
 def least_ms(answer: Callable[[Float64], object], points: Float64) -> float:
@@ -73,7 +48,11 @@ def main() -> None:
     rgb = np.ascontiguousarray(cv2.imread(str(args.photo))[:, :, ::-1])
     embedding = sam.encode(rgb)
     points = grid_points(8, embedding.width, embedding.height)[: args.prompts]
-    answer = published(model.file("decoder").path, embedding)
+    one, inside = published(model.file("decoder").path, embedding), np.ones(1, np.int32)
+
+    def answer(points: Float64) -> Float32:
+        return np.array([one(point[None], inside)[0] for point in points])
+
     ours, expected = sam.predict(embedding, points)[0], answer(points)
     difference = np.abs(ours - expected[:, :, : ours.shape[2], : ours.shape[3]]).max()
     print(f"{embedding.width} x {embedding.height}, {len(points)} prompts; logits differ by at most {difference:.1e}")

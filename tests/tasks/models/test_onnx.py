@@ -16,8 +16,7 @@ from ss_flow.errors import InputError
 from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef
 from ss_flow.tasks.models import onnx as networks
-from ss_flow.tasks.models.onnx import open_session, run
-from ss_flow.tasks.models.onnx_graph import read_graph
+from ss_flow.tasks.models.onnx import open_session, read_graph, run
 
 
 @pytest.fixture

