@@ -17,9 +17,11 @@ _OPSET, _IR_VERSION = 20, 9  # ONNX 1.15, which has GELU; read by ONNX Runtime f
 class GraphWriter:
     """A network, operator by operator; tensors are known by their names."""
 
-    def __init__(self, weights: Mapping[str, Float32]) -> None:
-        """weights: arrays by the names under which `weight` finds them."""
+    def __init__(self, weights: Mapping[str, Float32], letter: str = "t") -> None:
+        """weights: arrays by the names under which layers find them. letter: what names of tensors begin with, so that
+        those of one network may be inputs of another."""
         self.weights = weights
+        self._letter = letter
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
 
@@ -27,7 +29,7 @@ class GraphWriter:
         """Add an operator with one output, whose name is returned; an array among its inputs becomes a constant."""
         from onnx import helper
 
-        name = f"t{len(self._nodes)}"
+        name = f"{self._letter}{len(self._nodes)}"
         read = [tensor if isinstance(tensor, str) else self._constant(tensor) for tensor in inputs]
         self._nodes.append(helper.make_node(kind, read, [name], **attributes))
         return name

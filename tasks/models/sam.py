@@ -10,7 +10,8 @@ from ss_flow.task import Bundle
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, UInt8
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import open_session, run
-from ss_flow.tasks.models.sam_decoder import FINE, MASKS, SIDE, open_decoder
+from ss_flow.tasks.models.sam_cells import SIDE
+from ss_flow.tasks.models.sam_decoder import FINE, MASKS, MaskDecoder, open_decoder
 
 FRAME = 1024
 """Side of the square frame that the network sees, in pixels."""
@@ -41,6 +42,27 @@ class Embedding:
         rows, columns = (-(-round(side * self.scale) * SIDE // FRAME) for side in (self.height, self.width))
         return rows, columns
 
+    def upsample(self, logits: Float32) -> Float32:
+        """Logits at the size of the image, bilinear: [M, h, w] -> [M, H, W].
+
+        They begin at the image's upper left corner, and 256 of their pixels are as long as its longer side.
+        """
+        import cv2
+
+        step = self.scale * LOW / FRAME
+        # Pixel centres: x_low + 0.5 = (x + 0.5) * step.
+        inverse = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2]])
+        result = np.empty((len(logits), self.height, self.width), np.float32)
+        for index, mask in enumerate(logits):
+            result[index] = cv2.warpAffine(
+                mask,
+                inverse,
+                (self.width, self.height),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+        return result
+
 
 @dataclass(frozen=True)
 class EmbeddedPhoto(Bundle):
@@ -51,14 +73,7 @@ class EmbeddedPhoto(Bundle):
 
 
 class Sam:
-    """A Segment Anything network of the catalogue.
-
-    The decoder has four masks for each prompt: 0 is the one for prompts of several points, 1 to 3 are the alternatives
-    (part, whole, group) for an ambiguous single point.
-    """
-
-    BATCH = 8
-    """Prompts a run; more of them cost memory and save no time."""
+    """A Segment Anything network of the catalogue."""
 
     def __init__(self, model: Model, threads: int = 1) -> None:
         """Open the two networks. Raises InputError when a file is missing, damaged or another network."""
@@ -82,28 +97,46 @@ class Sam:
         padded[0, :, :inner_height, :inner_width] = ((small - _MEAN) / _DEVIATION).transpose(2, 0, 1)
         return Embedding(run(self._encoder, {"input": padded})[0], height, width)
 
-    def predict(
-        self, embedding: Embedding, points: Float32 | Float64, labels: Int32 | None = None
-    ) -> tuple[Float32, Float32]:
+    def image(self, embedding: Embedding, *, few: bool = False) -> PromptedImage:
+        """An image that prompts ask on.
+
+        few: for a prompt or two, or prompts of ten points, which do not gain by what is computed for all of them first.
+        """
+        return PromptedImage(self._decoder, embedding, few)
+
+
+class PromptedImage:
+    """An image, and what all prompts on it have in common.
+
+    There are four masks for each prompt: 0 is the one for prompts of several points, 1 to 3 are the alternatives (part,
+    whole, group) for an ambiguous single point.
+    """
+
+    BATCH = 8
+    """Prompts a run; more of them cost memory and save no time."""
+
+    def __init__(self, decoder: MaskDecoder, embedding: Embedding, few: bool) -> None:
+        self._decoder, self._embedding = decoder, embedding
+        self._known = decoder.known(embedding.features, few=few)
+
+    def predict(self, points: Float32 | Float64, labels: Int32 | None = None) -> tuple[Float32, Float32]:
         """The four masks of each of M single-point prompts.
 
         points: [M, 2] x, y in pixels of the image. labels: [M] 1 = inside (the default), 0 = outside.
-        Returns logits: [M, 4, h, w] (see `upsample`), predicted_iou: [M, 4].
+        Returns logits: [M, 4, h, w] (see `Embedding.upsample`), predicted_iou: [M, 4].
         """
         if labels is None:
             labels = np.ones(len(points), np.int32)
         parts = [
-            self._decode(embedding, points[start : start + self.BATCH, None], labels[start : start + self.BATCH, None])
+            self._decode(points[start : start + self.BATCH, None], labels[start : start + self.BATCH, None])
             for start in range(0, len(points), self.BATCH)
         ]
         if not parts:
-            rows, columns = embedding.cells
+            rows, columns = self._embedding.cells
             return np.zeros((0, MASKS, rows * FINE, columns * FINE), np.float32), np.zeros((0, MASKS), np.float32)
         return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
 
-    def predict_prompt(
-        self, embedding: Embedding, points: Float32 | Float64, labels: Int32 | None = None
-    ) -> tuple[Bool, float]:
+    def predict_prompt(self, points: Float32 | Float64, labels: Int32 | None = None) -> tuple[Bool, float]:
         """The one mask that several points ask for together.
 
         points: [n, 2] x, y in pixels of the image, n >= 1. labels: [n] 1 = inside (the default), 0 = outside.
@@ -112,31 +145,10 @@ class Sam:
         """
         if labels is None:
             labels = np.ones(len(points), np.int32)
-        logits, scores = self._decode(embedding, points[None], labels[None])
+        logits, scores = self._decode(points[None], labels[None])
         best = 1 + int(np.argmax(scores[0, 1:])) if len(points) == 1 else 0
-        return self.upsample(embedding, logits[0, best : best + 1])[0] > 0, float(scores[0, best])
+        return self._embedding.upsample(logits[0, best : best + 1])[0] > 0, float(scores[0, best])
 
-    def upsample(self, embedding: Embedding, logits: Float32) -> Float32:
-        """Logits at the size of the image, bilinear: [M, h, w] -> [M, H, W].
-
-        They begin at the image's upper left corner, and 256 of their pixels are as long as its longer side.
-        """
-        import cv2
-
-        step = embedding.scale * LOW / FRAME
-        # Pixel centres: x_low + 0.5 = (x + 0.5) * step.
-        inverse = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2]])
-        result = np.empty((len(logits), embedding.height, embedding.width), np.float32)
-        for index, mask in enumerate(logits):
-            result[index] = cv2.warpAffine(
-                mask,
-                inverse,
-                (embedding.width, embedding.height),
-                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                borderMode=cv2.BORDER_REPLICATE,
-            )
-        return result
-
-    def _decode(self, embedding: Embedding, points: Float32 | Float64, labels: Int32) -> tuple[Float32, Float32]:
-        places = np.asarray(points, np.float64) * embedding.scale
-        return self._decoder(embedding.features, (places + 0.5) / FRAME, labels, *embedding.cells)
+    def _decode(self, points: Float32 | Float64, labels: Int32) -> tuple[Float32, Float32]:
+        places = np.asarray(points, np.float64) * self._embedding.scale
+        return self._decoder(self._known, (places + 0.5) / FRAME, labels, *self._embedding.cells)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -126,7 +125,7 @@ def refine(
         row = held.get(frame.name)
         old = None if row is None else instance.mask(row)
         drawn = row is not None and instance.origin[row] == DRAWN
-        prompt = functools.partial(segmenter.predict_prompt, embeddings[view]) if segmenter else None
+        prompt = segmenter.image(embeddings[view], few=True).predict_prompt if segmenter else None
         new = _replacement(scene, view, solid, old, drawn, params, prompt)
         if new is not None:
             masks.append(np.packbits(new))

@@ -93,11 +93,11 @@ def prompt(photo: EmbeddedPhoto, prompts: dict[int, Prompt], model: Model, speck
     masks = np.zeros((len(prompts), frame.height, frame.width), bool)
     predicted = np.zeros(len(prompts), np.float32)
     if prompts:
-        sam = Sam(model)
+        image = Sam(model).image(photo.embedding, few=True)
         valid = decode_valid(frame)
         for row, label in enumerate(sorted(prompts)):
             asked = prompts[label]
-            mask, predicted[row] = sam.predict_prompt(photo.embedding, asked.points, asked.inside)
+            mask, predicted[row] = image.predict_prompt(asked.points, asked.inside)
             masks[row] = without_speckles(mask, speckle) & valid
     return PromptedMasks(
         name=frame.name,

@@ -19,7 +19,7 @@ from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree, merge_union, whole_pictures, without_speckles
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
-from ss_flow.tasks.models.sam import Embedding, Sam
+from ss_flow.tasks.models.sam import Embedding, PromptedImage, Sam
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
 
 
@@ -119,7 +119,7 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
     come in canonical order: area descending.
     Raises InputError when the model's files are missing, damaged or other networks.
     """
-    sam = Sam(model)
+    image = Sam(model).image(embedding)
     valid = decode_valid(frame)
     valid_low = _low_resolution(valid)
 
@@ -130,7 +130,7 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
         points = points[valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
         if params.adaptive and level == len(params.grids) - 1:
             points = points[_at(points, agreed, frame) < params.settled_by]
-        accepted, held = _ask(sam, embedding, points, level, valid_low, params, model)
+        accepted, held = _ask(image, points, level, valid_low, params, model)
         grids.append(accepted)
         agreed += held
         progress(level + 1, len(params.grids), f"{side} x {side}: {len(points)} prompts")
@@ -143,7 +143,7 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
     thresholds = np.array(params.mask_threshold, np.float32)[found.grid]
     masks = np.empty((len(thresholds), frame.height, frame.width), bool)
     for mask, logits, threshold in zip(masks, found.logits, thresholds, strict=True):
-        mask[:] = without_speckles(sam.upsample(embedding, logits[None])[0] > threshold, params.speckle) & valid
+        mask[:] = without_speckles(embedding.upsample(logits[None])[0] > threshold, params.speckle) & valid
     if params.merge == "union":
         large = np.flatnonzero(_large_enough(masks, params)).astype(np.int32)
         masks, origin = merge_union(masks[large], found.grid[large], params.duplicate_overlap, params.union_overlap)
@@ -172,7 +172,7 @@ def grid_points(side: int, width: int, height: int) -> Float64:
 
 
 def _ask(
-    sam: Sam, embedding: Embedding, points: Float64, level: int, valid: Bool, params: SegmentParams, model: Model
+    image: PromptedImage, points: Float64, level: int, valid: Bool, params: SegmentParams, model: Model
 ) -> tuple[_Candidates, Int32]:
     """The masks that the points of one grid find.
 
@@ -181,8 +181,8 @@ def _ask(
     """
     parts: list[_Candidates] = []
     held: Int32 = np.zeros(valid.shape, np.int32)
-    for start in range(0, max(1, len(points)), sam.BATCH):
-        logits, scores = sam.predict(embedding, points[start : start + sam.BATCH])
+    for start in range(0, max(1, len(points)), image.BATCH):
+        logits, scores = image.predict(points[start : start + image.BATCH])
         passed, prompt = _filter(logits, scores, level, valid, params, model)
         parts.append(passed)
         area = passed.masks.sum(axis=(1, 2))

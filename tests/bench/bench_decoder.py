@@ -22,7 +22,7 @@ from published_sam import published
 
 from ss_flow.tasks.artifacts import Float32, Float64
 from ss_flow.tasks.models.catalogue import find
-from ss_flow.tasks.models.sam import Sam
+from ss_flow.tasks.models.sam import PromptedImage, Sam
 from ss_flow.tasks.split.segment import grid_points
 
 
@@ -53,13 +53,17 @@ def main() -> None:
     def answer(points: Float64) -> Float32:
         return np.array([one(point[None], inside)[0] for point in points])
 
-    ours, expected = sam.predict(embedding, points)[0], answer(points)
+    image = sam.image(embedding)
+    ours, expected = image.predict(points)[0], answer(points)
     difference = np.abs(ours - expected[:, :, : ours.shape[2], : ours.shape[3]]).max()
     print(f"{embedding.width} x {embedding.height}, {len(points)} prompts; logits differ by at most {difference:.1e}")
     print(f"| published, one by one | {least_ms(answer, points):.1f} ms |")
+    few = sam.image(embedding, few=True)
+    print(f"| plain cells, one by one | {least_ms(lambda p: [few.predict(q[None]) for q in p], points):.1f} ms |")
+    print(f"| what all prompts share, an image | {least_ms(lambda p: sam.image(embedding), points[:1]):.1f} ms |")
     for batch in args.batches:
-        Sam.BATCH = batch
-        print(f"| in batches of {batch} | {least_ms(lambda p: sam.predict(embedding, p), points):.1f} ms |")
+        PromptedImage.BATCH = batch
+        print(f"| factored cells, in batches of {batch} | {least_ms(image.predict, points):.1f} ms |")
 
 
 if __name__ == "__main__":

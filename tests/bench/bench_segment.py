@@ -21,24 +21,24 @@ from ss_flow.tasks.artifacts import Float32, Frame, MaskSet
 from ss_flow.tasks.capture.ingest import IngestParams, frames
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.models import sam as network
 from ss_flow.tasks.models.catalogue import available, blake3_of, default_folders, find
-from ss_flow.tasks.models.sam import Sam
 from ss_flow.tasks.split import segment as step
 
 LARGE = 0.01
 """Share of the image from which a mask counts."""
 
 
-class CountingSam(Sam):
+class CountingImage(network.PromptedImage):
     """Counts prompts, and the CPU seconds that they take."""
 
     prompts, seconds = 0, 0.0
 
-    def predict(self, embedding, points, labels=None):
+    def predict(self, points, labels=None):
         begun = time.process_time()
-        answer = super().predict(embedding, points, labels)
-        CountingSam.seconds += time.process_time() - begun
-        CountingSam.prompts += len(points)
+        answer = super().predict(points, labels)
+        CountingImage.seconds += time.process_time() - begun
+        CountingImage.prompts += len(points)
         return answer
 
 
@@ -80,12 +80,12 @@ def main() -> None:
     model = find(names[0], folders) if names else None
     if model is None:
         parser.error("no segmenter is here; see `ss-flow models list`")
-    step.Sam = CountingSam
+    network.PromptedImage = CountingImage
     adaptive = step.SegmentParams()
     variants = {"adaptive": adaptive, "full": replace(adaptive, adaptive=False)}
     views = load(options.capture, options.views)
 
-    sam = Sam(model)
+    sam = network.Sam(model)
     encoding = 0.0
     spent: dict[str, list[tuple[int, float, float, int]]] = {name: [] for name in variants}
     there, back = [], []
@@ -95,11 +95,11 @@ def main() -> None:
         encoding += time.process_time() - begun
         pools = {}
         for name, params in variants.items():
-            CountingSam.prompts, CountingSam.seconds = 0, 0.0
+            CountingImage.prompts, CountingImage.seconds = 0, 0.0
             begun = time.process_time()
             pools[name] = step.segment(view, embedding, params=params, model=model)
-            rest = time.process_time() - begun - CountingSam.seconds
-            spent[name].append((CountingSam.prompts, CountingSam.seconds, rest, len(pools[name])))
+            rest = time.process_time() - begun - CountingImage.seconds
+            spent[name].append((CountingImage.prompts, CountingImage.seconds, rest, len(pools[name])))
         there.append(best_iou(pools["full"], pools["adaptive"]))
         back.append(best_iou(pools["adaptive"], pools["full"]))
         line = ", ".join(f"{name} {rows[-1][0]} prompts {rows[-1][3]} masks" for name, rows in spent.items())

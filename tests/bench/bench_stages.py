@@ -86,14 +86,14 @@ def outcome(folder: Path, params: Params, store: Store) -> Outcome:
 
 def asked(sam: Sam, frame: Frame, objects: list[Bool]) -> Iterator[float]:
     """IoU of each object with the segmenter's best answer to a box round it and points on it."""
-    embedding = sam.encode(decode_rgb(frame))
+    image = sam.image(sam.encode(decode_rgb(frame)), few=True)
     for mask in objects:
         y, x = np.nonzero(mask)
         places = np.stack([x, y], axis=1)[:: max(1, len(x) // 2000)] + 0.5
         chosen = places[greedy_farthest(places, POINTS, alpha=0.3, drop_hull=True)]
         box = np.array([[x.min(), y.min()], [x.max() + 1, y.max() + 1]])
         prompt = np.concatenate([box, chosen])
-        answer, _ = sam.predict_prompt(embedding, prompt, np.array([*CORNERS, *[1] * len(chosen)], np.int32))
+        answer, _ = image.predict_prompt(prompt, np.array([*CORNERS, *[1] * len(chosen)], np.int32))
         yield iou(answer, mask)
 
 

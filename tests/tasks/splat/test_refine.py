@@ -44,8 +44,12 @@ class Scripted:
     def __init__(self, model):
         pass
 
-    def predict_prompt(self, embedding, points):
-        return type(self).answer(embedding, points), type(self).score
+    def image(self, embedding, *, few):
+        self.view = embedding
+        return self
+
+    def predict_prompt(self, points):
+        return type(self).answer(self.view, points), type(self).score
 
 
 def refined(small: SmallScene, box: Gaussians, instance: InstanceMasks, monkeypatch=None, answer=None, **params):

@@ -112,7 +112,10 @@ def test_objects_that_lie_apart_tell_each_others_masks_where_they_end(monkeypatc
     class Scripted:
         def __init__(self, model: Model) -> None: ...
 
-        def predict_prompt(self, embedding, points, inside) -> tuple[np.ndarray, float]:
+        def image(self, embedding, *, few):
+            return self
+
+        def predict_prompt(self, points, inside) -> tuple[np.ndarray, float]:
             asked.append({tuple(place): int(i) for place, i in zip(points.tolist(), inside, strict=True)})
             answer = np.zeros((HEIGHT, WIDTH), bool)
             answer[:, slice(0, 50) if len(asked) % 2 else slice(40, 90)] = True

@@ -75,6 +75,9 @@ def test_an_answer_comes_without_speckles(monkeypatch):
     class Scripted:
         def __init__(self, model: Model) -> None: ...
 
+        def image(self, embedding, *, few):
+            return self
+
         def predict_prompt(self, *_: object) -> tuple[np.ndarray, float]:
             return answer, 0.9
 

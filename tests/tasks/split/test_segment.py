@@ -34,6 +34,7 @@ class ScriptedSam(sam_module.Sam):
     """Answers a point with the rectangles under it, smallest first: sharp logits, falling scores."""
 
     prompts: list
+    BATCH = 8
 
     def __init__(self, model, threads=1):
         pass
@@ -42,7 +43,10 @@ class ScriptedSam(sam_module.Sam):
         type(self).prompts = []
         return sam_module.Embedding(np.zeros((1, 256, 64, 64), np.float32), *rgb.shape[:2])
 
-    def predict(self, embedding, points, labels=None):
+    def image(self, embedding):
+        return self
+
+    def predict(self, points, labels=None):
         type(self).prompts.append(points)
         logits = np.full((len(points), 4, 256, 256), -9, np.float32)
         scores = np.zeros((len(points), 4), np.float32)
@@ -161,7 +165,7 @@ def test_filters_drop_what_falls_below_them(scripted, change, left):
 
 
 def test_unstable_masks_are_judged_by_the_models_own_threshold(scripted, monkeypatch):
-    def soft(self, embedding, points, labels=None):
+    def soft(self, points, labels=None):
         logits = np.full((len(points), 4, 256, 256), -9, np.float32)
         logits[:, 1, :100, :100] = 1.0  # below the upper cut at 0.5 + 0.85
         logits[:, 1, :90, :100] = 9.0  # stable share: 90 of 100 rows
