@@ -139,7 +139,8 @@ class PromptedImage:
     def predict_prompt(self, points: Float32 | Float64, labels: Int32 | None = None) -> tuple[Bool, float]:
         """The one mask that several points ask for together.
 
-        points: [n, 2] x, y in pixels of the image, n >= 1. labels: [n] 1 = inside (the default), 0 = outside.
+        points: [n, 2] x, y in pixels of the image, n >= 1. labels: [n] 1 = inside (the default), 0 = outside, 2 and 3 =
+        upper left and lower right corner of a box round it.
         Returns the mask [H, W] and its predicted IoU. A single point is ambiguous and gets the best of the
         alternatives; several points get the mask made for them.
         """

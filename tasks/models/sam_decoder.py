@@ -34,8 +34,9 @@ _FINE_EPSILON = 1e-6
 """Of the layer normalisation between the cuts, as the network was trained."""
 _FREQUENCIES = "prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"
 _INT64 = 7  # onnx.TensorProto.INT64, whose module is only loaded where a network is written
-_KINDS = ("not_a_point_embed", "point_embeddings.0", "point_embeddings.1")
-"""Of tokens: the one of no point, which the network was trained to find after points; points outside and inside."""
+_KINDS = ("not_a_point_embed", *(f"point_embeddings.{label}" for label in range(4)))
+"""Of tokens: the one of no point, which the network was trained to find after points; points outside and inside, the
+upper left and the lower right corner of a box."""
 
 
 class MaskDecoder:
@@ -62,8 +63,8 @@ class MaskDecoder:
     ) -> tuple[Float32, Float32]:
         """What M prompts on one image ask for.
 
-        points: [M, n, 2] x, y in 0..1 of the frame. labels: [M, n] 1 = inside, 0 = outside. rows, columns: how many
-        cells of the frame show the photo.
+        points: [M, n, 2] x, y in 0..1 of the frame. labels: [M, n] 1 = inside, 0 = outside, 2 and 3 = upper left and
+        lower right corner of a box. rows, columns: how many cells of the frame show the photo.
         Returns logits: [M, 4, 4 rows, 4 columns], predicted_iou: [M, 4].
         """
         shown = np.array([rows, columns], np.float32)

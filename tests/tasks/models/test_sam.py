@@ -107,7 +107,12 @@ def test_upsampled_logits_lie_where_the_image_lies(height, width):
 @pytest.mark.parametrize("few", [False, True])
 @pytest.mark.parametrize(
     ("points", "labels"),
-    [([[60.0, 70.0]], [1]), ([[150.0, 80.0]], [0]), ([[45.0, 60.0], [75.0, 80.0], [155.0, 85.0]], [1, 1, 0])],
+    [
+        ([[60.0, 70.0]], [1]),
+        ([[150.0, 80.0]], [0]),
+        ([[45.0, 60.0], [75.0, 80.0], [155.0, 85.0]], [1, 1, 0]),
+        ([[20.0, 30.0], [100.0, 110.0], [60.0, 70.0]], [2, 3, 1]),
+    ],
 )
 def test_decoder_answers_as_the_published_graph_does(encoded, points, labels, few):
     sam, embedding = encoded
