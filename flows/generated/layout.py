@@ -133,11 +133,14 @@ def _place(
             if (limit < 0).any() or mesh.height > surface.headroom:
                 continue
             c, s = np.cos(surface.angle), np.sin(surface.angle)
-            for u, v in rng.uniform(-limit, limit, (_TRIES, 2)):
-                x, y = surface.center[0] + c * u - s * v, surface.center[1] + s * u + c * v
-                if all(np.hypot(x - p, y - q) > radius + r + _GAP for p, q, r in taken[choice]):
-                    taken[choice].append((x, y, radius))
-                    return mesh.moved(x, y, surface.center[2])
+            u, v = rng.uniform(-limit, limit, (_TRIES, 2)).T
+            x, y = surface.center[0] + c * u - s * v, surface.center[1] + s * u + c * v
+            p, q, r = np.reshape(taken[choice], (-1, 3)).T
+            free = (np.hypot(x[:, None] - p, y[:, None] - q) > radius + r + _GAP).all(axis=1)
+            if free.any():
+                first = free.argmax()
+                taken[choice].append((x[first], y[first], radius))
+                return mesh.moved(x[first], y[first], surface.center[2])
         mesh = mesh.sized(0.9)
 
 
