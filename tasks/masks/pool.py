@@ -61,11 +61,14 @@ def large_pieces(mask: Bool, share: float) -> tuple[Bool, float]:
     """A mask [H, W] without its pieces below this share of the largest, and the area of which these fall short."""
     import cv2
 
-    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    where = _extent(mask)
+    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask[where].astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA].copy()
     area[0] = 0
     least = share * float(area.max())
-    return ((area > 0) & (area >= least))[piece], least
+    large = np.zeros_like(mask)
+    large[where] = ((area > 0) & (area >= least))[piece]
+    return large, least
 
 
 def without_speckles(mask: Bool, share: float) -> Bool:
@@ -75,13 +78,25 @@ def without_speckles(mask: Bool, share: float) -> Bool:
 
     if not share or not mask.any():
         return mask
-    large, least = large_pieces(mask, share)
-    _, gap, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    mended, least = large_pieces(mask, share)
+    # A gap that reaches the edge of the mask's extent goes on round the mask, to the image's border.
+    where = _extent(mask)
+    inner = mask[where]
+    _, gap, stats, _ = cv2.connectedComponentsWithStats((~inner).astype(np.uint8), connectivity=4)
     x, y, w, h, size = stats[:, :5].T
-    inside = (x > 0) & (y > 0) & (x + w < mask.shape[1]) & (y + h < mask.shape[0])
+    inside = (x > 0) & (y > 0) & (x + w < inner.shape[1]) & (y + h < inner.shape[0])
     hole = inside & (size < least)
     hole[0] = False  # the mask itself
-    return large | hole[gap]
+    mended[where] |= hole[gap]
+    return mended
+
+
+def _extent(mask: Bool) -> tuple[slice, slice]:
+    """The rows and columns over which a mask [H, W] reaches; one pixel of an empty one."""
+    import cv2
+
+    x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
+    return slice(y, y + max(h, 1)), slice(x, x + max(w, 1))
 
 
 def smoothed(mask: Bool, radius: int) -> Bool:
