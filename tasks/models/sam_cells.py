@@ -146,15 +146,16 @@ class FactoredCells:
 
     def mean(self, shares: str, weight: Float32, bias: Float32) -> str:
         op, by_head = self._graph.operator, weight.T.reshape(WIDTH, HEADS, -1)
-        if self._l:
-            shares = op("Div", op("Reshape", shares, _ROWS), self._l)
-            told = op("MatMul", shares, op("Transpose", self._s, perm=[0, 2, 1]))
-            answers = op("Transpose", self._v_times(by_head), perm=[0, 2, 1, 3])
-            told = op("MatMul", op("Reshape", told, self._and_rank(0, HEADS, -1)), answers)
-        known = op("Transpose", self._x_times(by_head), perm=[0, 2, 1])
-        seen = op("MatMul", op("Reshape", shares, _BY_HEAD), known)
         constant = (self._b @ weight.T + bias).reshape(HEADS, 1, -1)
-        return op("Add", op("Add", seen, told) if self._l else seen, constant)
+        known = op("Transpose", self._x_times(by_head), perm=[0, 2, 1])
+        if not self._l:
+            return op("Add", op("MatMul", shares, known), constant)
+        rows = op("Div", op("Reshape", shares, _ROWS), self._l)
+        met = op("MatMul", rows, op("Transpose", self._s, perm=[0, 2, 1]))
+        answers = op("Transpose", self._v_times(by_head), perm=[0, 2, 1, 3])
+        told = op("MatMul", op("Reshape", met, self._and_rank(0, HEADS, -1)), answers)
+        seen = op("MatMul", op("Reshape", rows, _BY_HEAD), known)
+        return op("Add", op("Add", seen, told), constant)
 
     def hear(self, shares: str, values: str, weight: Float32, bias: Float32) -> None:
         op = self._graph.operator
