@@ -56,9 +56,10 @@ class RefineParams:
     """IoU with the rendered mask from which a mask is added to a view that had none; 0.95 in the paper."""
     pred_iou: Fraction = 0.8
     """IoU that the segmenter predicts for its mask, below which the mask is not taken; 0 = any, as in the paper."""
-    margin: Fraction = 0.1
+    margin: Fraction = 1.0
     """How much better the segmenter's mask must agree with the rendered one to replace a mask that the view's photo
-    gave; one drawn from points is replaced by any that agrees better. 0 in the paper."""
+    gave; 1 = it stays, and the segmenter is not asked. One drawn from points is replaced by any that agrees better. 0
+    in the paper."""
     tie: Literal["old", "new"] = "old"
     """Which mask is taken where both agree equally well: the "old" one, or the segmenter's "new" one, as in the paper,
     which prefers the old one where its IoU is higher."""

@@ -187,10 +187,10 @@ TABLE = {
     "splat.merge.max_scale": (0.0, 0.0, 0.05),
     # 29
     "splat.refine.tau_iou": (0.95, 0.05, 0.5),
-    # 30: ours replaces a mask of the photo only by one that is much better.
+    # 30: ours keeps what the photo gave, and replaces what was drawn from points.
     "splat.refine.tie": ("new", "new", "old"),
     "splat.refine.pred_iou": (0.0, 0.0, 0.8),
-    "splat.refine.margin": (0.0, 0.0, 0.1),
+    "splat.refine.margin": (0.0, 0.0, 1.0),
     "splat.refine.speckle": (0.0, 0.0, 0.05),
     "splat.refine.max_change": (0.0, 0.0, 1.5),
     "splat.refine.dilation": (0, 1, 0),

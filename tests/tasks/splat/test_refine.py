@@ -106,10 +106,12 @@ def test_a_mask_stays_unless_the_segmenters_agrees_better(small, box, monkeypatc
     np.testing.assert_array_equal(same.packed, truth.packed)
     assert not same.origin.any()
 
-    worse = refined(small, box, truth, monkeypatch, lambda view, _: np.roll(small.ids[view] == 1, 6, axis=1))
+    shifted = lambda view, _: np.roll(small.ids[view] == 1, 6, axis=1)  # noqa: E731
+    worse = refined(small, box, truth, monkeypatch, shifted, margin=0.1)
     np.testing.assert_array_equal(worse.packed, truth.packed)
 
-    better = refined(small, box, moved(truth, 6), monkeypatch, lambda view, _: small.ids[view] == 1)
+    right = lambda view, _: small.ids[view] == 1  # noqa: E731
+    better = refined(small, box, moved(truth, 6), monkeypatch, right, margin=0.1)
     np.testing.assert_array_equal(better.packed, truth.packed)
     assert (better.origin == REFINED).all()
 
@@ -119,7 +121,7 @@ def test_a_mask_of_the_photo_gives_way_only_by_a_margin_and_one_drawn_from_point
 ):
     nearly = moved(small.instance(1), 1)
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
-    kept = refined(small, box, nearly, monkeypatch, right)
+    kept = refined(small, box, nearly, monkeypatch, right, margin=0.1)
     np.testing.assert_array_equal(kept.packed, nearly.packed)
     for instance, params in (
         (replace(nearly, origin=np.full(VIEWS, DRAWN, np.uint8)), {}),
@@ -144,8 +146,9 @@ def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small,
     masks = np.array(truth.dense())
     part = replace(truth, **as_fields(masks & (np.cumsum(masks, axis=2) <= masks.sum(axis=2, keepdims=True) // 2)))
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
-    np.testing.assert_array_equal(refined(small, box, part, monkeypatch, right).packed, part.packed)
-    np.testing.assert_array_equal(refined(small, box, part, monkeypatch, right, max_change=0.0).packed, truth.packed)
+    for limit, expected in ((1.5, part), (0.0, truth)):
+        found = refined(small, box, part, monkeypatch, right, margin=0.1, max_change=limit)
+        np.testing.assert_array_equal(found.packed, expected.packed)
     drawn = replace(part, origin=np.full(VIEWS, DRAWN, np.uint8))
     np.testing.assert_array_equal(refined(small, box, drawn, monkeypatch, right).packed, truth.packed)
 
@@ -166,7 +169,8 @@ def test_the_segmenter_is_not_asked_where_no_answer_could_be_taken(small, box, m
     assert views_asked(truth, margin=0.3) == 0  # none agrees better by so much
     assert views_asked(truth, margin=0.0) == VIEWS
     assert views_asked(replace(truth, origin=np.full(VIEWS, DRAWN, np.uint8))) == VIEWS
-    assert views_asked(moved(truth, 6)) == VIEWS
+    assert views_asked(moved(truth, 6), margin=0.1) == VIEWS
+    assert views_asked(moved(truth, 6)) == 0  # what the photo gave stays
     masks = np.array(truth.dense())
     sliver = replace(truth, **as_fields(masks & (np.cumsum(masks, axis=2) <= 2)))
     assert views_asked(sliver, margin=0.5) == 0  # what agrees so well has another size
@@ -227,7 +231,7 @@ def test_prompts_lie_on_visible_parts_of_the_instance(small, box, monkeypatch):
         asked[view] = points
         return np.zeros(small.ids[0].shape, bool)
 
-    refined(small, box, small.instance(1), monkeypatch, prompted)
+    refined(small, box, small.instance(1), monkeypatch, prompted, margin=0.1)
     assert sorted(asked) == list(range(VIEWS))
     for view, points in asked.items():
         column, row = points.astype(int).T
