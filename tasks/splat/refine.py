@@ -248,7 +248,8 @@ def _replacement(
     drawn: whether `old` was made of points. prompt: gives the segmenter's mask of the view, and its score, for points
     in the photo.
     """
-    if prompt is None and old is not None:
+    stays = prompt is None or (not drawn and params.margin >= 1)
+    if old is not None and stays:
         return None
     rows, column, row, _ = scene.surface_points(view, gaussians.means)
     if len(rows) < params.min_visible:
