@@ -30,9 +30,14 @@ LARGE = 0.01
 
 
 class CountingImage(network.PromptedImage):
-    """Counts prompts, and the CPU seconds that they take."""
+    """Counts prompts, and the CPU seconds that they and what they share take."""
 
     prompts, seconds = 0, 0.0
+
+    def __init__(self, *args):
+        begun = time.process_time()
+        super().__init__(*args)
+        CountingImage.seconds += time.process_time() - begun
 
     def predict(self, points, labels=None):
         begun = time.process_time()
