@@ -10,6 +10,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Frame, LabelMap, UInt8
 from ss_flow.tasks.deliver.compressed import Thumbnail, compressed
 from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.masks.packing import bounds
 
 _SIDE = 128
 _MARGIN = 0.15
@@ -49,10 +50,9 @@ def thumbnails(frames: Sequence[Frame], maps: Sequence[LabelMap]) -> tuple[Thumb
 def _cut_out(photo: UInt8, mask: np.ndarray) -> UInt8:
     import cv2
 
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    side = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
-    side = int(side * (1 + 2 * _MARGIN)) + 2
-    top, left = (rows[0] + rows[-1] + 1 - side) // 2, (columns[0] + columns[-1] + 1 - side) // 2
+    x0, y0, x1, y1 = bounds(mask)
+    side = int(max(x1 - x0, y1 - y0) * (1 + 2 * _MARGIN)) + 2
+    top, left = (y0 + y1 - side) // 2, (x0 + x1 - side) // 2
     down = np.clip(np.arange(top, top + side), 0, photo.shape[0] - 1)
     across = np.clip(np.arange(left, left + side), 0, photo.shape[1] - 1)
     inside = np.outer(down == np.arange(top, top + side), across == np.arange(left, left + side))

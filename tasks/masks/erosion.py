@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Int32, MaskSet, PromptedMasks
+from ss_flow.tasks.masks.packing import bounds
 from ss_flow.tasks.masks.pool import canonical_order, exclusive
 from ss_flow.tasks.ranges import Fraction, Natural, NonNegative
 
@@ -72,11 +73,8 @@ def erode(mask: Bool, params: ErosionParams) -> Bool:
     scale = float(np.hypot(height, width)) / params.diagonal if params.diagonal else 1.0
     large = area >= params.large_area * mask.size
     radius = round((params.radius_large if large else params.radius) * scale)
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    box = (
-        slice(max(rows[0] - radius, 0), rows[-1] + radius + 1),
-        slice(max(columns[0] - radius, 0), columns[-1] + radius + 1),
-    )
+    x0, y0, x1, y1 = bounds(mask)
+    box = slice(max(y0 - radius, 0), y1 + radius), slice(max(x0 - radius, 0), x1 + radius)
     crop = mask[box].astype(np.uint8)
     for r in range(radius, 0, -1):
         inner = cv2.erode(crop, np.ones((2 * r + 1, 2 * r + 1), np.uint8))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, MaskSet
 from ss_flow.tasks.masks.overlap import intersections, suppress
-from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.packing import bounds, pack_masks
 
 _CRUMB = 0.1
 """Pieces of a drawn mask below this share of its largest one are no part of it."""
@@ -61,13 +61,15 @@ def large_pieces(mask: Bool, share: float) -> tuple[Bool, float]:
     """A mask [H, W] without its pieces below this share of the largest, and the area of which these fall short."""
     import cv2
 
-    where = _extent(mask)
-    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask[where].astype(np.uint8), connectivity=8)
+    large = np.zeros_like(mask)
+    if not mask.any():
+        return large, 0.0
+    x0, y0, x1, y1 = bounds(mask)
+    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask[y0:y1, x0:x1].astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA].copy()
     area[0] = 0
     least = share * float(area.max())
-    large = np.zeros_like(mask)
-    large[where] = ((area > 0) & (area >= least))[piece]
+    large[y0:y1, x0:x1] = ((area > 0) & (area >= least))[piece]
     return large, least
 
 
@@ -78,25 +80,18 @@ def without_speckles(mask: Bool, share: float) -> Bool:
 
     if not share or not mask.any():
         return mask
-    mended, least = large_pieces(mask, share)
-    # A gap that reaches the edge of the mask's extent goes on round the mask, to the image's border.
-    where = _extent(mask)
-    inner = mask[where]
+    # A gap that reaches the edge of the mask's bounds goes on round the mask, to the image's border.
+    x0, y0, x1, y1 = bounds(mask)
+    inner = mask[y0:y1, x0:x1]
+    large, least = large_pieces(inner, share)
     _, gap, stats, _ = cv2.connectedComponentsWithStats((~inner).astype(np.uint8), connectivity=4)
     x, y, w, h, size = stats[:, :5].T
     inside = (x > 0) & (y > 0) & (x + w < inner.shape[1]) & (y + h < inner.shape[0])
     hole = inside & (size < least)
     hole[0] = False  # the mask itself
-    mended[where] |= hole[gap]
+    mended = np.zeros_like(mask)
+    mended[y0:y1, x0:x1] = large | hole[gap]
     return mended
-
-
-def _extent(mask: Bool) -> tuple[slice, slice]:
-    """The rows and columns over which a mask [H, W] reaches; one pixel of an empty one."""
-    import cv2
-
-    x, y, w, h = cv2.boundingRect(mask.astype(np.uint8))
-    return slice(y, y + max(h, 1)), slice(x, x + max(w, 1))
 
 
 def smoothed(mask: Bool, radius: int) -> Bool:
