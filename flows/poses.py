@@ -30,7 +30,7 @@ def poses(frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] |
         if len(left.row) and params.guided_matching == "missing":
             again = gather([rematched(found, looks, row, left.total, params) for row in left.row.tolist()])
             tries.append(sfm(found, matches, again, params=params.mapping))
-        return accepted(gather(tries), missing, min_registered=params.min_registered)
+        return accepted(gather(tries), missing, found, matches, min_registered=params.min_registered)
 
     return expand(missing, complete)
 

@@ -19,7 +19,7 @@ Allowed = Callable[[slice], Bool]
 
 _RATIO, _MAX_ANGLE = 0.8, 0.7
 """COLMAP's: the nearest descriptor must be so much nearer than the next, and no farther than this angle (radians)."""
-_MAX_ERROR = 4.0
+MAX_ERROR = 4.0
 """COLMAP's: how far from its epipolar line a point may lie, in pixels."""
 _TRIALS = 2000
 """The most that RANSAC samples: enough for pairs of which 45 % fit (Hartley and Zisserman, Sec. 4.7.1; 1 - 0.45^7 a
@@ -132,7 +132,7 @@ def near_epipolar_lines(a: Float64, b: Float64, fundamental: Float64) -> Allowed
     of_lines, of_back = (lines[:, :2] ** 2).sum(axis=1), (back[:, :2] ** 2).sum(axis=1)
 
     def allowed(block: slice) -> Bool:
-        off: Bool = (lines[block] @ points.T) ** 2 <= _MAX_ERROR**2 * (of_lines[block, None] + of_back)
+        off: Bool = (lines[block] @ points.T) ** 2 <= MAX_ERROR**2 * (of_lines[block, None] + of_back)
         return off
 
     return allowed

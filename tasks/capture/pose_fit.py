@@ -13,9 +13,9 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Int32
 from ss_flow.tasks.capture.features import Features
-from ss_flow.tasks.capture.matches import Matches
+from ss_flow.tasks.capture.matches import MAX_ERROR, Matches
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
 
@@ -149,6 +149,28 @@ def better_poses(
     return given
 
 
+def matches_that_fit(cameras: Cameras, photos: Sequence[Features], matches: Sequence[Matches]) -> tuple[int, int]:
+    """How many matches between photos with cameras lie near each other's epipolar lines, and how many there are.
+
+    photos: all that the matches name; their lenses may bend lines as `Cameras.radial` says.
+    """
+    rows = {name: row for row, name in enumerate(cameras.names)}
+    points = {}
+    for i in range(len(photos)):
+        if photos[i].name in rows:
+            points[photos[i].name] = _straight(cameras, rows[photos[i].name], photos[i].points)
+    fit, total = 0, 0
+    for own in matches:
+        for i, other in enumerate(own.others):
+            if own.name not in points or other not in points:
+                continue
+            pair = own.pair[own.first[i] : own.first[i + 1]]
+            fundamental = _fundamental(cameras, rows[own.name], rows[other])
+            off = sampson_distance(fundamental, points[own.name][pair[:, 0]], points[other][pair[:, 1]])
+            fit, total = fit + int((off < MAX_ERROR).sum()), total + len(pair)
+    return fit, total
+
+
 def sampson_distance(fundamental: Float64, first: np.ndarray, second: np.ndarray) -> Float64:
     """[N] how far, in pixels, matched points lie from their epipolar lines (Hartley and Zisserman, Eq. 11.9, its root).
 
@@ -171,6 +193,19 @@ def _fundamental(cameras: Cameras, first: int, second: int) -> Float64:
     x, y, z = relative[:3, 3]
     across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.asarray(lens(second).T @ across @ relative[:3, :3] @ lens(first))
+
+
+def _straight(cameras: Cameras, view: int, points: Float32) -> Float32:
+    """[N, 2] where the points of a photo lie in that of a pinhole."""
+    import cv2
+
+    if not cameras.radial.size or not len(points):
+        return points
+    fx, fy, cx, cy = cameras.intrinsics[view]
+    lens = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    bend, until = np.array([cameras.radial[view], 0, 0, 0]), (cv2.TERM_CRITERIA_COUNT, 50, 0)
+    straight: Float32 = cv2.undistortPoints(points[:, None], lens, bend, P=lens, criteria=until)[:, 0]
+    return straight
 
 
 def _depth_difference(cameras: Cameras, views: tuple[int, int], depths: tuple[DepthMap, DepthMap]) -> float:

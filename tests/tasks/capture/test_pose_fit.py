@@ -15,6 +15,7 @@ from ss_flow.tasks.capture.pose_fit import (
     PoseFit,
     PoseFitParams,
     better_poses,
+    matches_that_fit,
     pose_fit,
     pose_pairs,
     sampson_distance,
@@ -57,6 +58,39 @@ def test_without_depth_or_matches_nothing_is_told(scene):
     assert np.isnan(untold.distance) and not PoseFitParams().certain(untold)
     unknown = [replace(depth, depth=0 * depth.depth) for depth in depths]
     assert np.isnan(pose_fit(cameras, pairs, photos, matches, unknown).depth)
+
+
+def test_matches_fit_the_poses_that_they_come_from_bent_lines_and_all(scene):
+    cameras, _, photos, matches, _ = scene
+    total = sum(len(found.pair) for found in matches)
+    fit, of = matches_that_fit(cameras, photos, matches)
+    assert of == total > 100 and fit > 0.97 * total
+    assert matches_that_fit(jittered(cameras, 0.03, 1.0), photos, matches)[0] < 0.8 * fit
+    # What a lens with k1 = 1 would have shown: a point 0.4 from the axis lies 0.4 (1 + 0.16) from it.
+    bent = replace(cameras, radial=np.ones(len(cameras)))
+    pulled = [replace(photo, points=_bent(photo.points, cameras.intrinsics[0], 1.0)) for photo in photos]
+    assert matches_that_fit(bent, pulled, matches)[0] == pytest.approx(fit, abs=5)
+    assert matches_that_fit(cameras, pulled, matches)[0] < fit - 20
+    placed = cameras.names.index(photos[0].name)
+    others = [row for row in range(len(cameras)) if row != placed]
+    assert matches_that_fit(_of(cameras, others), photos, matches)[1] < total
+
+
+def _bent(points, intrinsics, k1):
+    away = (points - intrinsics[2:]) / intrinsics[:2]
+    away = away * (1 + k1 * (away**2).sum(axis=1, keepdims=True))
+    return (away * intrinsics[:2] + intrinsics[2:]).astype(np.float32)
+
+
+def _of(cameras, rows):
+    """The cameras of some rows."""
+    return replace(
+        cameras,
+        names=tuple(cameras.names[row] for row in rows),
+        sizes=cameras.sizes[rows],
+        intrinsics=cameras.intrinsics[rows],
+        world_to_camera=cameras.world_to_camera[rows],
+    )
 
 
 def looking_along_x(places):

@@ -3,12 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from found_poses import cameras_of, find_poses
-from generated_views import views
+from generated_views import jittered, views
 
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, Frame
-from ss_flow.tasks.capture.sfm import MappingParams, SfmParams, registered
+from ss_flow.tasks.capture.features import features
+from ss_flow.tasks.capture.matches import match
+from ss_flow.tasks.capture.sfm import MappingParams, SfmParams, Unregistered, accepted, registered
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
 
 EYES = [(x, y, 0.1 * x) for x in (-0.9, -0.3, 0.3, 0.9) for y in (-0.3, 0.3)]
@@ -103,6 +105,25 @@ def test_photos_that_do_not_overlap_are_refused_with_their_number(store):
     with pytest.raises(InputError, match="only 0 of 4 photos found their pose") as refusal:
         cameras_of(find_poses(frames, store), store)
     assert "\n" not in str(refusal.value)
+
+
+def test_of_tries_the_one_counts_that_matches_fit_however_many_another_places(scene, found):
+    frames, _, _ = scene
+    photos = [features(frame) for frame in frames]
+    matches = [match(photos[row], photos[:row]) for row in range(len(photos))]
+    missing = Unregistered(np.zeros(0, np.int32), len(frames))
+    wrong = jittered(found, 0.1, 5.0)
+    rows = list(range(len(found) - 2))
+    fewer = replace(
+        found,
+        names=found.names[:-2],
+        **{field: getattr(found, field)[rows] for field in ("sizes", "intrinsics", "world_to_camera", "radial")},
+    )
+    taken = accepted((wrong, fewer), missing, photos, matches, min_registered=0.5)
+    assert taken is fewer
+    assert accepted((fewer, found), missing, photos, matches, min_registered=0.5) is found
+    with pytest.warns(UserWarning, match="probably wrong: [2-9][0-9]% of the matches"):
+        assert accepted((wrong, fewer), missing, photos, matches, min_registered=0.9) is wrong
 
 
 def test_two_photos_are_too_few(scene, store):

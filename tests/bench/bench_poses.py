@@ -1,0 +1,109 @@
+"""How many photos find their right place from the photos alone, in captures whose poses are known.
+
+    python tests/bench/bench_poses.py CAPTURE [...] [--set capture.sfm.STEP.PARAM=VALUE ...] [--store DIR]
+
+A line for each capture: its photos; how many are placed; how many of these lie within 2 % of the extent of all places
+from where the capture has them, under the similarity that most agree on, and their median distance in per cent of it;
+the share of the matches that fit the poses that were found, and the capture's own; seconds of the steps. Masks of what
+is to be ignored are used, poses, lenses and depth are not. With --store, another run computes only what is new.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+from ss_flow.flows import settings
+from ss_flow.flows.capture import all_of
+from ss_flow.flows.cli.context import file_digests, references
+from ss_flow.flows.params import CaptureParams, Params
+from ss_flow.flows.poses import matched, poses
+from ss_flow.graph import each
+from ss_flow.tasks.artifacts import Bool, Cameras, Float64
+from ss_flow.tasks.capture.features import features
+from ss_flow.tasks.capture.ingest import cameras, frames
+from ss_flow.tasks.capture.pairs import look
+from ss_flow.tasks.capture.pose_fit import matches_that_fit
+from ss_flow.tasks.capture.scene import open_scene
+
+SAMPLES = 2000
+RIGHT = 0.02
+
+
+def centers(found: Cameras) -> Float64:
+    """[V, 3] where the cameras stand."""
+    return np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in found.world_to_camera])
+
+
+def moved(points: Float64, onto: Float64, by: Bool | np.ndarray) -> Float64:
+    """[N, 3] the points after the similarity that takes those of `by` nearest to theirs (Umeyama 1991)."""
+    mean, other = points[by].mean(axis=0), onto[by].mean(axis=0)
+    a, b = points[by] - mean, onto[by] - other
+    u, size, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (size * sign).sum() / max((a**2).sum(), 1e-12)
+    return scale * (points - mean) @ ((u * sign) @ vt).T + other
+
+
+def right_places(found: Float64, true: Float64) -> Float64:
+    """Distances of those that lie right, as a share of the extent of the true ones."""
+    extent, random = np.linalg.norm(np.ptp(true, axis=0)), np.random.default_rng(0)
+    best = np.zeros(len(found), bool)
+    for _ in range(SAMPLES):
+        near = np.linalg.norm(moved(found, true, random.choice(len(found), 3, replace=False)) - true, axis=1)
+        if (near < RIGHT * extent).sum() > best.sum():
+            best = near < RIGHT * extent
+    off = np.linalg.norm(moved(found, true, best) - true, axis=1) / extent
+    return off[off < RIGHT]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("--set", nargs="*", default=[])
+    parser.add_argument("--store", type=Path, help="a store to keep")
+    options = parser.parse_args()
+    asked = ["capture.sfm.min_registered=0", *options.set]
+    params = settings.apply(Params(), asked).capture
+    print("| capture | photos | placed | right | off | fit | fit given poses | seconds |\n" + "|---" * 8 + "|")
+    with tempfile.TemporaryDirectory() as temporary:
+        store = Store(options.store or Path(temporary))
+        for place in options.captures:
+            print(line(place, params, store), flush=True)
+
+
+def line(place: Path, params: CaptureParams, store: Store) -> str:
+    scene = open_scene(place)
+    reference = references(file_digests(store))
+
+    def build() -> dict[str, object]:
+        photos, valid = all_of(reference, scene.photos), all_of(reference, scene.valid)
+        own = frames(names=scene.names, photos=photos, valid=valid, params=params.ingest)
+        found = each(own, build=lambda frame: features(frame, params=params.sfm.features))
+        looks = each(found, build=lambda photo: look(photo, count=params.sfm.pairs.look_features))
+        given = cameras(own, names=scene.names, lenses=scene.lenses, poses=scene.poses, metric=True, sparse=None)
+        placed, matches = poses(own, params.sfm, None), matched(found, looks, params.sfm, None)
+        return {"placed": placed, "given": given, "features": found, "matches": matches}
+
+    report = run_flow(build, store, scene=place.name, header={})
+    placed, given = store.get(report.values["placed"]), store.get(report.values["given"])
+    photos, matches = ([store.get(key) for key in report.values[name]] for name in ("features", "matches"))
+    rows = [given.names.index(name) for name in placed.names]
+    off = right_places(centers(placed), centers(given)[rows])
+    shares = [fit / max(total, 1) for fit, total in (matches_that_fit(c, photos, matches) for c in (placed, given))]
+    seconds = defaultdict[str, float](float)
+    for node in report.nodes:
+        seconds[node["step"]] += node.get("seconds", 0.0)
+    steps = ", ".join(f"{step.removeprefix('capture.')} {taken:.0f}" for step, taken in seconds.items() if taken > 0.5)
+    counts = f"{len(photos)} | {len(placed)} | {len(off)} | {100 * np.median(off):.2f}"
+    return f"| {place.name} | {counts} | {shares[0]:.3f} | {shares[1]:.3f} | {steps} |"
+
+
+if __name__ == "__main__":
+    main()
