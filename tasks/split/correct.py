@@ -100,7 +100,7 @@ def part_masks(
         votes = np.bincount(old.label[inside], minlength=1)
         of_most = (old.label == votes.argmax()) & (old.label > 0)
         held, total = (
-            np.bincount(new.label[here], minlength=new.label.max() + 1) for here in (of_most & inside, of_most)
+            np.bincount(new.label[here], minlength=after.num_labels + 1) for here in (of_most & inside, of_most)
         )
         shown = np.flatnonzero((held > 0) & (held >= _SHOWN * total))
         if len(shown) < 2:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from box_scene import row_of_points
@@ -9,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Clicks, PointCloud, PointLabels, Visibility
-from ss_flow.tasks.split.correct import clicked_points, correct
+from ss_flow.tasks.masks.pool import mask_set
+from ss_flow.tasks.split.correct import clicked_points, correct, part_masks
 
 SIDE = 12
 GREY, RED = (120, 120, 120), (200, 40, 40)
@@ -133,3 +136,21 @@ def test_a_click_means_the_nearest_point_that_the_view_sees_within_reach():
     nothing = Clicks("1", np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.int32))
     rows, things = clicked_points((seen, seen), (on, nothing))
     assert rows.tolist() == [2, 5] and things.tolist() == [1, 1]
+
+
+WHOLE = mask_set("0", np.ones((1, SIDE, SIDE), bool), np.ones(1, np.float32), "sam")
+"""A mask over the whole sheet."""
+HALVES = labelled(np.where(left(), 10, 11), num_labels=11)
+"""The sheet divided, of which `ONE` is the instance."""
+
+
+def test_a_mask_over_both_halves_of_a_divided_sheet_becomes_two():
+    found = part_masks(view(), WHOLE, ONE, HALVES, contained=0.9)
+    lefts = left().reshape(SIDE, SIDE)
+    assert sorted(mask.tolist() for mask in found.dense()) == sorted([lefts.tolist(), (~lefts).tolist()])
+
+
+def test_a_view_that_sees_no_point_keeps_its_masks():
+    nothing = np.zeros(0, np.int32)
+    blind = replace(view(), point_index=nothing, pixel=nothing, depth=np.zeros(0, np.float32))
+    assert part_masks(blind, WHOLE, ONE, HALVES, contained=0.9) is WHOLE
