@@ -86,7 +86,8 @@ def propagate(
 
     visibility, observations: one of each per view, in the order of the views. The masks vote for the labels of the
     points under them; in the end a point keeps the label that got a share of tau_label of its votes. The order of the
-    masks of a view does not matter, nor does the scale of the world; nor, with views=at_once, the order of the views.
+    masks of a view does not matter, nor does the scale of the world; nor, with views=at_once, the order of the views,
+    up to `at_once.max_views` of them.
     """
     if params.views == "in_turn":
         votes, matched = vote_in_turn(len(points.points), visibility, observations, params.tau_label, params.in_turn)

@@ -2,8 +2,8 @@
 
 Every view that sees two masks says how far their points lie under one mask of its own. Masks are united as long as
 what speaks for it outweighs what speaks against it (Bansal, Blum, Chawla: "Correlation Clustering", 2004, with real
-weights). No order of views enters, a second copy of a view says nothing new, and a mask that holds two objects is
-outvoted by those that part them. Beyond Split&Splat, whose labels can only grow together.
+weights). Up to `max_views` views, no order of views enters, and a second copy of a view says nothing new. A mask that
+holds two objects is outvoted by those that part them. Beyond Split&Splat, whose labels can only grow together.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class MaskClusteringParams:
     min_share: Fraction = 0.02
     """Share of a mask's points below which it is not asked what another mask makes of them."""
     max_views: Count = 120
-    """Views whose masks are clustered together. More are dealt out into several lots; what each lot finds is clustered
-    again, as if each were one view."""
+    """Views whose masks are clustered together. More are dealt out in turn into several lots; what each lot finds is
+    clustered again, as if each were one view."""
     border_vote: Fraction = 0.5
     """Weight of a mask's vote for a point at its border, inside which it is 1."""
     background_vote: Fraction = 0.3
