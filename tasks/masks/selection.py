@@ -26,7 +26,8 @@ class SelectionParams:
     masks: Literal["best", "all"] = "best"
     """The masks that together agree best with a label's points, or, as in the paper, all that overlap it most."""
     min_iou: Fraction = 0.3
-    """IoU with a label's painted points below which no mask shows the label (only with "best")."""
+    """IoU with a label's painted points below which a mask does not show the label: one that was prompted or drawn for
+    it, or, with "best", one of the view's own."""
     unlabelled: Fraction = 0.5
     """How much a point without a label counts against a mask that holds it (only with "best")."""
     erosion: ErosionParams = field(default_factory=ErosionParams)

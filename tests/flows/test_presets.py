@@ -103,6 +103,7 @@ TABLE = {
     "split.reprompt.prompts": (10, 10, 10),
     "split.reprompt.min_agreement": (0.0, 0.0, 0.5),
     "split.reprompt.speckle": (0.0, 0.0, 0.05),
+    "split.reproject.selection.min_iou": (0.0, 0.0, 0.3),
     # 21
     "split.reproject.min_views": (2, 2, 2),
     "splat.refine.min_views": (2, 2, 2),
