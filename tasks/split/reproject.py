@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ss_flow.running import progress
+from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import (
     DRAWN,
@@ -78,7 +78,7 @@ def reproject(
     label's points do (`draw_missing`). The masks of one view do not overlap: smaller ones are on top. The first
     instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id. An
     instance's confidence is its points' mean share of votes, less the share of its painted pixels that other labels
-    contradict.
+    contradict. Warns where every instance is weak.
     """
     by_name = {extra.name: extra for extra in prompted}
     num_labels = int(labels.label.max(initial=0))
@@ -125,6 +125,11 @@ def reproject(
                 origin=np.array([views[k][label][1] for k in shown_in], np.uint8),
                 weak=label > 0 and len(shown_in) < params.min_views,
             )
+        )
+    if len(found) > 1 and all(instance.weak for instance in found[1:]):
+        warn(
+            f"No instance has masks in as many views as split.reproject.min_views ({params.min_views}), so none is "
+            "reconstructed: give more photos, or lower it."
         )
     return tuple(found)
 

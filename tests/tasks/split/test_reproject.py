@@ -163,6 +163,21 @@ def test_an_instance_seen_in_one_view_is_weak():
     assert (two.views, two.weak) == (("b",), True)
 
 
+def test_instances_that_are_all_weak_are_warned_of(recwarn):
+    run([columns(0, 5), columns(5, 8)], halves())
+    (told,) = recwarn.list
+    assert "as many views as split.reproject.min_views (2), so none is reconstructed" in str(told.message)
+
+
+def test_where_one_instance_is_not_weak_or_there_is_none_nothing_is_warned_of(recwarn):
+    run([columns(0, 5), columns(5, 8)], halves(), replace(FOUND_ONLY, min_views=1))
+    run([columns(0, 5)], np.zeros((H, W)))
+    cloud, labels = labelled(halves())
+    masks = (mask_set(columns(0, 5)[None], "a"), mask_set(np.stack([columns(0, 5), columns(5, 8)]), "b"))
+    reproject(cloud, (view("a"), view("b")), masks, labels, WHOLE, (), params=FOUND_ONLY)
+    assert not recwarn.list
+
+
 def test_confidence_is_the_mean_share_less_what_other_labels_contradict():
     cloud, labels = labelled(halves(), confidence=0.8)
     masks = (mask_set(columns(0, 6)[None], "a"),)
