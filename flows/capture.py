@@ -60,8 +60,10 @@ class Capture:
     """Where its user pointed at objects."""
     corrections: tuple[Clicks, ...] | None = None
     """Where its user pointed at what Split is to join or to part."""
+    things: tuple[str, ...] = ()
+    """What the user calls the things of the corrections."""
     objects: tuple[str, ...] = ()
-    """What the user calls these objects."""
+    """What the user calls the objects of the clicks."""
     registration: Registration | None = None
     """Of a sensor's depth."""
     colours: tuple[ColourTransform, ...] = ()
@@ -152,6 +154,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         names=names,
         clicks=pointed,
         corrections=corrected,
+        things=scene.corrections.objects if scene.corrections is not None else (),
         objects=objects,
         registration=placing,
         colours=evened,

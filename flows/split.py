@@ -148,7 +148,8 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         if segmenter is not None:
             clicked = _clicked(capture, capture.corrections, embeddings, segmenter, params, apart=True)
             by_clicks = [_labelled(points, seen, clicked, params)]
-        joined, labels = labels, correct(points, seen, capture.corrections, pieces, labels, by_clicks)
+        joined = labels
+        labels = correct(points, seen, capture.corrections, pieces, joined, by_clicks, names=capture.things)
         contained = params.segment.contained
         shown = each(
             seen,

@@ -38,22 +38,31 @@ def correct(
     pieces: PointLabels,
     labels: PointLabels,
     clicked: Sequence[PointLabels],
+    *,
+    names: tuple[str, ...],
 ) -> PointLabels:
     """The instances, corrected by points that were clicked on things. Beyond Split&Splat.
 
     visibility, clicks: one of each per view. pieces: the labels that the instances are made of. labels: the instances.
     clicked: the points under the masks that the segmenter gives for the clicks (`hints.label`); none without one.
+    names: what the user calls each thing.
 
     Clicks on one thing unite the instances that they lie on. An instance with clicks on several things is divided: each
     of its points goes to the thing that it hangs together with (`divided`). What changes gets new ids; all other
     instances keep theirs, so that what follows from them alone is not computed again. Warns of clicks that lie on no
-    instance.
+    instance, and of clicks on several things that mean one point.
     """
     row, thing = clicked_points(visibility, clicks)
     on_any = labels.label[row] > 0
     if lost := sum(int(of_view.inside.sum()) for of_view in clicks) - int(on_any.sum()):
         warn(f"{lost} clicks lie on no instance; they correct nothing.")
     row, thing = row[on_any], thing[on_any]
+    for point in np.unique(row):
+        claiming = [repr(names[k - 1]) for k in np.unique(thing[row == point]).tolist()]
+        if len(claiming) > 1:
+            warn(
+                f"Clicks on {' and '.join(claiming)} mean one point, which only one of them gets; click farther apart."
+            )
     instance = labels.label[row]
     changed, shown = labels.label.copy(), np.arange(labels.num_labels + 1, dtype=np.int32)
     for held in np.unique(instance).tolist():

@@ -15,6 +15,7 @@ from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.split.correct import clicked_points, correct, part_masks
 
 SIDE = 12
+NAMES = ("mug", "box", "cup", "jug")
 GREY, RED = (120, 120, 120), (200, 40, 40)
 
 
@@ -52,7 +53,7 @@ def clicks(*points: tuple[int, float, float]) -> Clicks:
 
 
 def corrected(cloud: PointCloud, labels: PointLabels, clicked: Clicks, *, pieces=None, masks=()) -> PointLabels:
-    return correct(cloud, (view(),), (clicked,), labels if pieces is None else pieces, labels, masks)
+    return correct(cloud, (view(),), (clicked,), labels if pieces is None else pieces, labels, masks, names=NAMES)
 
 
 ONE = labelled(np.ones(SIDE * SIDE))
@@ -123,6 +124,11 @@ def test_clicks_beside_all_instances_are_warned_of():
     with pytest.warns(UserWarning, match="1 clicks lie on no instance; they correct nothing"):
         found = corrected(sheet(GREY), labelled(label), clicks((1, 1.5, 1.5), (2, 10.5, 1.5)))
     assert found.label.tolist() == label.tolist()
+
+
+def test_clicks_on_two_things_that_mean_one_point_are_warned_of_with_both_names():
+    with pytest.warns(UserWarning, match="Clicks on 'box' and 'cup' mean one point, which only one of them gets"):
+        corrected(sheet(GREY), ONE, clicks((1, 1.5, 1.5), (1, 1.6, 1.5), (2, 6.5, 6.5), (3, 6.6, 6.5)))
 
 
 def test_a_click_means_the_nearest_point_that_the_view_sees_within_reach():
