@@ -38,15 +38,17 @@ def apply(params: T, assignments: Iterable[str]) -> T:
     """Set parameters from texts such as "split.tau_label=0.8".
 
     A name may leave out what is not needed to tell it apart: "propagate.tau_label" and "split.tau_label" are the same.
+    Lists that belong together may come in any order, and the last of several texts for one parameter counts.
     Raises InputError for a text without "=", an unknown or ambiguous name, and a value of the wrong type or range.
     """
+    values: dict[Path, Any] = {}
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals or not name:
             raise InputError(f"--set {assignment!r} is not of the form step.param=value.")
         path = find(params, name.strip())
-        params = _replaced(params, path, _parsed(text.strip(), type_of(params, path), ".".join(path)))
-    return params
+        values[path] = _parsed(text.strip(), type_of(params, path), ".".join(path))
+    return _replaced(params, values)
 
 
 def find(params: Any, name: str) -> Path:
@@ -83,14 +85,15 @@ def preset(params: T, name: str) -> T:
 
 def overlaid(params: T, table: Mapping[str, Any]) -> T:
     """Set parameters from nested tables."""
+    values: dict[Path, Any] = {}
     for name, value in table.items():
         if isinstance(value, Mapping):
             params = dataclasses.replace(params, **{name: overlaid(getattr(params, name), value)})  # type: ignore[type-var]
         else:
             path = find(params, name)
             _check(value, type_of(params, path), ".".join(path))
-            params = _replaced(params, path, tuple(value) if isinstance(value, list) else value)
-    return params
+            values[path] = tuple(value) if isinstance(value, list) else value
+    return _replaced(params, values)
 
 
 def recorded(params: T, values: Mapping[str, Any], step: str) -> T:
@@ -107,9 +110,13 @@ def _shortens(wanted: list[str], path: Path) -> bool:
     return wanted[-1] == path[-1] and all(any(part == p for p in rest) for part in wanted[:-1])
 
 
-def _replaced(params: Any, path: Path, value: Any) -> Any:
-    inner = value if len(path) == 1 else _replaced(getattr(params, path[0]), path[1:], value)
-    return dataclasses.replace(params, **{path[0]: inner})
+def _replaced(params: Any, values: Mapping[Path, Any]) -> Any:
+    """The same with other values, by path; each dataclass is made once, since it may check one value by another."""
+    own = {path[0]: value for path, value in values.items() if len(path) == 1}
+    for name in {path[0] for path in values} - own.keys():
+        inner = {path[1:]: value for path, value in values.items() if path[0] == name}
+        own[name] = _replaced(getattr(params, name), inner)
+    return dataclasses.replace(params, **own)
 
 
 def type_of(params: Any, path: Path) -> Any:
@@ -151,11 +158,13 @@ def _converted(text: str, kind: Any) -> Any:
 
 
 def _check(value: Any, kind: Any, name: str) -> None:
-    """Raises InputError when a value, or an item of it, is out of its declared range or choice."""
+    """Raises InputError for an empty list, and for a value, or an item of it, out of its declared range or choice."""
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
         if value is not None:
             _check(value, next(k for k in typing.get_args(kind) if k is not type(None)), name)
     elif typing.get_origin(kind) is tuple:
+        if not value:
+            raise InputError(f"parameter {name} is empty; it takes {_described(kind)}.")
         for item in value:
             _check(item, typing.get_args(kind)[0], name)
     elif typing.get_origin(kind) is typing.Annotated:

@@ -178,13 +178,13 @@ class Sweep:
             if full in lists:
                 raise InputError(f"parameter {full} is given twice; give all its values in one --set.")
             lists[full] = values_of(listed, separator=";" if _is_list(settings.type_of(params, path)) else ",")
-        params = settings.apply(params, [f"{name}={v[0]}" for name, v in lists.items() if len(v) == 1])
+        fixed = [f"{name}={values[0]}" for name, values in lists.items() if len(values) == 1]
         swept = {name: values for name, values in lists.items() if len(values) > 1}
         if not swept:
             raise InputError("there is nothing to sweep; give a parameter several values: --set tau_label=0.6,0.8.")
         found = []
         for values in zipped(swept) if self.zipped else grid(swept):
-            variant = settings.apply(params, [f"{name}={text}" for name, text in values.items()])
+            variant = settings.apply(params, [*fixed, *(f"{name}={text}" for name, text in values.items())])
             found.append((variant, {name: settings.flat(variant)[name] for name in values}))
         return found
 

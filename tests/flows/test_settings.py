@@ -63,6 +63,8 @@ def test_a_parameter_is_set_by_name(text, expected):
         ("inner.share=nan", "a number"),
         ("inner.grids=0", "at least 1"),
         ("inner.grids=1.5", "a whole number"),
+        ("inner.grids=", "is empty; it takes a whole number, or several"),
+        ("inner.grids=()", "is empty"),
         ("inner.rule=or", "'child' or 'union'"),
         ("inner.on=maybe", "true or false"),
         ("group.share=0.5", "ambiguous"),
@@ -73,6 +75,29 @@ def test_a_bad_assignment_is_refused_in_one_sentence(text, sentence):
     with pytest.raises(InputError, match=sentence) as caught:
         settings.apply(Top(), [text])
     assert "\n" not in str(caught.value)
+
+
+FINER = {
+    "grids": "1,4,8,16,32",
+    "stability_offset": "0.8,0.8,0.8,1,1",
+    "mask_threshold": "0.5,0.5,0.3,0.3,0.3",
+    "box_nms": "0.3,0.3,0.5,0.3,0.3",
+}
+"""Lists of one length, another than that of the defaults."""
+
+
+@pytest.mark.parametrize("names", [list(FINER), list(reversed(FINER))])
+def test_lists_that_belong_together_are_set_in_any_order(names):
+    params = settings.apply(Params(), [f"split.segment.{name}={FINER[name]}" for name in names])
+    assert {len(getattr(params.split.segment, name)) for name in FINER} == {5}
+    table = {name: list(getattr(params.split.segment, name)) for name in names}
+    assert settings.overlaid(Params(), {"split": {"segment": table}}) == params
+    with pytest.raises(InputError, match=r"stability_offset has 4 values but segment\.grids has 5"):
+        settings.apply(Params(), [f"split.segment.grids={FINER['grids']}"])
+
+
+def test_the_last_of_two_values_counts():
+    assert settings.apply(Top(), ["group.inner.share=0.5", "inner.share=0.6"]).group.inner.share == 0.6
 
 
 @pytest.mark.parametrize("name", ["default", "paper", "paper_lerf", "reference", "fast", "thorough"])

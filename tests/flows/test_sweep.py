@@ -74,6 +74,13 @@ def test_two_parameters_make_a_grid_or_go_together(tiny):
     assert [tuple(row["params"].values()) for row in zipped] == [pairs[0], pairs[3]]
 
 
+def test_lists_of_one_length_may_be_swept_beside_lists_that_stay(tiny):
+    fixed = ["grids=1,2,3,4,5", "stability_offset=1,1,1,1,1", "mask_threshold=0,0,0,0,0"]
+    given = [word for text in [*fixed, "box_nms=1,1,1,1,1;0,0,0,0,0"] for word in ("--set", f"segment.{text}")]
+    rows = sweep_tiny(tiny, "--dry-run", *given).document()
+    assert [row["params"] for row in rows] == [{"split.segment.box_nms": [value] * 5} for value in (1.0, 0.0)]
+
+
 def test_a_dry_run_says_what_is_there_and_why_the_rest_is_not_and_writes_nothing(warm, tmp_path):
     runs = sorted((warm.store / "roots/runs").iterdir())
     actions = len(list(Store(warm.store).actions()))
