@@ -19,6 +19,8 @@ from ss_flow.tasks.semantics.sides import sides
 
 _TEMPERATURE = 10.0
 _HALF = 0.5
+_NOT = re.compile(r"(?<![\w-])(?:but\s+)?not(?![\w-])", re.IGNORECASE)
+"""The word by itself; in "forget-me-not" it is none."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def terms(text: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """
     wanted, unwanted = [], []
     for term in text.split(","):
-        first, *others = (part.strip() for part in re.split(r"\b(?:but\s+)?not\b", term, flags=re.IGNORECASE))
+        first, *others = (part.strip() for part in _NOT.split(term))
         wanted += [first] if first else []
         if not all(others):
             raise InputError(f'In the query {text!r} nothing follows "not"; ask for something like "red, not the mug".')

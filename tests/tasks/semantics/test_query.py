@@ -199,6 +199,7 @@ def test_descriptors_of_another_encoder_are_refused():
         ("Not the wall", (), ("the wall",)),
         ("a mug but not red, wooden", ("a mug", "wooden"), ("red",)),
         ("knot, a notebook", ("knot", "a notebook"), ()),
+        ("forget-me-not vase, but not-red", ("forget-me-not vase", "but not-red"), ()),
         ("cup not red not blue", ("cup",), ("red", "blue")),
     ],
 )
