@@ -64,22 +64,23 @@ class ClipTokenizer:
 
         Raises InputError when the files are not those of a byte-pair tokenizer.
         """
-        vocabulary: Mapping[str, int] | None = None
-        merges: list[tuple[str, str]] | None = None
+        vocabulary = lines = None
         for file in files:
-            text = file.read_text(encoding="utf-8")
-            if not text.lstrip().startswith("{"):
-                merges = _merges_of(text.splitlines())
-                continue
             try:
-                document = json.loads(text)
-            except json.JSONDecodeError as error:
-                raise InputError(f"{file.name} is not valid JSON ({error}); fetch the model's files again.") from error
-            if "model" in document:
-                vocabulary, merges = document["model"].get("vocab"), _merges_of(document["model"].get("merges", []))
+                text = file.read_text(encoding="utf-8")
+                document = json.loads(text) if text.lstrip().startswith("{") else None
+            except ValueError as error:
+                raise InputError(
+                    f"{file.name} is not valid JSON or UTF-8 ({error}); fetch the model's files again."
+                ) from error
+            if document is None:
+                lines = text.splitlines()
+            elif isinstance(model := document.get("model"), dict):  # "model" may also be a token of vocab.json
+                vocabulary, lines = model.get("vocab"), model.get("merges")
             else:
                 vocabulary = document
-        if not vocabulary or not merges:
+        merges = _merges_of(lines) if isinstance(lines, list) else []
+        if not isinstance(vocabulary, dict) or not merges:
             names = ", ".join(file.name for file in files) or "no file"
             raise InputError(f"{names}: a tokenizer needs tokenizer.json, or vocab.json together with merges.txt.")
         return cls(vocabulary, merges)

@@ -144,10 +144,28 @@ def test_a_vocabulary_without_its_merges_is_refused(tmp_path: Path):
         ClipTokenizer.from_files(tmp_path / "vocab.json")
 
 
-def test_a_damaged_file_is_refused_by_name(tmp_path: Path):
-    (tmp_path / "tokenizer.json").write_text('{"model": {')
-    with pytest.raises(InputError, match=r"tokenizer\.json is not valid JSON"):
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b'{"model": {', r"tokenizer\.json is not valid JSON"),
+        (b"\xff\xfe\x00", r"tokenizer\.json is not valid JSON or UTF-8"),
+        (b'{"model": null}', r"tokenizer\.json: a tokenizer needs"),
+        (b'{"model": {"vocab": [["a", 0.5]], "merges": ["a b"]}}', r"tokenizer\.json: a tokenizer needs"),
+        (b'{"model": {"vocab": {"a": 0}, "merges": null}}', r"tokenizer\.json: a tokenizer needs"),
+        (b"", r"tokenizer\.json: a tokenizer needs"),
+    ],
+)
+def test_a_damaged_file_is_refused_by_name(content: bytes, says: str, tmp_path: Path):
+    (tmp_path / "tokenizer.json").write_bytes(content)
+    with pytest.raises(InputError, match=says):
         ClipTokenizer.from_files(tmp_path / "tokenizer.json")
+
+
+def test_a_vocabulary_may_have_the_token_model(tmp_path: Path):
+    (tmp_path / "vocab.json").write_text(json.dumps(VOCABULARY | {"model": 900}))
+    (tmp_path / "merges.txt").write_text("\n".join(" ".join(pair) for pair in MERGES), encoding="utf-8")
+    read = ClipTokenizer.from_files(tmp_path / "vocab.json", tmp_path / "merges.txt")
+    assert read.tokens("the cat") == TOKENIZER.tokens("the cat")
 
 
 def test_a_vocabulary_of_another_model_is_refused():
