@@ -12,7 +12,7 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
-from ss_flow.tasks.geometry.images import decode_valid
+from ss_flow.tasks.geometry.images import decode_valid, pixels_under
 
 
 @task(name="capture.sensor_depth")
@@ -107,6 +107,4 @@ def _check_not_all_empty(maps: Sequence[DepthMap], where: str) -> None:
 
 def resampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """[height, width] an image at another size, nearest neighbour (ids and depths must not be blended)."""
-    rows = ((np.arange(height) + 0.5) * image.shape[0] / height).astype(np.intp)
-    columns = ((np.arange(width) + 0.5) * image.shape[1] / width).astype(np.intp)
-    return image[np.ix_(rows, columns)]
+    return image[np.ix_(pixels_under(height, image.shape[0]), pixels_under(width, image.shape[1]))]

@@ -13,7 +13,7 @@ from ss_flow.tasks.artifacts import Bool, ColourTransform, DepthMap, Float32, Fl
 from ss_flow.tasks.geometry.cameras import Camera, pixels_in_view
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
-from ss_flow.tasks.geometry.images import decode_valid, shared_rgb, transformed
+from ss_flow.tasks.geometry.images import decode_valid, pixels_under, shared_rgb, transformed
 from ss_flow.tasks.geometry.visibility import VisibilityParams, surface_points
 from ss_flow.tasks.ranges import Count, Natural
 
@@ -286,6 +286,5 @@ def _box(full: Camera, crop: Camera) -> tuple[int, int, int, int]:
 def _pixels_of_crop(full: Camera, crop: Camera) -> tuple[Int32, Int32]:
     """The pixel columns and rows of the full image under the pixel centres of a crop."""
     x0, y0, width, height = _box(full, crop)
-    column = x0 + ((np.arange(crop.width) + 0.5) * width / crop.width).astype(np.int32)
-    row = y0 + ((np.arange(crop.height) + 0.5) * height / crop.height).astype(np.int32)
-    return column, row
+    column, row = x0 + pixels_under(crop.width, width), y0 + pixels_under(crop.height, height)
+    return column.astype(np.int32), row.astype(np.int32)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
+from ss_flow.tasks.geometry.images import pixels_under
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
 _MEDIAN_OF_NORMAL = 0.6745
@@ -70,9 +71,7 @@ def depth_at(
     h, w = depth.depth.shape
     if (h, w) == (height, width):
         return depth.depth[row, column]
-    y = ((row + 0.5) * (h / height)).astype(np.intp)
-    x = ((column + 0.5) * (w / width)).astype(np.intp)
-    return depth.depth[y, x]
+    return depth.depth[pixels_under(height, h)[row], pixels_under(width, w)[column]]
 
 
 def consistent_points(

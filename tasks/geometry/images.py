@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, ColourTransform, DepthMap, Float32, Frame, UInt8
 
@@ -84,9 +85,12 @@ def encode_png(image: np.ndarray) -> UInt8:
 def depth_at_frame_size(depth: DepthMap, frame: Frame) -> Float32:
     """The depth map at its frame's resolution, nearest neighbour (depth must not be blended across edges): [H, W]."""
     h, w = depth.depth.shape
-    rows = (np.arange(frame.height) + 0.5) * h / frame.height
-    columns = (np.arange(frame.width) + 0.5) * w / frame.width
-    return depth.depth[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
+    return depth.depth[np.ix_(pixels_under(frame.height, h), pixels_under(frame.width, w))]
+
+
+def pixels_under(count: int, size: int) -> NDArray[np.intp]:
+    """[count] of `size` pixels in a row, those under the centres of `count` others that span the same length."""
+    return ((np.arange(count) + 0.5) * size / count).astype(np.intp)
 
 
 def at_diagonal(pixels: float, height: int, width: int) -> float:

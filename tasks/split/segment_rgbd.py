@@ -11,7 +11,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Int32, MaskSet
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.holes import close_holes
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size, pixels_under
 from ss_flow.tasks.masks.overlap import drop_duplicates
 from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree
@@ -79,9 +79,7 @@ def segment_rgbd(frame: Frame, depth: DepthMap, cameras: Cameras, *, params: Seg
     import cv2
 
     small = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
-    rows = ((np.arange(height) + 0.5) * frame.height / height).astype(np.intp)
-    columns = ((np.arange(width) + 0.5) * frame.width / width).astype(np.intp)
-    pick = np.ix_(rows, columns)
+    pick = np.ix_(pixels_under(height, frame.height), pixels_under(width, frame.width))
     valid_small = valid[pick]
     # Thin holes would cut every surface into pieces. They are closed for the masks alone: steps that compare depths
     # must see measured depth only, not guesses.

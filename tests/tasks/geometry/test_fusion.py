@@ -39,6 +39,12 @@ def test_depth_of_a_smaller_map_is_read_at_the_pixel_centre():
     assert depth_at(depth, column, row, 4, 4).tolist() == [1, 1, 2, 4, 3]
 
 
+def test_a_pixel_centre_between_two_pixels_of_the_map_is_in_the_second():
+    depth = DepthMap("0", np.arange(30, dtype=np.float32)[None], "sensor")
+    row, column = np.zeros(11, int), np.arange(11)
+    assert depth_at(depth, column, row, 11, 1)[5] == 15  # 5.5 * 30 / 11 = 15
+
+
 def four_equal_views(distances):
     """Cameras at the same place that measure a wall at different distances."""
     k = len(distances)

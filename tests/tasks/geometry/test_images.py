@@ -1,4 +1,4 @@
-"""Photos that are decoded once for many."""
+"""Photos that are decoded once for many, and pixels under pixels of another size."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Frame
 from ss_flow.tasks.geometry import images
-from ss_flow.tasks.geometry.images import decode_rgb, encode_png, shared_rgb
+from ss_flow.tasks.geometry.images import decode_rgb, encode_png, pixels_under, shared_rgb
 
 
 def frame(seed: int) -> Frame:
@@ -61,3 +63,8 @@ def test_photos_that_come_and_go_are_never_taken_for_each_other(decoded):
 
     with ThreadPoolExecutor(4) as pool:
         assert all(pool.map(right, range(400)))
+
+
+@given(st.integers(1, 5000), st.integers(1, 5000))
+def test_the_pixel_under_a_centre_is_the_one_that_whole_numbers_give(count, size):
+    assert pixels_under(count, size).tolist() == [(2 * k + 1) * size // (2 * count) for k in range(count)]
