@@ -28,6 +28,20 @@ def plane_through(points: Float64) -> tuple[Float64, Float64]:
     return centre, np.linalg.svd(points - centre, full_matrices=False)[2][2]
 
 
+def plane_of_most(points: Float64, thickness: float, rounds: int) -> tuple[Float64, Float64]:
+    """The plane that most points [N, 3] lie on, which the others do not draw away: a point of it, and its unit normal.
+
+    thickness: how far from the plane a point still lies on it. rounds: fits, each to the points on the plane of the
+    last one, or to the nearer half of all points where that is more.
+    """
+    near = np.ones(len(points), bool)
+    for _ in range(rounds):
+        centre, normal = plane_through(points[near])
+        distance = np.abs((points - centre) @ normal)
+        near = distance <= max(thickness, float(np.median(distance)))
+    return centre, normal
+
+
 def middle_of(cameras: Cameras) -> Float64:
     """[3] the mean place of the cameras."""
     return np.mean([camera_of(cameras, view).center for view in range(len(cameras))], axis=0)

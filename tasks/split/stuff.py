@@ -8,7 +8,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
+from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_of_most, plane_through, thinned, towards
 from ss_flow.tasks.ranges import Count, Fraction
 
 _ROUNDS = 4
@@ -64,7 +64,7 @@ def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params
 def _planes(places: Float64, thickness: float, params: StuffParams) -> list[tuple[Float64, Float64]]:
     """The planes that enough of some points [N, 3] lie on: one, or else one after the other, each with as many as it
     can of those that are left; none if there would have to be too many."""
-    one = _plane(places, thickness)
+    one = plane_of_most(places, thickness, _ROUNDS)
     if _near(places, one, thickness).mean() >= params.flat:
         return [one]
     planes: list[tuple[Float64, Float64]] = []
@@ -95,13 +95,3 @@ def _near(places: Float64, plane: tuple[Float64, Float64], thickness: float) -> 
     """[N] which points lie on a plane."""
     centre, normal = plane
     return np.asarray(np.abs((places - centre) @ normal) <= thickness)
-
-
-def _plane(places: Float64, thickness: float) -> tuple[Float64, Float64]:
-    """The plane that most of some points [N, 3] lie on: a point on it, and its unit normal."""
-    near = np.ones(len(places), bool)
-    for _ in range(_ROUNDS):
-        centre, normal = plane_through(places[near])
-        distance = np.abs((places - centre) @ normal)
-        near = distance <= max(thickness, float(np.median(distance)))
-    return centre, normal

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Cameras, Float64, Int32, PointCloud
-from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned
+from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_of_most, thinned
 from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.split.shadows import OTHER, Touches, bright, find_shadows, find_touches, logarithms
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
@@ -132,9 +132,5 @@ def _in_one_plane(cloud: PointCloud, a: NDArray[np.intp], b: NDArray[np.intp], p
     """Whether most of two sets of points (rows) lies on the plane of the larger one."""
     larger, smaller = (thinned(cloud.points[part], _MOST) for part in sorted((a, b), key=len, reverse=True))
     thickness = max(params.thickness * box_diagonal(smaller, _TRIM), cloud.spacing)
-    near = np.ones(len(larger), bool)
-    for _ in range(_ROUNDS):
-        centre, normal = plane_through(larger[near])
-        distance = np.abs((larger - centre) @ normal)
-        near = distance <= max(thickness, float(np.median(distance)))
+    centre, normal = plane_of_most(larger, thickness, _ROUNDS)
     return all((np.abs((part - centre) @ normal) <= thickness).mean() >= params.flat for part in (larger, smaller))
