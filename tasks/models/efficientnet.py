@@ -26,9 +26,9 @@ _BATCH = 8
 class EfficientNetLite2:
     """The network, given by the file of its weights: a PyTorch state dictionary."""
 
-    def __init__(self, weights: FileRef, threads: int = 1) -> None:
+    def __init__(self, weights: FileRef) -> None:
         """Raises InputError when the file holds no weights, or those of another network."""
-        self._session = open_written(weights, lambda: _network(read_state(weights)), threads=threads)
+        self._session = open_written(weights, lambda: _network(read_state(weights)))
 
     def probabilities(self, images: Sequence[UInt8]) -> Float32:
         """Of every class for each picture: [n, 1000], rows of sum 1.

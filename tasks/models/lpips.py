@@ -31,10 +31,10 @@ _EPSILON = 1e-10
 class Lpips:
     """The network and the weights of its channels."""
 
-    def __init__(self, model: Model, threads: int = 1) -> None:
+    def __init__(self, model: Model) -> None:
         """Raises InputError when a file is damaged, or of another network."""
         features, linear = model.file("features"), model.file("linear")
-        self._session = open_written(features, lambda: _network(read_state(features)), threads=threads)
+        self._session = open_written(features, lambda: _network(read_state(features)))
         weights = read_state(linear)
         with all_weights_of(linear):
             self._weights = [weights[f"lin{block}.model.1.weight"].ravel() for block in range(len(_BLOCKS))]

