@@ -288,8 +288,6 @@ class PointLabels:
     """[A] index of the mask in its view's MaskSet."""
     match_label: Int32
     """[A] id that the mask votes for."""
-    match_purity: Float32
-    """[A] share of what the mask holds, of all that is labelled, that carries that id."""
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,6 @@ def correct(
         match_view=labels.match_view[kept],
         match_mask=labels.match_mask[kept],
         match_label=matched[kept],
-        match_purity=labels.match_purity[kept],
     )
 
 

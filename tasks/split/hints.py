@@ -90,7 +90,6 @@ def label(
         match_view=nothing,
         match_mask=nothing,
         match_label=nothing,
-        match_purity=np.zeros(0, np.float32),
     )
 
 

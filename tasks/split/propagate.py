@@ -128,7 +128,6 @@ def propagate(
         match_view=np.array(matched.view, np.int32),
         match_mask=np.array(matched.mask, np.int32),
         match_label=match_label,
-        match_purity=np.array(matched.purity, np.float32),
     )
 
 
@@ -138,14 +137,12 @@ def _at_once(
     """Votes for labels, votes against any [N], and the label of each mask, from the masks of all views at once."""
     labels = cluster_masks(observations, num_points, params.at_once)
     votes, against = vote_at_once(num_points, observations, labels, params.at_once)
-    leader, _ = votes.leaders()
-    matched = Matches([], [], [], [])
+    matched = Matches([], [], [])
     for k, (seen, shown) in enumerate(zip(observations, labels, strict=True)):
         for j in np.flatnonzero(shown).tolist():
             matched.view.append(k)
             matched.mask.append(int(seen.mask[j]))
             matched.label.append(int(shown[j]))
-            matched.purity.append(float((leader[seen.inside(j)] == shown[j]).mean()))
     return votes, against, matched
 
 

@@ -58,4 +58,4 @@ def test_cache_show_tells_statistics_size_and_history(tiny):
 def test_html_escapes_what_comes_from_outside():
     labels = Metrics({"<script>": 1.0})
     assert "<script>" not in as_html(labels)
-    assert "<table>" in as_html(PointLabels(*(np.zeros(3, np.int32),) * 2, 1, *(np.zeros(0, np.int32),) * 4))
+    assert "<table>" in as_html(PointLabels(*(np.zeros(3, np.int32),) * 2, 1, *(np.zeros(0, np.int32),) * 3))

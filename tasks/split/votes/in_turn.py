@@ -55,7 +55,6 @@ class Matches:
     view: list[int]
     mask: list[int]
     label: list[int]
-    purity: list[float]
 
 
 def vote_in_turn(
@@ -75,7 +74,7 @@ def vote_in_turn(
     num_labels = 0
     for turn in range(params.passes):
         votes = Votes(num_points)
-        matched = Matches([], [], [], [])
+        matched = Matches([], [], [])
         for k, (view, seen) in enumerate(zip(visibility, observations, strict=True)):
             progress(turn * len(visibility) + k, params.passes * len(visibility), view.name)
             virtual = _virtual_labels(view, given, votes, tau_label)
@@ -92,7 +91,6 @@ def vote_in_turn(
                 matched.view.append(k)
                 matched.mask.append(int(seen.mask[match.mask]))
                 matched.label.append(chosen)
-                matched.purity.append(match.purity)
         leader, share = votes.leaders()
         given = np.where(share >= tau_label, leader, 0).astype(np.int32)
     return votes, matched

@@ -42,7 +42,7 @@ NO_GAUSSIANS = Gaussians(
 
 
 def labels_of(label: np.ndarray) -> PointLabels:
-    return PointLabels(label.astype(np.int32), np.ones(len(label), np.float32), 5, NONE_I, NONE_I, NONE_I, NONE_F)
+    return PointLabels(label.astype(np.int32), np.ones(len(label), np.float32), 5, NONE_I, NONE_I, NONE_I)
 
 
 def instance_of(masks: np.ndarray, views: list[int]) -> InstanceMasks:

@@ -117,12 +117,12 @@ def test_writing_takes_little_memory_beside_the_scene(tmp_path: Path):
 
 def cloud_of(n: int) -> tuple[PointCloud, PointLabels, PointParts]:
     rng = np.random.default_rng(1)
-    nothing, none = np.zeros(0, np.int32), np.zeros(0, np.float32)
+    nothing = np.zeros(0, np.int32)
     points, colors = rng.normal(size=(n, 3)).astype(np.float32), rng.integers(0, 256, (n, 3), np.uint8)
     labels = rng.integers(0, 300, n).astype(np.int32)
     return (
         PointCloud(points, colors, 1.0, 0.02),
-        PointLabels(labels, rng.random(n).astype(np.float32), 300, nothing, nothing, nothing, none),
+        PointLabels(labels, rng.random(n).astype(np.float32), 300, nothing, nothing, nothing),
         PointParts(rng.integers(0, 5, n).astype(np.int32)),
     )
 

@@ -174,7 +174,7 @@ def test_objects_are_pictured_by_how_much_they_matter_and_the_doubtful_ones_name
 
 def labels(confidence: list[float], label: list[int]) -> PointLabels:
     nothing = np.zeros(0, np.int32)
-    return PointLabels(np.int32(label), np.float32(confidence), 3, nothing, nothing, nothing, np.zeros(0, np.float32))
+    return PointLabels(np.int32(label), np.float32(confidence), 3, nothing, nothing, nothing)
 
 
 def test_agreement_is_told_by_tenths_of_the_points_that_have_votes():

@@ -32,7 +32,7 @@ def seen():
     points, labels = points[near][first], labels[near][first]
     colors = box_scene.COLORS[labels]
     none, ones = np.zeros(0, np.int32), np.ones(len(points), np.float32)
-    known = PointLabels(labels, ones, 3, none, none, none, ones[:0])
+    known = PointLabels(labels, ones, 3, none, none, none)
     measured = Measured(cameras, box_scene.depths(), PointCloud(points, colors, 1.0, SPACING), known)
     return measured, operations.begin(initialise(points, colors, labels, 1.0, opacity=0.9))
 

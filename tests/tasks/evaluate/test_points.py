@@ -39,7 +39,7 @@ def _cloud(points: np.ndarray) -> PointCloud:
 def _labels(label: list[int]) -> PointLabels:
     none = np.zeros(0, np.int32)
     array = np.array(label, np.int32)
-    return PointLabels(array, np.ones(len(label), np.float32), 9, none, none, none, np.zeros(0, np.float32))
+    return PointLabels(array, np.ones(len(label), np.float32), 9, none, none, none)
 
 
 def test_ig_protocol_gives_the_golden_values_e3() -> None:

@@ -57,4 +57,4 @@ def test_an_object_whose_instance_was_left_out_names_nothing():
 
 def labelled(label: np.ndarray) -> PointLabels:
     none = np.zeros(0, np.int32)
-    return PointLabels(label, np.ones(len(label), np.float32), 9, none, none, none, np.zeros(0, np.float32))
+    return PointLabels(label, np.ones(len(label), np.float32), 9, none, none, none)

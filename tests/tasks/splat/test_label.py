@@ -23,7 +23,7 @@ FRAMES = box_scene.frames()
 TRUE = [LabelMap(frame.name, box_scene.cast(view)[1].astype(np.uint16)) for view, frame in enumerate(FRAMES)]
 NO_CLOUD = (
     PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 1.0, 0.01),
-    PointLabels(*(np.zeros(0, kind) for kind in (np.int32, np.float32)), 0, *(np.zeros(0, np.int32),) * 3, np.zeros(0)),
+    PointLabels(*(np.zeros(0, kind) for kind in (np.int32, np.float32)), 0, *(np.zeros(0, np.int32),) * 3),
     PointParts(np.zeros(0, np.int32)),
 )
 

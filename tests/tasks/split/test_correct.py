@@ -41,7 +41,7 @@ def labelled(label: np.ndarray, confidence: float = 1.0, num_labels: int = 9) ->
     """With one mask matched to label 1, and one to label 2."""
     mask = np.array([0, 1], np.int32)
     share = np.full(len(label), confidence, np.float32)
-    return PointLabels(label.astype(np.int32), share, num_labels, 0 * mask, mask, mask + 1, np.ones(2, np.float32))
+    return PointLabels(label.astype(np.int32), share, num_labels, 0 * mask, mask, mask + 1)
 
 
 def clicks(*points: tuple[int, float, float]) -> Clicks:

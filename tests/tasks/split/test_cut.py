@@ -19,7 +19,6 @@ LABELS = PointLabels(
     match_view=np.array([0, 0, 1, 1], np.int32),
     match_mask=np.array([0, 1, 0, 1], np.int32),
     match_label=np.array([1, 2, 5, 4], np.int32),
-    match_purity=np.ones(4, np.float32),
 )
 
 

@@ -65,7 +65,7 @@ def test_faces_are_one_unless_the_views_deny_it(together, apart, agreement):
     # The masks that hold both hold much else, so that alone they show nothing.
     cloud, cameras, view, label = scene()
     nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label), np.float32), 3, nothing, nothing, nothing, np.zeros(0, np.float32))
+    labels = PointLabels(label, np.ones(len(label), np.float32), 3, nothing, nothing, nothing)
     seen = np.full(3, SIDE**2, np.int32)
     views = [[[1, 1, 1]]] * together + [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]] * apart
     tallies = [

@@ -30,9 +30,7 @@ def tree(tallies: list[Tally], labels: int, **changes) -> Hierarchy:
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.1)
     label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), 20)
     nothing = np.zeros(0, np.int32)
-    given = PointLabels(
-        label, np.ones(len(label), np.float32), labels, nothing, nothing, nothing, np.zeros(0, np.float32)
-    )
+    given = PointLabels(label, np.ones(len(label), np.float32), labels, nothing, nothing, nothing)
     sizes, intrinsics = np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]])
     cameras = Cameras(("a",), sizes, intrinsics, np.eye(4)[None], True)
     return hierarchy(cloud, cameras, [], given, tallies, params=HierarchyParams(**{"prior": 0.0, **changes}))
@@ -153,7 +151,7 @@ def agreement_beside(neighbour: float, alone: float = 0.3) -> float:
     )
     label = np.repeat(np.arange(1, 4, dtype=np.int32), len(half))
     nothing = np.zeros(0, np.int32)
-    given = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing, np.zeros(0))
+    given = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing)
     cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), np.eye(4)[None], True)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.02)
     views = [tally([({1, 2}, 0.9)], {1, 2, 3}), tally([({1}, 0.9), ({2}, 0.9)], {1, 2, 3})]

@@ -138,7 +138,7 @@ def test_objects_that_lie_apart_tell_each_others_masks_where_they_end(monkeypatc
 def spread_in(seen: Visibility, own: PromptedMasks, label: np.ndarray, model=ABSENT, embedding=NOTHING):
     none = np.zeros(0, np.int32)
     share = np.ones(len(label), np.float32)
-    labels = PointLabels(label, share, 3, none, none, none, np.zeros(0, np.float32))
+    labels = PointLabels(label, share, 3, none, none, none)
     frame = box_scene.frames()[int(seen.name)]
     return hints.spread(
         EmbeddedPhoto(frame, embedding), seen, own, labels, params=RepromptParams(), contained=0.9, model=model

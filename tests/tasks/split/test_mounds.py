@@ -27,7 +27,7 @@ def on_seat(height: float, color: tuple[int, int, int]) -> Mounds:
     places = np.concatenate([SEAT[~HOLE], top, sides]).astype(np.float32)
     label = np.repeat(np.array([1, 2], np.int32), [(~HOLE).sum(), len(top) + len(sides)])
     nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), 2, nothing, nothing, nothing, np.zeros(0))
+    labels = PointLabels(label, np.ones(len(label)), 2, nothing, nothing, nothing)
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = (0, 0, 2)
     cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)

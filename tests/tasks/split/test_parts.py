@@ -47,9 +47,7 @@ def parts_of(views: dict[str, list[Mask]], label=LABEL, params=None) -> list[int
         pools.append(replace(mask_set(np.zeros((len(masks), 1, 1), bool), name), parent=parent))
         matched += [(k, j, mask.label) for j, mask in enumerate(masks) if mask.label]
     view, mask, shown = np.array(matched, np.int32).reshape(-1, 3).T
-    labels = PointLabels(
-        np.array(label, np.int32), np.ones(len(label), np.float32), 2, view, mask, shown, np.ones(len(view), np.float32)
-    )
+    labels = PointLabels(np.array(label, np.int32), np.ones(len(label), np.float32), 2, view, mask, shown)
     return find_parts(observations, pools, labels, params=params or PartsParams()).part.tolist()
 
 

@@ -78,7 +78,6 @@ def test_the_worked_example_of_the_specification(preset, label_of_4, share_of_4)
     assert result.match_view.tolist() == [0, 0, 1, 1, 2]
     assert result.match_mask.tolist() == [0, 1, 0, 1, 0]
     assert result.match_label.tolist() == [1, 2, 1, 2, 2]
-    np.testing.assert_allclose(result.match_purity, [1, 1, 2 / 3, 1, 1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -44,9 +44,7 @@ def labelled(image, confidence=1.0):
     """Points labelled by an image of labels [4, 10], and their cloud."""
     flat = np.asarray(image, np.int32).ravel()
     none = np.zeros(0, np.int32)
-    labels = PointLabels(
-        flat, np.full(H * W, confidence, np.float32), int(flat.max()), none, none, none, np.zeros(0, np.float32)
-    )
+    labels = PointLabels(flat, np.full(H * W, confidence, np.float32), int(flat.max()), none, none, none)
     places = np.random.default_rng(0).random((H * W, 3)).astype(np.float32)
     return PointCloud(places, np.zeros((H * W, 3), np.uint8), 1.0, 0.1), labels
 
@@ -324,7 +322,7 @@ def test_a_drawn_mask_has_no_gaps_in_a_close_view_whose_points_lie_far_apart(apa
     # Around it lies what has no label: the mask must not grow into that, however far it reaches.
     label = truth.ravel()[pixel].astype(np.int32)
     none = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(pixel), np.float32), 1, none, none, none, np.zeros(0, np.float32))
+    labels = PointLabels(label, np.ones(len(pixel), np.float32), 1, none, none, none)
     places = np.stack([u.ravel(), v.ravel(), np.zeros(pixel.size)], axis=-1).astype(np.float32)
     cloud = PointCloud(places, np.zeros((pixel.size, 3), np.uint8), 1.0, float(apart))
     seen = Visibility("a", np.arange(pixel.size, dtype=np.int32), pixel, np.ones(pixel.size, np.float32), side, side)

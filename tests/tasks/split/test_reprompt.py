@@ -25,7 +25,7 @@ def box_view(missing):
     seen = Visibility("0", every, every, np.ones(ids.size, np.float32), *ids.shape)
     none = np.zeros(0, np.int32)
     share = np.ones(ids.size, np.float32)
-    labels = PointLabels(ids.ravel().astype(np.int32), share, 3, none, none, none, np.zeros(0, np.float32))
+    labels = PointLabels(ids.ravel().astype(np.int32), share, 3, none, none, none)
     shown = [ids == i for i in (1, 2, 3) if i not in missing]
     return ids, seen, mask_set(np.stack(shown), "0"), labels
 

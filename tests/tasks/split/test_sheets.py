@@ -44,7 +44,7 @@ def scene(page: float = 0.0, mug: float = 0.1, table: float = 0.8) -> tuple[Poin
     places = np.concatenate(pieces).astype(np.float32)
     label = np.repeat(np.arange(1, 4, dtype=np.int32), [len(piece) for piece in pieces])
     nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing, np.zeros(0))
+    labels = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, STEP)
     return cloud, labels
 

@@ -16,7 +16,7 @@ def kinds(*pieces, **values) -> list[bool]:
     places = np.concatenate(pieces).astype(np.float32)
     label = np.repeat(np.arange(1, len(pieces) + 1, dtype=np.int32), [len(p) for p in pieces])
     nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), len(pieces), nothing, nothing, nothing, np.zeros(0))
+    labels = PointLabels(label, np.ones(len(label)), len(pieces), nothing, nothing, nothing)
     pose = np.eye(4)
     pose[:3, 3] = (0, 0, -1.5)
     cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)

@@ -163,7 +163,7 @@ def tree(agreement: float) -> Hierarchy:
     """A floor and a table, both in light and shadow, of which no view has a mask."""
     cloud, cameras, label = scene(*floor(), *table())
     nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), 4, nothing, nothing, nothing, np.zeros(0))
+    labels = PointLabels(label, np.ones(len(label)), 4, nothing, nothing, nothing)
     return hierarchy(
         cloud, cameras, [], labels, [], params=HierarchyParams(shadows=ShadowParams(agreement=agreement, repeats=1))
     )

@@ -8,9 +8,7 @@ from ss_flow.tasks.split.tally import tally
 def labelled(label) -> PointLabels:
     nothing = np.zeros(0, np.int32)
     label = np.array(label, np.int32)
-    return PointLabels(
-        label, np.ones(len(label), np.float32), int(label.max()), nothing, nothing, nothing, np.zeros(0, np.float32)
-    )
+    return PointLabels(label, np.ones(len(label), np.float32), int(label.max()), nothing, nothing, nothing)
 
 
 def test_a_point_counts_under_every_mask_that_holds_it():
