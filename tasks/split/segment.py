@@ -4,7 +4,7 @@ Sec. 3.1; spec S1)."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -84,27 +84,22 @@ class _Candidates:
     """Masks at the network's own resolution, cropped to the image."""
 
     logits: Float32
-    """[N, h', w'], at least as large."""
+    """[N, h', w'] as the network gives them, h' >= h and w' >= w: they may go on beyond the image."""
     masks: Bool
     """[N, h, w]."""
     predicted_iou: Float32
+    """[N]."""
     stability: Float32
+    """[N]."""
     grid: Int32
+    """[N] level of the grid whose prompt found it."""
 
     def __getitem__(self, rows: Int32) -> _Candidates:
-        return _Candidates(
-            self.logits[rows], self.masks[rows], self.predicted_iou[rows], self.stability[rows], self.grid[rows]
-        )
+        return _Candidates(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     @staticmethod
     def joined(parts: Sequence[_Candidates]) -> _Candidates:
-        return _Candidates(
-            np.concatenate([part.logits for part in parts]),
-            np.concatenate([part.masks for part in parts]),
-            np.concatenate([part.predicted_iou for part in parts]),
-            np.concatenate([part.stability for part in parts]),
-            np.concatenate([part.grid for part in parts]),
-        )
+        return _Candidates(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Candidates)})
 
 
 @task(
