@@ -19,6 +19,7 @@ from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Bool, Float32, UInt8
 from ss_flow.tasks.models.efficientnet import EfficientNetLite2
 from ss_flow.tasks.models.sentences import SentenceEncoder
+from ss_flow.tasks.models.text_image import CANONICAL
 
 LIKELIEST = 10
 """How many classes a picture is made of; the paper's choice."""
@@ -64,8 +65,8 @@ class ClassNames:
         return self._sentences.encode(texts)
 
     def negatives(self, text: str) -> tuple[str, ...]:
-        """The canonical phrases that fit anything (Kerr et al., "LERF", Sec. 3.4)."""
-        return ("object", "things", "stuff", "texture")
+        """The canonical phrases."""
+        return CANONICAL
 
     @functools.cached_property
     def _classifier(self) -> EfficientNetLite2:

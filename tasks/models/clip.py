@@ -16,6 +16,7 @@ from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Bool, Float32, UInt8
 from ss_flow.tasks.models.onnx import open_session
+from ss_flow.tasks.models.text_image import CANONICAL
 from ss_flow.tasks.models.tokenizer import ClipTokenizer
 
 if TYPE_CHECKING:
@@ -81,8 +82,8 @@ class Clip:
         return _unit(self._text.run([self._text_output], feeds)[0])
 
     def negatives(self, text: str) -> tuple[str, ...]:
-        """The canonical phrases that fit anything (Kerr et al., "LERF", Sec. 3.4)."""
-        return ("object", "things", "stuff", "texture")
+        """The canonical phrases."""
+        return CANONICAL
 
 
 def prepare(image: UInt8, side: int) -> Float32:

@@ -7,6 +7,9 @@ from typing import Protocol
 
 from ss_flow.tasks.artifacts import Bool, Float32, UInt8
 
+CANONICAL = ("object", "things", "stuff", "texture")
+"""The canonical phrases, which fit anything (Kerr et al., "LERF", Sec. 3.4)."""
+
 
 class TextImageEncoder(Protocol):
     """A model for which the cosine between a picture and a text says how well they agree."""
