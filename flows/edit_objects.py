@@ -33,7 +33,7 @@ class Objects:
     parts: dict[int, dict[int, int]]
     """Of each instance, the parts that have Gaussians, and their numbers of dense points."""
     dense: dict[int, set[int]]
-    """Of each instance, the labels of the dense points that lie where it lies."""
+    """Of each instance and of the background (0), the labels of the dense points that lie where it lies."""
     groups: list[Entry]
     next_id: int
     """Ids are never used twice."""
@@ -51,7 +51,7 @@ class Objects:
         for instance, part in np.unique(np.stack([scene.instance_id, scene.part_id]), axis=1).T.tolist():
             parts.setdefault(instance, {})[part] = points.get(instance, {}).get(part, 0)
         used = [0, *entries, *parts, *(group["id"] for group in document["groups"])]
-        return cls(entries, parts, {i: {i} for i in entries}, list(document["groups"]), max(used) + 1)
+        return cls(entries, parts, {i: {i} for i in (0, *entries)}, list(document["groups"]), max(used) + 1)
 
     def names(self) -> list[str]:
         return [entry["name"] for entry in self.entries.values()]
@@ -87,7 +87,7 @@ class Objects:
 
     def keep(self, ids: Iterable[int]) -> None:
         """Remove all others."""
-        self.remove(set(self.entries) - set(ids))
+        self.remove({0, *self.entries} - set(ids))
 
     def move(self, ids: Iterable[int]) -> None:
         """The capture no longer shows these where they are."""

@@ -261,8 +261,8 @@ def _came_to_light(
     """
     from scipy.spatial import cKDTree
 
-    own = np.isin(before.instance_id, instances)
-    rest = some_rows(before, ~own)
+    stays = ~np.isin(before.instance_id, instances) & np.isin(before.instance_id, after.instance_id)
+    rest = some_rows(before, stays)
     reach = _NEAR * measured.points.spacing
 
     def within(of: Float32 | Float64) -> Bool:
@@ -274,14 +274,14 @@ def _came_to_light(
         np.maximum(with_it, render(before, view.camera).max_contribution, out=with_it)
         np.maximum(without, render(rest, view.camera).max_contribution, out=without)
     small = rest.log_scales.max(axis=1, initial=-np.inf) < np.log(reach)
-    grown = without > 2 * with_it[~own]
+    grown = without > 2 * with_it[stays]
     alone = grown & ~within(measured.points.points[Remains.of(measured, gone).rows])
     if alone.any():
         for number in range(len(measured.cameras)):
             np.maximum(with_it, render(before, camera_of(measured.cameras, number)).max_contribution, out=with_it)
     came = np.zeros(len(after), bool)
     stayed = np.flatnonzero(~np.isin(after.instance_id, instances))[: len(rest)]  # what is new comes last
-    came[stayed] = (grown & small & within(places)) | (alone & (with_it[~own] < _FAINT))
+    came[stayed] = (grown & small & within(places)) | (alone & (with_it[stays] < _FAINT))
     return came
 
 

@@ -165,6 +165,14 @@ def test_the_dense_points_of_what_has_left_no_longer_count():
     assert [step.leaving for step in steps] == [(), (3,), (), (2, 8), ()]
 
 
+def test_the_dense_points_of_the_background_leave_with_it():
+    steps, _ = checked({"op": "remove", "instances": ["background", 2]}, {"op": "remove", "instances": [3]})
+    assert [step.gone for step in steps] == [(0, 2), (0, 2, 3)]
+    assert [step.leaving for step in steps] == [(2,), (3,)]
+    steps, _ = checked({"op": "keep", "instances": [2, 3]}, {"op": "remove", "instances": [3]})
+    assert [step.gone for step in steps] == [(0, 4, 5), (0, 3, 4, 5)]
+
+
 def test_groups_lose_what_has_left_them():
     now, objects = applied({"op": "transform", "instances": 3, "move": [0, 0, 1]})
     assert objects.document(DOCUMENT, now)["groups"][0]["instances"] == [4]

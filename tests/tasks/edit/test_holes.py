@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import box_scene
 import numpy as np
 import pytest
@@ -109,6 +111,19 @@ def test_where_nothing_is_left_nothing_is_filled(seen):
     assert len(after) == 0
     found = holes(scene, nothing, measured, instances=(1, 2, 3), gone=(0, 1, 2, 3))
     assert np.array_equal(found.unmeasured, found.left)
+
+
+def test_the_background_may_leave_together_with_what_leaves_a_hole(seen):
+    measured, scene = seen
+    floor, background = 4, 0  # the floor an instance, and a box part of the background
+    ids = np.array([floor, 1, BOX, background], np.int32)
+    now = replace(scene, instance_id=ids[scene.instance_id])
+    known = replace(measured.labels, label=ids[measured.labels.label])
+    after = operations.remove(now, instances=(background, BOX))
+    full = fill(now, after, replace(measured, labels=known), instances=(BOX,), gone=(background, BOX))
+    new = full.instance_id[full.filled > 0]
+    assert len(new) > 0.5 * np.prod(np.ptp(box_scene.BOXES[BOX - 1, :, :2], axis=0)) / SPACING**2
+    assert (new == floor).all() and set(full.instance_id.tolist()) == {floor, 1}
 
 
 def test_the_same_edit_gives_the_same_bytes(seen, removed):
