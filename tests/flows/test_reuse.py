@@ -38,6 +38,7 @@ def test_a_second_run_computes_nothing_and_leaves_every_file_as_it_is(warm):
     assert again.code == 0
     assert again.computed() == {}
     assert again.results() == warm.called.results()
+    assert again.document() == read_run(warm.out)
     after = bytes_of(warm.out)
     assert {name for name in before | after if before.get(name) != after.get(name)} == {"run.json"}
 
@@ -70,6 +71,19 @@ def test_an_output_folder_that_was_deleted_is_written_again_from_the_store(warm)
     assert {n for n in before if before[n] != after[n]} <= {"run.json", "report.html"}
 
 
+@pytest.mark.parametrize("name", ["instances.json", "report.html", "run.json", "scene.ply", "masks/0000.png"])
+def test_an_output_folder_with_a_file_cut_off_or_gone_is_written_again(warm, name):
+    before = bytes_of(warm.out)
+    if name.endswith((".ply", ".png")):
+        (warm.out / name).unlink()
+    else:
+        (warm.out / name).write_bytes(before[name][: len(before[name]) // 2])
+    assert run_tiny(warm.scene, warm.store, out=warm.out).computed() == {}
+    after = bytes_of(warm.out)
+    assert set(after) == set(before) and after["report.html"].rstrip().endswith(b"</html>")
+    assert {n for n in before if before[n] != after[n]} <= {"run.json", "report.html"}
+
+
 def test_a_changed_threshold_of_propagation_computes_it_and_nothing_before_it(warm):
     again = run_tiny(warm.scene, warm.store, "--set", "split.tau_label=0.95", out=warm.out)
     assert again.computed()["split.propagate"] == 1
@@ -97,6 +111,8 @@ def test_the_search_threshold_changes_nothing_in_a_run_and_only_the_answer_of_a_
     again = run_tiny(warm.scene, warm.store, "--set", "semantics.tau_corr=0.5", out=warm.out)
     assert again.computed() == {}
     assert read_run(warm.out)["params"]["semantics.query.tau_corr"] == 0.5
+    report = (warm.out / "report.html").read_text(encoding="utf-8")
+    assert re.search(r"semantics\.query\.tau_corr\D*0\.5\D", report)
 
     def ask(*more):
         assert ss_flow("query", warm.out, "red", *more, "--json").code == 0
