@@ -44,7 +44,7 @@ SILHOUETTE = 0.7
 """Accumulated alpha from which a pixel belongs to a silhouette (OpenGaussian)."""
 _MEAN_FILTER = 30
 _CUT_2D = 0.4
-_MAJORITY = 15
+_MAJORITY = 7
 """Pixels across the window whose majority decides, in LangSplat's protocol."""
 _LABELS_AT_ONCE = 16
 
@@ -147,8 +147,8 @@ def langsplat_2d(
     """LangSplat's protocol on rendered features: every Gaussian carries the descriptor of its instance.
 
     A category's relevancy map is half raw and half a 30 x 30 mean, stretched from its least to its largest value over
-    -1..1; a pixel belongs to it above 0.4, by the majority of 15 x 15 pixels. It is localised when the largest mean
-    lies in the box of one of its polygons.
+    -1..1; a pixel belongs to it above 0.4, by the majority of the 7 x 7 pixels around it (`smooth` in LangSplat's
+    `eval/utils.py`). It is localised when the largest mean lies in the box of one of its polygons.
     texts: (category, what the encoder reads). Returns miou, macc25, macc50 as `strict`, localised (share of the pairs),
     num_targets, num_frames. Raises InputError as `strict`.
     """
@@ -244,9 +244,14 @@ def _found_2d(relevancy: Float32) -> tuple[Bool, tuple[int, int]]:
     both: Float64 = (relevancy.astype(np.float64) + mean) / 2
     spread = both.max() - both.min()
     stretched = np.clip(2 * (both - both.min()) / (spread if spread > 0 else 1) - 1, 0, 1)
-    share = cv2.blur((stretched > _CUT_2D).astype(np.float32), (_MAJORITY, _MAJORITY))
+    above = (stretched > _CUT_2D).astype(np.float32)
+    # Of a window that reaches over the border, the part inside the image decides.
+    counts, areas = (
+        cv2.boxFilter(a, -1, (_MAJORITY, _MAJORITY), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for a in (above, np.ones_like(above))
+    )
     row, column = np.unravel_index(int(mean.argmax()), mean.shape)
-    return share > 0.5, (int(column), int(row))
+    return 2 * counts > areas, (int(column), int(row))
 
 
 def _in_a_box(label: LabelledFrame, category: str, place: tuple[int, int]) -> bool:

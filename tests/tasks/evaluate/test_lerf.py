@@ -16,7 +16,7 @@ from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, Descriptors, Frame, Gaussians, LabelMap
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import SceneFiles
-from ss_flow.tasks.evaluate.lerf import Labels, langsplat_2d, oracle, strict
+from ss_flow.tasks.evaluate.lerf import Labels, _found_2d, langsplat_2d, oracle, strict
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.semantics.query import QueryParams, Similarity, chosen, similarity
 
@@ -159,6 +159,15 @@ def test_rendered_features_find_and_localise(tmp_path: Path) -> None:
     swapped = (("red mug", "blue"), ("blue box", "red"))
     values = langsplat_2d(FRAMES, CAMERAS, SCENE, DESCRIPTORS, labels=labels, texts=swapped).values
     assert values["localised"] == 0 and values["macc25"] == 0
+
+
+@pytest.mark.parametrize(("columns", "found"), [((20, 24), (20, 24)), ((20, 23), (0, 0)), ((0, 3), (0, 2))])
+def test_of_the_seven_by_seven_pixels_around_one_most_must_be_relevant(columns, found) -> None:
+    relevancy, mask = np.zeros((40, 60), np.float32), np.zeros((40, 60), bool)
+    relevancy[:, slice(*columns)] = 1
+    mask[:, slice(*found)] = True
+    # 4 of 7 columns are most, 3 are not. At the border a window has 4, 5, 6, 7 columns: 3 are most of 4 and of 5.
+    np.testing.assert_array_equal(_found_2d(relevancy)[0], mask)
 
 
 def test_frames_that_are_no_view_are_told_and_none_at_all_is_refused(tmp_path: Path) -> None:
