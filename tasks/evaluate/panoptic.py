@@ -52,8 +52,10 @@ def panoptic_quality(table: Contingency, ignored: NDArray[np.bool_] | None = Non
     return PanopticQuality(sq * rq, sq, rq, tp, fp, fn)
 
 
-def average_precision(table: Contingency, confidence: Float64, threshold: float = _MATCH) -> float:
+def monotone_average_precision(table: Contingency, confidence: Float64, threshold: float = _MATCH) -> float:
     """Class-agnostic average precision: the area under precision over recall, precision made monotone.
+
+    ScanNet's evaluation integrates and matches otherwise: `scannet_ap`.
 
     confidence: [P] of each prediction; the most confident choose first, ties by their order. A prediction is right when
     its IoU with an instance that none has chosen before exceeds the threshold.

@@ -27,12 +27,11 @@ from ss_flow.tasks.artifacts import (
     PointLabels,
     Visibility,
 )
-from ss_flow.tasks.evaluate.contingency import Contingency, Labels, contingency
+from ss_flow.tasks.evaluate.contingency import Labels, contingency
 from ss_flow.tasks.evaluate.instances import segmentation_metrics, summary
-from ss_flow.tasks.evaluate.panoptic import average_precision, panoptic_quality
+from ss_flow.tasks.evaluate.panoptic import panoptic_quality
+from ss_flow.tasks.evaluate.scannet_ap import scannet_ap
 
-_LEAST_POINTS = 100
-"""Instances and predictions with fewer points are left out of the average precision, as ScanNet's evaluation does."""
 _OVERLAPS = tuple(np.arange(50, 95, 5) / 100)
 """IoU thresholds whose mean is AP in ScanNet's evaluation: 0.50 to 0.90."""
 
@@ -222,28 +221,6 @@ def ig_metrics(truth: Labels, predicted: Labels, *, compat_gap_bug: bool = False
         by_id = dict(zip(table.truth_ids.tolist(), best.tolist(), strict=True))
         best = np.array([by_id.get(i, 0.0) for i in range(len(best))])
     return summary(best)
-
-
-def scannet_ap(table: Contingency, score: Mapping[int, float], overlap: float) -> float:
-    """Class-agnostic average precision by ScanNet's rules (spec 2.1 a).
-
-    table: of all points, with the true label -1 where nothing is annotated, without predicted 0. Instances and
-    predictions of fewer than 100 points are left out. A prediction that meets no instance with an IoU above `overlap`
-    is no false positive when more than this share of it lies on what is not annotated or left out.
-    """
-    counted = (table.truth_ids >= 0) & (table.truth_area >= _LEAST_POINTS)
-    large = table.predicted_area >= _LEAST_POINTS
-    free = table.intersection[~counted].sum(axis=0) / np.maximum(table.predicted_area, 1)
-    kept = large & ((table.iou[counted] > overlap).any(axis=0) | (free <= overlap))
-    of_kept = Contingency(
-        table.truth_ids[counted],
-        table.predicted_ids[kept],
-        table.intersection[np.ix_(counted, kept)],
-        table.truth_area[counted],
-        table.predicted_area[kept],
-    )
-    confidence = np.array([score.get(int(i), 0.0) for i in of_kept.predicted_ids], np.float64)
-    return average_precision(of_kept, confidence, overlap)
 
 
 def transfer_nearest(

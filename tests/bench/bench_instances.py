@@ -44,7 +44,7 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.evaluate.contingency import contingency
 from ss_flow.tasks.evaluate.instances import evaluate_masks, pooled
-from ss_flow.tasks.evaluate.panoptic import average_precision
+from ss_flow.tasks.evaluate.panoptic import monotone_average_precision
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -201,7 +201,7 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
     known = room.true_label >= 0
     on_points = contingency(room.true_label[known], labels.label[known]).without(truth=0, predicted=0)
     return values | {
-        "ap50": average_precision(table, np.array([confidence[int(i)] for i in table.predicted_ids])),
+        "ap50": monotone_average_precision(table, np.array([confidence[int(i)] for i in table.predicted_ids])),
         "points": float(on_points.best_iou().mean()),
         "moved": moved(labels.label, again.label),
         "labels": float(len(table.predicted_ids)),

@@ -23,10 +23,10 @@ from ss_flow.tasks.evaluate.points import (
     ig_metrics,
     lifted,
     point_metrics,
-    scannet_ap,
     transfer_nearest,
 )
 from ss_flow.tasks.evaluate.scannet import scannet_truth
+from ss_flow.tasks.evaluate.scannet_ap import scannet_ap
 
 TRUTH = np.array([0, 0, 0, 0, 1, 1, 2, -1])
 PREDICTED = np.array([5, 5, 5, 7, 7, 7, 5, 9])
@@ -126,14 +126,30 @@ def _ap(truth: list[tuple[int, int, int]], score: dict[int, float], overlap: flo
 def test_average_precision_follows_scannets_rules() -> None:
     both = [(0, 5, 200), (1, 6, 200)]
     assert _ap(both, {5: 1.0, 6: 0.5}, 0.5) == 1.0
-    # A false positive that is surer than one of two hits: precision 1, 1/2, 2/3 at recall 1/2, 1/2, 1.
+    # A wrong one that is surer than one of two right ones: precision 1, 1, 1/2, 2/3 at recall 0, 1/3, 1/3, 2/3.
     wrong = [*both, (-1, 7, 40), (2, 7, 160), (2, 0, 300)]
-    assert _ap(wrong, {5: 1.0, 7: 0.8, 6: 0.5}, 0.5) == pytest.approx((1 + 2 / 3) / 3)
+    assert _ap(wrong, {5: 1.0, 7: 0.8, 6: 0.5}, 0.5) == pytest.approx(1 / 3 + (1 / 2 + 2 / 3) / 2 / 3)
+    # All of one score are one point of the curve: precision 1, 2/3 at recall 0, 2/3.
+    assert _ap(wrong, {5: 0.7, 6: 0.7, 7: 0.7}, 0.5) == pytest.approx((1 + 2 / 3) / 2 * 2 / 3)
     # What lies for more than the threshold on points without annotation is no false positive.
     assert _ap([*both, (-1, 7, 160), (1, 7, 40)], {5: 1.0, 7: 2.0, 6: 0.5}, 0.5) == 1.0
     # Instances and predictions of fewer than 100 points do not count; what lies on such an instance is ignored.
     assert _ap([*both, (2, 8, 99), (0, 9, 30)], {5: 1.0, 6: 0.5, 8: 3.0, 9: 3.0}, 0.5) == 1.0
     assert _ap([*both, (2, 8, 90), (-1, 8, 30)], {5: 1.0, 6: 0.5, 8: 3.0}, 0.5) == 1.0
+
+
+def test_below_one_half_the_first_prediction_is_taken_and_the_surest_counts() -> None:
+    # 5 meets both instances with an IoU of 1/3, 6 the first one with 1/2. The first instance takes 5, and so the second
+    # has none: 6 is right and 5 wrong. Precision 1, 1, 1/2 at recall 0, 1/2, 1/2.
+    assert _ap([(0, 5, 100), (0, 6, 100), (1, 5, 100), (1, 0, 100)], {5: 0.4, 6: 0.9}, 0.25) == 0.5
+    # 6 meets both, but was not taken: right for both, and wrong besides. Precision 1, 1, 2/3 at recall 0, 1/2, 1.
+    twice = _ap([(0, 5, 100), (0, 6, 100), (1, 6, 100), (1, 0, 100)], {5: 0.9, 6: 0.4}, 0.25)
+    assert twice == pytest.approx(1 / 2 + (1 + 2 / 3) / 2 / 2)
+
+
+def test_without_predictions_or_instances_that_count_the_average_precision_is_zero() -> None:
+    assert _ap([(0, 0, 200), (0, 5, 99)], {5: 1.0}, 0.5) == 0
+    assert _ap([(-1, 5, 200), (0, 6, 50)], {5: 1.0}, 0.5) == 0
 
 
 def test_points_take_the_id_that_most_of_the_views_give_them() -> None:
