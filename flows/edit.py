@@ -16,7 +16,7 @@ from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows.deliver import failure_records, node_records
 from ss_flow.flows.edit_objects import Objects
-from ss_flow.flows.edit_script import Step, check
+from ss_flow.flows.edit_script import Step, check, rooted
 from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run
 from ss_flow.graph import labelled
 from ss_flow.kept_closures import kept_closure
@@ -40,6 +40,7 @@ class Edit:
     source: FinishedRun
     """The run that is edited."""
     script: Mapping[str, Any]
+    """With absolute paths."""
     steps: list[Step]
     objects: Objects
     """Those of the edited scene."""
@@ -79,7 +80,7 @@ def open_edit(source: Path, script: Mapping[str, Any], store: Store, folder: Pat
         )
     run = finished_run(source, document, store, _NEEDED)
     steps, objects = check(script, Objects.of(run.instances, run.results.one("scene")), folder)
-    return Edit(run, script, steps, objects)
+    return Edit(run, rooted(script, folder), steps, objects)
 
 
 def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None = None, jobs: int = 0) -> dict[str, Any]:

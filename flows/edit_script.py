@@ -62,6 +62,15 @@ def check(script: object, objects: Objects, folder: Path) -> tuple[list[Step], O
     return steps, objects
 
 
+def rooted(script: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A checked script with absolute paths in the place of those that start from `folder`."""
+    operations = [
+        {**operation, "run": str((folder / operation["run"]).resolve())} if "run" in operation else operation
+        for operation in script["operations"]
+    ]
+    return {**script, "operations": operations}
+
+
 def _step(number: int, raw: object, objects: Objects, folder: Path) -> Step | None:
     if not isinstance(raw, Mapping):
         raise InputError(f'operation {number} must be an object such as {{"op": "remove", "instances": [3]}}.')

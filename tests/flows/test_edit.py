@@ -20,6 +20,7 @@ def edit(warm, *operations: dict, out: str = "edited"):
     """`ss-flow edit --json` of the run with these operations; what it came to, and the folder."""
     place = warm.out.parent / out
     script = place.with_suffix(".json")
+    script.parent.mkdir(exist_ok=True)
     script.write_text(json.dumps({"version": 1, "operations": list(operations)}))
     return ss_flow("edit", warm.out, script, "--out", place, "--cache", warm.store, "--json", "--jobs", "1"), place
 
@@ -86,6 +87,10 @@ def test_an_object_of_another_run_takes_the_place_of_one(warm, tmp_path):
     old = read_gaussians(place.parent / "other" / f"instances/{own:04d}.ply")
     np.testing.assert_allclose(new.means, old.means, atol=1e-5)
     np.testing.assert_array_equal(new.sh, old.sh)
+    told = called.document()["edit"]["script"]["operations"]
+    assert told == [replacing | {"run": str((place.parent / "other").resolve())}]
+    again, _ = edit(warm, *told, out="elsewhere/edited")  # whose script stands in another folder
+    assert again.computed() == {}
 
 
 def test_a_bad_script_runs_nothing_and_writes_nothing(warm):
