@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -55,8 +56,10 @@ def replacing(folder: Path) -> Iterator[Path]:
     """
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    for stale in folder.parent.glob(f".{folder.name}.*.partial"):
-        shutil.rmtree(stale, ignore_errors=True)
+    unfinished = re.compile(rf"\.{re.escape(folder.name)}\.[0-9a-f]{{8}}(\.old)?\.partial")
+    for stale in folder.parent.iterdir():
+        if unfinished.fullmatch(stale.name):
+            shutil.rmtree(stale, ignore_errors=True)
     filling = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}.partial"
     filling.mkdir()
     try:

@@ -44,12 +44,13 @@ def test_when_filling_fails_the_old_content_stays(tmp_path):
 
 
 def test_what_a_killed_run_left_is_taken_away_and_the_neighbours_are_not(tmp_path):
-    (tmp_path / ".out.0123abcd.partial").mkdir()
-    (tmp_path / ".out2.0123abcd.partial").mkdir()
-    (tmp_path / "out.partial").mkdir()
-    with replacing(tmp_path / "out"):
+    own = [".out[1].0123abcd.partial", ".out[1].0123abcd.old.partial"]
+    others = [".out[1].v2.0123abcd.partial", ".out1.0123abcd.partial", "out[1].partial"]
+    for name in (*own, *others):
+        (tmp_path / name).mkdir()
+    with replacing(tmp_path / "out[1]"):
         pass
-    assert names(tmp_path) == [".out2.0123abcd.partial", "out", "out.partial"]
+    assert names(tmp_path) == sorted([*others, "out[1]"])
 
 
 def test_a_relative_name_is_taken_from_where_one_is(tmp_path, monkeypatch):
