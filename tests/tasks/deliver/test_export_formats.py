@@ -8,6 +8,7 @@ import itertools
 import json
 import struct
 import zipfile
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -26,7 +27,8 @@ from ss_flow.tasks.deliver.export.sog import _kinds, sog
 from ss_flow.tasks.deliver.export.splat import splat
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.export.usda import usda
-from ss_flow.tasks.gaussians.read_ply import read_gaussians
+from ss_flow.tasks.edit.operations import edited
+from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
 
 SIZES = st.sampled_from([0, 1, 2, 255, 256, 257, 700])
 DEGREES = st.integers(0, 3)
@@ -275,6 +277,15 @@ def test_ply_reads_back_equal(tmp_path_factory, count, degree, labelled):
     np.testing.assert_array_equal(read.means, made.means)
     np.testing.assert_array_equal(read.sh[:, : made.sh.shape[1]], made.sh)
     np.testing.assert_array_equal(read.instance_id, made.instance_id * labelled)
+
+
+def test_instances_of_an_edited_scene_keep_the_column_that_says_what_fills_holes(tmp_path):
+    made = made_gaussians(40, 1)
+    flags = np.arange(40) % 2
+    scene = replace(edited(made, filled=0), filled=flags.astype(np.uint8))
+    own = made.instance_id == 2
+    (tmp_path / "two.ply").write_bytes(bytes_of(gaussian_ply(chosen(scene, instances=(2,)), labelled=True)))
+    assert np.array_equal(read_columns(tmp_path / "two.ply")["filled"], flags[own]) and own.any()
 
 
 def test_usda_has_a_prim_for_each_instance_and_numbers_that_read_back():
