@@ -159,6 +159,11 @@ class Objects:
             self.entries[new_id]["parent"] = entry["parent"]
             self.dense[new_id] = set(self.dense[instance])
             rows.append((instance, part, new_id, 0))
+        pieces = [new_id for _, _, new_id, _ in rows]
+        self.groups = [
+            group | {"instances": [*group["instances"], *pieces]} if instance in group["instances"] else group
+            for group in self.groups
+        ]
         if 0 in own:
             rest = max(0, entry["num_points"] - sum(own[part] for part in named))
             self.entries[instance], self.parts[instance] = entry | {"num_points": rest}, {0: rest}

@@ -180,6 +180,14 @@ def test_groups_lose_what_has_left_them():
     assert objects.document(DOCUMENT, now)["groups"] == []
 
 
+def test_what_an_instance_is_split_into_is_part_of_its_groups():
+    now, objects = applied({"op": "split", "instance": 3}, {"op": "remove", "instances": 4})
+    document = objects.document(DOCUMENT, now)
+    assert {e["id"]: e["parent"] for e in document["instances"]} == {2: None, 5: None, 8: 7, 9: 7}
+    assert [(group["id"], group["instances"]) for group in document["groups"]] == [(7, [8, 9])]
+    assert DOCUMENT["groups"][0]["instances"] == [3, 4]
+
+
 def test_checking_changes_nothing_that_it_was_given():
     before = copy.deepcopy(DOCUMENT)
     objects = Objects.of(DOCUMENT, scene())
