@@ -68,13 +68,13 @@ class Guard:
     def path(self, request: Request) -> str | None:
         """The path below the token; None for a request that is refused."""
         token, _, path = request.path.removeprefix("/").partition("?")[0].partition("/")
-        known = hmac.compare_digest(token.encode(), self.token.encode())
+        known = hmac.compare_digest(token.encode(errors="surrogateescape"), self.token.encode())
         return "/" + path if known and self._from_here(request) else None
 
     def _from_here(self, request: Request) -> bool:
         """Whether it comes from the viewer's own page, or from nobody's. A websocket comes from a page."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-        if len(hosts) != 1 or (self.local and not _is_local(urlsplit(f"//{hosts[0]}").hostname or "")):
+        if len(hosts) != 1 or (self.local and not _is_local(_name(hosts[0]))):
             return False
         return origins == [f"http://{hosts[0]}"] or not (origins or request.headers.get_all("Upgrade"))
 
@@ -138,7 +138,10 @@ def _behind(guard: Guard, answer: _Answer) -> _Answer:
             return connection.respond(403, "Refused. The address, with its token, is where ss-flow view was started.\n")
         if "Accept-Encoding" in request.headers:  # the page is added to
             del request.headers["Accept-Encoding"]
-        response = answer(connection, dataclasses.replace(request, path=path))
+        try:
+            response = answer(connection, dataclasses.replace(request, path=path))
+        except (OSError, ValueError):  # no file can have this name
+            response = connection.respond(404, "NOT FOUND")
         if response is not None:
             response.headers.update(_HEADERS)
             body = response.body or b""
@@ -184,7 +187,7 @@ def understood(raw: object) -> bool:
         if document.keys() - {field.name for field in dataclasses.fields(kind)} or not _is_finite(document):
             return False
         message = msgspec.convert(document, kind)
-    except (msgspec.MsgspecError, KeyError, TypeError, AttributeError, RecursionError):
+    except (msgspec.MsgspecError, UnicodeError, KeyError, TypeError, AttributeError, RecursionError):
         return False
     return not isinstance(message, _messages.GuiUpdateMessage) or message.updates.keys() == {"value"}
 
@@ -193,6 +196,14 @@ def _is_finite(value: object) -> bool:
     if isinstance(value, dict | list):
         return all(map(_is_finite, value.values() if isinstance(value, dict) else value))
     return not isinstance(value, float) or math.isfinite(value)
+
+
+def _name(host: str) -> str:
+    """The name or number in a header Host; empty where there is none."""
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
 
 
 def _is_local(host: str) -> bool:

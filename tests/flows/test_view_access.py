@@ -99,16 +99,26 @@ def test_a_websocket_without_an_origin_or_token_is_refused(address):
         talk(address.rstrip("/")[:-3] + "abc/")
 
 
+@pytest.mark.parametrize(("below", "status"), [("", b"403"), ("TOKEN/", b"404")])
+def test_a_path_that_is_no_ascii_is_refused_like_any_other(address, below, status):
+    parts = urlsplit(address)
+    path = ("/" + below.replace("TOKEN", parts.path.strip("/"))).encode() + b"\xff\xfe"
+    with socket.create_connection((parts.hostname, parts.port), timeout=20) as plain:
+        plain.sendall(b"GET " + path + b" HTTP/1.1\r\nHost: " + parts.netloc.encode() + b"\r\n\r\n")
+        assert plain.recv(1000).split()[1] == status
+
+
 def test_a_foreign_name_that_was_made_to_lead_here_is_refused(address):
     port = urlsplit(address).port
     assert ask(address, Host=f"evil.example:{port}").status == 403
+    assert ask(address, Host="[").status == ask(address, Host=f"[::1:{port}").status == 403
     assert ask(address, Host=f"localhost:{port}").status == 200
 
 
 @pytest.mark.parametrize(
     "path",
     ["../../etc/passwd", "..%2f..%2f..%2fetc%2fpasswd", "/etc/passwd", "%2e%2e/__init__.py", "..\\..\\x", "client",
-     "%00", "index.html/..", "~root"],
+     "%00", "index.html/..", "~root", "a" * 300],
 )  # fmt: skip
 def test_no_file_of_the_machine_is_read(address, path):
     assert ask(address, urlsplit(address).path + path).status == 404
@@ -145,6 +155,7 @@ WRONG = {
     "no msgpack": b"\xc1\xc1",
     "empty": b"",
     "a list": msgspec.msgpack.encode([1]),
+    "no text": b"\x81\xa4type\xa1\x85",
     "no type": msgspec.msgpack.encode({}),
     "a type that is no text": msgspec.msgpack.encode({"type": [1]}),
     "a call home": msgspec.msgpack.encode({"type": "ShareUrlRequest"}),
