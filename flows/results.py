@@ -84,10 +84,7 @@ class FinishedRun:
         """Raises InputError when the store no longer holds one of these results, or an edited run never had it."""
         never = [name for name in needed if name not in self.document["results"]]
         if never and "edit" in self.document:
-            raise InputError(
-                f"{self.folder} is an edited run, which has no {', '.join(never)} of its own; take its source, "
-                f"{self.document['edit']['source']}."
-            )
+            raise not_of_an_edit(self.folder, self.document, ", ".join(never))
         if gone := self.results.missing(needed):
             what = f"the store {self.store.location} no longer holds {', '.join(gone)} of {self.folder}"
             raise InputError(f"{what}; run it again.")
@@ -175,6 +172,12 @@ def read_run(folder: Path) -> dict[str, Any]:
     if not (folder / RUN_FILE).is_file():
         raise InputError(f"{folder} is not the output folder of a run: it has no {RUN_FILE}.")
     return _read(folder / RUN_FILE, {"store", "scene", "params", "results"})
+
+
+def not_of_an_edit(folder: Path, document: Mapping[str, Any], what: str) -> InputError:
+    """What to say where an edited run is asked for something that only its source has. document: its run.json."""
+    source = document["edit"]["source"]
+    return InputError(f"{folder} is an edited run, which has no {what} of its own; take its source, {source}.")
 
 
 def open_finished(folder: str | Path, store: Store | None = None) -> FinishedRun:

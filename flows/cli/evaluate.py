@@ -37,7 +37,7 @@ from ss_flow.flows.evaluate import (
     on_points,
     scan_truth,
 )
-from ss_flow.flows.results import FinishedRun, read_run
+from ss_flow.flows.results import FinishedRun, not_of_an_edit, read_run
 from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.capture.scene import open_scene
@@ -218,7 +218,10 @@ def _metrics(found: Mapping[str, Metrics]) -> dict[str, dict[str, float]]:
 
 
 def _of_views(folder: Path) -> dict[str, dict[str, float]]:
-    metrics = {stage: values for stage, values in read_run(folder)["metrics"].items() if stage != "novel_view"}
+    document = read_run(folder)
+    if "edit" in document:
+        raise not_of_an_edit(folder, document, "metrics")
+    metrics = {stage: values for stage, values in document["metrics"].items() if stage != "novel_view"}
     if not metrics:
         raise InputError(f"{folder} was run on a capture without annotated views; there is nothing to measure by.")
     return metrics

@@ -140,6 +140,14 @@ def test_an_edited_run_is_exported_but_for_what_its_photos_do_not_show(warm):
         assert f"edited run, which has no masks of its own; take its source, {warm.out.resolve()}." in refused.err
 
 
+@pytest.mark.parametrize("protocol", ["views", "points", "objects"])
+def test_an_edited_run_is_not_measured(warm, protocol):
+    _, place = edit(warm)
+    refused = ss_flow("eval", place, "--protocol", protocol, "--cache", warm.store)
+    assert refused.code == 2 and "is an edited run, which has no" in refused.err
+    assert f"of its own; take its source, {warm.out.resolve()}." in refused.err
+
+
 def test_a_scene_that_the_store_no_longer_holds_is_refused(warm, tmp_path):
     script = tmp_path / "script.json"
     script.write_text('{"operations": []}')
