@@ -20,17 +20,19 @@ constexpr int64_t kChunk = 1024;  // Gaussians that are projected in one piece
 constexpr int kAhead = 8;         // so many entries ahead, splats are fetched into the cache
 constexpr int kStride = 4;        // blocks that get an entry at a time
 
-// What the blending reads: alpha = 2^(log2_opacity + dx (A dx + B dy) + C dy^2), d = pixel - mean; and the ellipse
-// where alpha reaches 1/255: half its width and height, the correlation of x and y, and sqrt(1 - correlation^2).
+// What the blending reads: alpha = 2^(log2_opacity + A (dx + shear dy)^2 + C dy^2), d = pixel - mean; A and C are below
+// zero. And the ellipse where alpha reaches 1/255: half its width and height, the correlation of x and y, and
+// sqrt(1 - correlation^2).
 struct alignas(64) Splat {
-    float u, v, A, B, C, log2_opacity;
+    float u, v, A, shear, C, log2_opacity;
     float color[3], z;
     int32_t label, row;
     float half_width, half_height, correlation, chord;
 };
 static_assert(sizeof(Splat) == 64, "sixteen splats are written as a transposed square");
 
-// Sums over the pixels for one splat in one band: moments 1, x, y, xx, xy, yy of dL/d(log alpha); dL/d(color); dL/dz.
+// Sums over the pixels for one splat in one band: moments 1, x, y, xx, xy, yy of dL/d(log alpha), where x stands for
+// dx + shear dy; dL/d(color); dL/dz.
 struct alignas(64) Sums {
     float value[16];
 };
@@ -111,7 +113,7 @@ inline void project_chunk(const Scene& s, const projection::View& view, int64_t 
         for (int k = 0; k < 16; ++k) row[k] = (int32_t)rows.at[k], label[k] = s.labels ? s.labels[rows.at[k]] : -1;
         const float half = -0.5f * projection::kLog2E;
         const V16 correlation = f.c01 / lanes::square_root(f.c00 * f.c11);
-        V16 fields[16] = {f.u, f.v, half * f.k00, 2 * half * f.k01, half * f.k11, f.log2_opacity,
+        V16 fields[16] = {f.u, f.v, half * f.kx, f.shear, half * f.ky, f.log2_opacity,
                           color[0], color[1], color[2], f.z, as_floats(label), as_floats(row),
                           half_width, half_height, correlation, f.chord};
         lanes::transpose(fields);

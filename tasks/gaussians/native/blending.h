@@ -86,8 +86,8 @@ struct Block {
 struct Touch {
     V16 raw, alpha;  // before and after the cuts at 0.99 and 1/255
     INLINE Touch of(const V16& column, const V16& row, const Splat& p) {
-        const V16 dx = column - p.u, dy = row - p.v;
-        const V16 exponent = dx * (dx * p.A + dy * p.B) + (dy * dy * p.C + p.log2_opacity);
+        const V16 dy = row - p.v, x = (column - p.u) + dy * p.shear;
+        const V16 exponent = x * (x * p.A) + (dy * dy * p.C + p.log2_opacity);
         Touch t;
         t.raw = lanes::exp2_lanes(exponent);
         t.alpha = where_less(exponent, splat(projection::kLog2MinAlpha), splat(0),
@@ -216,7 +216,7 @@ class Harvest {
     INLINE void add(Harvest& h, int32_t number, const Splat& p, const V16& d, const V16& weight, Sums* sums) {
         lanes::store(h.d_[h.count_], d);
         lanes::store(h.weight_[h.count_], weight);
-        h.dx_[h.count_] = h.x_ - p.u, h.dy_[h.count_] = h.y_ - p.v;
+        h.dx_[h.count_] = h.x_ - p.u, h.dy_[h.count_] = h.y_ - p.v, h.shear_[h.count_] = p.shear;
         h.number_[h.count_] = number;
         if (++h.count_ == 16) h.flush(sums);
     }
@@ -231,7 +231,8 @@ class Harvest {
         }
         for (int k = 0; k < 16; ++k) v[k] = lanes::load(d_[k]);
         lanes::transpose(v);
-        // Moments about the block's first pixel from the sums of rows and columns, then about the splat's mean.
+        // Moments about the block's first pixel from the sums of rows and columns, then sheared, then about the splat's
+        // mean.
         V16 row[4], along[4], m = splat(0), mx = splat(0), mxx = splat(0);
         for (int r = 0; r < 4; ++r) {
             row[r] = (v[4 * r] + v[4 * r + 1]) + (v[4 * r + 2] + v[4 * r + 3]);
@@ -242,12 +243,13 @@ class Harvest {
         mx = (along[0] + along[1]) + (along[2] + along[3]);
         const V16 my = row[1] + 2.0f * row[2] + 3.0f * row[3], myy = row[1] + 4.0f * row[2] + 9.0f * row[3];
         const V16 mxy = along[1] + 2.0f * along[2] + 3.0f * along[3];
-        const V16 dx = lanes::load(dx_), dy = lanes::load(dy_);
+        const V16 shear = lanes::load(shear_), dy = lanes::load(dy_), x = lanes::load(dx_) + shear * dy;
+        const V16 sx = mx + shear * my, sxy = mxy + shear * myy, sxx = mxx + shear * (mxy + sxy);
         out[0] = m;
-        out[1] = mx + dx * m;
+        out[1] = sx + x * m;
         out[2] = my + dy * m;
-        out[3] = mxx + dx * (mx + out[1]);
-        out[4] = mxy + dx * my + dy * out[1];
+        out[3] = sxx + x * (sx + out[1]);
+        out[4] = sxy + x * my + dy * out[1];
         out[5] = myy + dy * (my + out[2]);
         for (int k = 10; k < 16; ++k) out[k] = splat(0);
         lanes::transpose(out);
@@ -260,7 +262,7 @@ class Harvest {
 
   private:
     alignas(64) float d_[16][16] = {}, weight_[16][16] = {};
-    alignas(64) float towards_[4][16], dx_[16] = {}, dy_[16] = {};
+    alignas(64) float towards_[4][16], dx_[16] = {}, dy_[16] = {}, shear_[16] = {};
     int32_t number_[16];
     float x_, y_;
     int count_ = 0;

@@ -53,7 +53,7 @@ struct Footprint {
     V16 V[3][3], T[2][3];               // V = R rotation diag(scale), T = J V
     V16 j00, j02, j11, j12;             // the Jacobian J; j01 = j10 = 0
     V16 u, v, c00, c01, c11;            // screen mean and covariance
-    V16 k00, k01, k11;                  // its inverse
+    V16 shear, kx, ky;                  // its inverse, as kx (dx + shear dy)^2 + ky dy^2
     V16 chord;                          // sqrt(1 - correlation^2)
     V16 transparency;                   // 1 - opacity
     V16 log2_opacity;
@@ -109,7 +109,9 @@ inline Footprint project(const Scene& s, const View& view, const Rows& rows) {
     const V16 m12 = T[0][1] * T[1][2] - T[0][2] * T[1][1];
     const V16 det = (m01 * m01 + m02 * m02 + m12 * m12) + kDilation * (c00 + c11) + kDilation * kDilation;
     f.c00 = c00 + kDilation, f.c11 = c11 + kDilation;
-    f.k00 = f.c11 / det, f.k01 = -f.c01 / det, f.k11 = f.c00 / det;
+    // A sum of squares, too: far along a needle, the terms with dx^2, dx dy and dy^2 are millions of times as large as
+    // their sum. kx and ky are the inverse variances of x at a given y, and of y.
+    f.shear = -f.c01 / f.c11, f.kx = f.c11 / det, f.ky = 1.0f / f.c11;
     f.chord = square_root(det / (f.c00 * f.c11));
     const V16 odds = exponential(-rows.column(s.opacity_logits, 1, 0));
     f.transparency = odds / (1.0f + odds);
@@ -123,24 +125,25 @@ inline Footprint project(const Scene& s, const View& view, const Rows& rows) {
 
 // What the blending sends back.
 struct ScreenGradient {
-    V16 g, gx, gy, gxx, gxy, gyy;  // moments of dL/d(log alpha) about the screen mean
+    V16 g, gx, gy, gxx, gxy, gyy;  // moments of dL/d(log alpha) about the screen mean, in x + shear y and y
     V16 color[3], z;
 };
 
 inline void backproject(const Scene& s, const View& view, const Rows& rows, const ScreenGradient& in,
                         const Gradients& out) {
     const Footprint f = project(s, view, rows);
-    // alpha = o exp(-q / 2), q = k00 dx^2 + 2 k01 dx dy + k11 dy^2, dx = pixel - mean.
-    const V16 du = f.k00 * in.gx + f.k01 * in.gy, dv = f.k01 * in.gx + f.k11 * in.gy;
+    // alpha = o exp(-q / 2), q = kx (dx + shear dy)^2 + ky dy^2, dx = pixel - mean.
+    const V16 du = f.kx * in.gx, dv = f.shear * du + f.ky * in.gy;
     rows.put(out.centers, 2, 0, du), rows.put(out.centers, 2, 1, dv);
-    // dL/dC = -K (dL/dK) K with dL/dK = -moments / 2.
-    const V16 a0 = f.k00 * in.gxx + f.k01 * in.gxy, a1 = f.k00 * in.gxy + f.k01 * in.gyy;
-    const V16 b0 = f.k01 * in.gxx + f.k11 * in.gxy, b1 = f.k01 * in.gxy + f.k11 * in.gyy;
-    const V16 g00 = 0.5f * (a0 * f.k00 + a1 * f.k01), g01 = 0.5f * (a0 * f.k01 + a1 * f.k11);
-    const V16 g11 = 0.5f * (b0 * f.k01 + b1 * f.k11);
+    // With S = [1 shear; 0 1], D = diag(kx, ky) and the moments P, the inverse of C = T T^t + dilation is S^t D S, and
+    // -dL/dK is S^-1 P S^-t / 2. So dL/dC = -K (dL/dK) K = S^t N S / 2 with N = D P D, and dL/dT = 2 (dL/dC) T =
+    // S^t N S T.
+    const V16 n00 = f.kx * f.kx * in.gxx, n01 = f.kx * f.ky * in.gxy, n11 = f.ky * f.ky * in.gyy;
     V16 dV[3][3], dj00 = splat(0), dj02 = splat(0), dj11 = splat(0), dj12 = splat(0);
     for (int k = 0; k < 3; ++k) {
-        const V16 dT0 = 2.0f * (g00 * f.T[0][k] + g01 * f.T[1][k]), dT1 = 2.0f * (g01 * f.T[0][k] + g11 * f.T[1][k]);
+        const V16 sheared = f.T[0][k] + f.shear * f.T[1][k];
+        const V16 dT0 = n00 * sheared + n01 * f.T[1][k];
+        const V16 dT1 = f.shear * dT0 + (n01 * sheared + n11 * f.T[1][k]);
         dV[0][k] = f.j00 * dT0, dV[1][k] = f.j11 * dT1, dV[2][k] = f.j02 * dT0 + f.j12 * dT1;
         dj00 = dj00 + dT0 * f.V[0][k], dj02 = dj02 + dT0 * f.V[2][k];
         dj11 = dj11 + dT1 * f.V[1][k], dj12 = dj12 + dT1 * f.V[2][k];
