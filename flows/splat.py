@@ -85,7 +85,8 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
         shown = shown_in(masks_refined)
     merged = merge_rounds(views, of_each(retrained), masks_refined, shown, params, 0)
     assembled = assemble(merged)
-    scene = otherwise(global_pass(views, assembled, masks_refined, params=settings.merge), lambda: assembled)
+    finished = global_pass(views, assembled, masks_refined, params=settings.merge, visibility=visibility)
+    scene = otherwise(finished, lambda: assembled)
     return {
         "reconstruct": of_each(reconstructed),
         "refine": masks_of_each,

@@ -49,12 +49,14 @@ def global_pass(
     masks: tuple[LabelMap, ...],
     *,
     params: MergeParams,
+    visibility: VisibilityParams = VisibilityParams(),
 ) -> Gaussians:
     """A last, short training of the whole scene with its background, on whole photos (spec P4, A22).
 
-    scene: as `assemble` gives it. masks: exclusive label maps of all views. Opacities are kept and nothing is split or
-    cloned. The loss is `global_objective`, `global_mask_weight` times the mask loss, and `side_weight` times what an
-    instance covers beside its surface (`side_views`); the guard of `merge_pair` holds here too.
+    scene: as `assemble` gives it. masks: exclusive label maps of all views. visibility: how far depths of one surface
+    may differ. Opacities are kept and nothing is split or cloned. The loss is `global_objective`, `global_mask_weight`
+    times the mask loss, and `side_weight` times what an instance covers beside its surface (`side_views`); the guard of
+    `merge_pair` holds here too.
 
     After `relabel_after` steps the scene shows what belongs to what better than the masks do. So a Gaussian whose place
     shows another instance in most views becomes that one's, and only then is each instance looked at from the side. In
@@ -63,7 +65,7 @@ def global_pass(
     if not len(scene) or not params.global_iterations:
         return scene
     ids = np.unique(scene.instance_id)
-    compared = views.compared(VisibilityParams())
+    compared = views.compared(visibility)
     seen = _whole_views(compared, masks, ids, params.crop.max_side)
     first = params.relabel_after if params.relabel_after < params.global_iterations else 0
     settings = TrainParams(

@@ -17,6 +17,7 @@ from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.shape import box_diagonal
+from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.splat import merge as module
 from ss_flow.tasks.splat.global_pass import assemble, global_pass
@@ -335,6 +336,18 @@ def test_the_last_pass_leaves_a_thing_no_gaussian_far_off_that_photos_show_as_an
     size = np.linalg.norm(np.ptp(built.ball.means, axis=0))
     assert np.linalg.norm(np.ptp(ball(replace(MERGE, relabel_after=0)), axis=0)) > 1.5 * size
     assert np.linalg.norm(np.ptp(ball(MERGE), axis=0)) < 1.2 * size
+
+
+def test_the_last_pass_compares_depths_as_it_is_told(built):
+    scene = assemble((built.background, built.box, built.ball))
+    params = replace(MERGE, global_iterations=20, relabel_after=10, guard_views=0)
+
+    def labels(**options) -> np.ndarray:
+        return global_pass(built.views, scene, built.scene.maps, params=params, **options).instance_id
+
+    usual = labels()
+    np.testing.assert_array_equal(labels(visibility=VisibilityParams()), usual)
+    assert not np.array_equal(labels(visibility=VisibilityParams(tau_depth=1e-6)), usual)
 
 
 def test_a_last_pass_of_few_steps_keeps_its_labels(built):
