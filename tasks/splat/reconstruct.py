@@ -204,7 +204,8 @@ def _trained(
     if not views:
         warn(f"No view shows instance {instance.instance_id} where it may be seen; it stays as its points.")
         return initial
-    extent = max(box_diagonal(surface.points), surface.spacing)
+    # Points that are all at one place are as large as their Gaussians.
+    extent = max(box_diagonal(surface.points), surface.spacing) or float(np.exp(initial.log_scales.max()))
     if params.extent == "cameras":
         extent = camera_extent([view.camera for view in views]) or extent
     result = train(

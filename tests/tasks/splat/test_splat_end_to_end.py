@@ -117,6 +117,15 @@ def test_a_weak_instance_and_one_without_masks_or_points_give_no_gaussians(built
         assert len(reconstruct(built.views, instance, params=TRAIN)) == 0
 
 
+@pytest.mark.parametrize(("instance_id", "rows"), [(2, [0]), (2, [0, 0, 0]), (0, [0])])
+def test_an_instance_of_points_at_one_place_is_trained(built, instance_id, rows):
+    whole = built.scene.instance(instance_id)
+    own = ("points", "colors", "point_confidence", "point_part")
+    few = replace(whole, **{name: getattr(whole, name)[rows] for name in own})
+    params = replace(TRAIN, min_iterations=20, max_iterations=20, tau_agree=0.0)
+    assert len(reconstruct(built.views, few, params=params))
+
+
 def test_a_merge_leaves_what_is_far_from_the_smaller_group_as_it_was(built):
     far = replace(built.box, means=built.box.means + np.float32(50), instance_id=np.full(len(built.box), 3, np.int32))
     merged = merge_pair(
