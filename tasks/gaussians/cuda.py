@@ -21,8 +21,8 @@ _CHANNELS = 32
 """So many channels gsplat blends at once at full speed."""
 _STRIP = 4
 """Rows of tiles whose contributions are listed at once: they may be a hundred for every pixel."""
-_MOST_ALPHA = 0.999
-"""gsplat's largest alpha."""
+_LEAST_ALPHA, _MOST_ALPHA = 1 / 255, 0.999
+"""gsplat's smallest alpha and its largest."""
 
 
 class DeviceCamera(NamedTuple):
@@ -116,7 +116,7 @@ def draw(
     strongest = alpha.new_zeros(len(gaussians))
     if settings.winners:
         with torch.no_grad():
-            _find_winners(splats, width, height, top, strongest)
+            _find_winners(splats, alpha, top, strongest)
     return Rendered(
         rgb=image[..., :3] + (1 - alpha)[..., None] * background,
         alpha=alpha,
@@ -148,11 +148,12 @@ def _projected(gaussians: GaussianTensors, camera: DeviceCamera) -> _Splats:
     return _Splats(means, conics, opacities[None], depths, radii, offsets, listed)
 
 
-def _find_winners(splats: _Splats, width: int, height: int, top: Tensor, strongest: Tensor) -> None:
+def _find_winners(splats: _Splats, alpha: Tensor, top: Tensor, strongest: Tensor) -> None:
     """Fill in each pixel's Gaussian of the largest weight ([H, W], -1 where none is) and each Gaussian's largest weight
-    ([N], 0 where it has none), from gsplat's lists of who contributes to a pixel."""
+    ([N], 0 where it has none), from gsplat's lists of who contributes to a pixel. alpha: [H, W] as rendered."""
     from gsplat import rasterize_to_indices_in_range
 
+    height, width = alpha.shape
     begins = torch.cat([splats.offsets.flatten(), splats.offsets.new_tensor([len(splats.listed)])]).long()
     columns = splats.offsets.shape[-1]
     for row in range(0, splats.offsets.shape[1], _STRIP):
@@ -163,7 +164,7 @@ def _find_winners(splats: _Splats, width: int, height: int, top: Tensor, stronge
         ends = begins[row * columns : (row + tiles.shape[1]) * columns + 1]
         listed = splats.listed[: int(ends[-1])]
         transmittance, heaviest = means.new_ones(size).flatten(), means.new_zeros(size).flatten()
-        best = top[rows].view(-1)
+        best, left = top[rows].view(-1), 1 - alpha[rows].flatten()
         for turn in range(-(-int(ends.diff().max()) // _TILE**2)):  # gsplat takes as many of a tile's list at once
             gaussian, pixel, _ = rasterize_to_indices_in_range(
                 turn, turn + 1, transmittance.reshape(1, *size), means, splats.conics, splats.opacities, width, size[0],
@@ -172,13 +173,13 @@ def _find_winners(splats: _Splats, width: int, height: int, top: Tensor, stronge
             if not len(gaussian):
                 continue
             gaussian, pixel = gaussian.long(), pixel.long()
-            alpha = _alpha(means[0, gaussian], splats.conics[0, gaussian], splats.opacities[0, gaussian], pixel, width)
+            each = _alpha(means[0, gaussian], splats.conics[0, gaussian], splats.opacities[0, gaussian], pixel, width)
             # Those of one pixel follow one another, front to back: their sums are differences of the sum over all.
-            thinned = torch.log1p(-alpha.double())
+            thinned = torch.log1p(-each.double())
             before = thinned.cumsum(0) - thinned
             first = torch.cat([pixel[:1] >= 0, pixel.diff() != 0]).nonzero()[:, 0]
             start = before.new_zeros(len(heaviest)).index_put((pixel[first],), before[first])
-            weight = transmittance[pixel] * torch.exp(before - start[pixel]).float() * alpha
+            weight = transmittance[pixel] * torch.exp(before - start[pixel]).float() * each
             strongest.scatter_reduce_(0, gaussian, weight, "amax")
             peak = torch.zeros_like(heaviest).scatter_reduce_(0, pixel, weight, "amax")
             place = torch.arange(len(pixel), device=pixel.device)
@@ -188,6 +189,9 @@ def _find_winners(splats: _Splats, width: int, height: int, top: Tensor, stronge
             best[better] = gaussian[leader[better]].int()
             heaviest = torch.maximum(heaviest, peak)
             transmittance *= torch.exp(torch.zeros_like(start).index_add_(0, pixel, thinned)).float()
+            # A pixel that ends at an opaque Gaussian does not tell: in the next part of the list, a faint one would
+            # pass. But no Gaussian is so faint that one more would not be seen in what is left.
+            transmittance *= transmittance > (1 + _LEAST_ALPHA / 2) * left
 
 
 def _alpha(means: Tensor, conics: Tensor, opacities: Tensor, pixel: Tensor, width: int) -> Tensor:

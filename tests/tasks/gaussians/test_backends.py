@@ -377,6 +377,31 @@ def test_through_gsplat_a_crop_shows_what_its_photo_shows_there(stand_in):
     assert 0 < int((part.radii > 0).sum()) < int((whole.radii > 0).sum())
 
 
+def test_through_gsplat_a_pixel_that_an_opaque_gaussian_ends_gives_no_weight_to_those_behind(stand_in):
+    """gsplat lists 256 at a time: with 255 in front, the opaque one is the last of a list and the faint ones begin the
+    next."""
+    camera, device, settings = (
+        Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4)),
+        torch.device("cpu"),
+        Settings((0, 0, 0), 0, 0, True),
+    )
+    renderer = renderer_on(torch.device("cuda"))
+    for front in (200, 255, 300):
+        opacity = torch.tensor([0.0117] * front + [0.9996, 0.9, 0.0117])
+        n = len(opacity)
+        gaussians = GaussianTensors(
+            means=torch.stack([torch.zeros(n), torch.zeros(n), torch.linspace(1, 2, n)], dim=1),
+            quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+            log_scales=torch.full((n, 3), np.log(5.0)),
+            opacity_logits=torch.logit(opacity),
+            sh=torch.zeros(n, 1, 3),
+        )
+        where = renderer.camera_on(device, camera)
+        drawn = renderer.draw(gaussians, where, torch.zeros(3), None, settings, torch.zeros(n, 2))
+        assert drawn.max_contribution.sum() == pytest.approx(float(drawn.alpha), abs=1e-5)
+        assert not drawn.max_contribution[front:].any()
+
+
 def test_a_backend_for_cuda_is_of_torch():
     assert isinstance(backend_for("cpu", 2), NativeBackend)
     assert isinstance(backend_for("meta", 2), TorchBackend)
