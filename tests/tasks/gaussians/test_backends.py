@@ -303,7 +303,8 @@ def trained(backend, params: TrainParams, seed: int = 1):
 def test_a_training_is_the_same_on_every_backend(backend):
     params = TrainParams(iterations=60, densify="none")
     ours, theirs = trained(NATIVE, params), trained(backend, params)
-    np.testing.assert_allclose(theirs.loss, ours.loss, rtol=10 * tolerance(backend))
+    # Rounding grows from step to step: native trainings that only round otherwise are a thousandth apart in the end.
+    np.testing.assert_allclose(theirs.loss, ours.loss, rtol=20 * tolerance(backend))
     assert len(ours.gaussians) == len(theirs.gaussians)
 
 
