@@ -17,8 +17,8 @@ from ss_flow.tasks.geometry.cameras import Camera
 
 _TILE = 16
 """Pixels on a side of gsplat's tiles."""
-_CHANNELS = 32
-"""So many channels gsplat blends at once at full speed."""
+_CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
+"""Of so many channels gsplat has kernels, up to the most that it blends at once at full speed."""
 _STRIP = 4
 """Rows of tiles whose contributions are listed at once: they may be a hundred for every pixel."""
 _LEAST_ALPHA, _MOST_ALPHA = 1 / 255, 0.999
@@ -106,10 +106,10 @@ def draw(
         channels.append((labels[:, None] == torch.arange(settings.num_labels, device=labels.device)).float())
     drawn = [
         rasterize_to_pixels(
-            splats.means, splats.conics, some[None], splats.opacities, width, height, _TILE, splats.offsets,
+            splats.means, splats.conics, _padded(some)[None], splats.opacities, width, height, _TILE, splats.offsets,
             splats.listed,
         )
-        for some in torch.cat(channels, dim=1).split(_CHANNELS, dim=1)
+        for some in torch.cat(channels, dim=1).split(_CHANNELS[-1], dim=1)
     ]  # fmt: skip
     image, alpha = torch.cat([images[0] for images, _ in drawn], dim=-1), drawn[0][1][0, :, :, 0]
     top = torch.full((height, width), -1, dtype=torch.int32, device=alpha.device)
@@ -121,12 +121,18 @@ def draw(
         rgb=image[..., :3] + (1 - alpha)[..., None] * background,
         alpha=alpha,
         depth=image[..., 3],
-        label_masks=image[..., 4:].permute(2, 0, 1),
+        label_masks=image[..., 4 : 4 + settings.num_labels].permute(2, 0, 1),
         top_contributor=top,
         radii=torch.where(in_view, splats.radii[0].amax(dim=-1), 0).float(),
         max_contribution=strongest,
         center_gradient=center_gradient,
     )
+
+
+def _padded(channels: Tensor) -> Tensor:
+    """[N, C] with channels of zeros up to a number that gsplat has a kernel for; some versions of it do not pad."""
+    count = channels.shape[1]
+    return torch.nn.functional.pad(channels, (0, next(known for known in _CHANNELS if known >= count) - count))
 
 
 def _projected(gaussians: GaussianTensors, camera: DeviceCamera) -> _Splats:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 
 LIMIT, END, CLIP = 1 / 255, 1e-4, 0.999
+KERNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
+"""Of so many channels; gsplat 1.5.3 pads others itself, later versions refuse them."""
 
 
 def fully_fused_projection(
@@ -95,7 +97,7 @@ def rasterize_to_pixels(
     means2d, conics, colors, opacities, image_width, image_height, tile_size, isect_offsets, flatten_ids,
     backgrounds=None, masks=None, packed=False, absgrad=False,
 ):  # fmt: skip
-    assert colors.shape[:2] == means2d.shape[:2] and backgrounds is None
+    assert colors.shape[:2] == means2d.shape[:2] and colors.shape[2] in KERNELS and backgrounds is None
     rows = flatten_ids[: means2d.shape[1]].long()
     alpha = _alphas(means2d, conics, opacities, rows, image_width, image_height)
     left = torch.cumprod(1 - alpha, dim=1)
