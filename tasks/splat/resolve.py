@@ -103,14 +103,13 @@ def _painted(
     for instance in instances:
         if instance.instance_id == 0:
             continue
-        for row, view in enumerate(instance.views):
+        for row, (view, area) in enumerate(zip(instance.views, instance.areas().tolist(), strict=True)):
             if maps[view].shape != tuple(instance.sizes[row][::-1]):
                 raise InputError(
                     f"Frame {view} is {maps[view].shape[1]} x {maps[view].shape[0]} pixels and the "
                     f"mask of instance {instance.instance_id} has {instance.sizes[row, 0]} x {instance.sizes[row, 1]}; "
                     "both must have one size."
                 )
-            area = int(instance.mask(row).sum())
             on_top = kept_on_top and instance.origin[row] != REFINED
             seen[view].append((on_top, -area, -instance.instance_id, instance, row))
     for view, layers in seen.items():
