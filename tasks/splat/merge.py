@@ -99,7 +99,7 @@ class MergeParams:
     """A refinement that lowers the PSNR by more than this, in dB, is undone."""
     guard_trade: NonNegative = 2.0
     """Such a loss is allowed where the other of the two gains more than so many times as much, both counted in these
-    limits: 0.06 of IoU for more than 6 dB. 0 = never."""
+    limits: 0.06 of IoU for more than 6 dB. 0 = never, nor where a limit is 0."""
     guard_views: Natural = 12
     """Views that the two are measured on; 0 = nothing is measured and no refinement undone, as in the paper."""
     crop: CropParams = CropParams()
@@ -298,8 +298,10 @@ def acceptable(old: Quality, new: Quality, params: MergeParams) -> bool:
     iou, psnr = new.iou - old.iou, new.psnr - old.psnr
 
     def allowed(change: float, limit: float, other: float, others_limit: float) -> bool:
-        paid = params.guard_trade and other * limit > params.guard_trade * -change * others_limit
-        return change >= -limit or bool(paid)
+        price = params.guard_trade * -change * others_limit
+        # A gain cannot be counted in limits of 0.
+        paid = params.guard_trade > 0 and others_limit > 0 and other * limit > price
+        return change >= -limit or paid
 
     return allowed(iou, params.guard_iou, psnr, params.guard_psnr) and allowed(
         psnr, params.guard_psnr, iou, params.guard_iou

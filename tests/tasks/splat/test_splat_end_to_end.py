@@ -282,6 +282,8 @@ def test_a_loss_is_accepted_within_its_limit_or_when_the_other_gains_much_more()
         assert acceptable(old, Quality(iou_, psnr_), always) == strict
     for limits in ({"guard_iou": 0.0}, {"guard_psnr": 0.0}, {"guard_iou": 0.0, "guard_psnr": 0.0}):
         assert not acceptable(old, Quality(0.7, 10.0), MergeParams(**limits))
+        assert not acceptable(old, Quality(0.7, 30.0), MergeParams(**limits))
+        assert not acceptable(old, Quality(1.0, 2.0), MergeParams(**limits))
         assert acceptable(old, old, MergeParams(**limits))
 
 
