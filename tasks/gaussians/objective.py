@@ -78,7 +78,7 @@ class Target:
     inside: Float32
     """[h, w] 1 where alpha should be 1."""
     judged: Float32
-    """[h, w] 1 / number of pixels where alpha counts."""
+    """[h, w] where alpha counts, 1 / number of the pixels that the mean of its error is over; 0 elsewhere."""
     depth: Float32
     """[h, w] 1 where unknown."""
     known: Float32

@@ -52,8 +52,8 @@ class MergeParams:
     global_mask_weight: NonNegative = 0.25
     """w_mask of the last pass."""
     side_weight: NonNegative = 0.05
-    """Weight, in the last pass, of the mean alpha where an instance, seen alone from anywhere, has no surface near; 0 =
-    only photos count."""
+    """Weight, in the last pass, of the alpha where an instance, seen alone from anywhere, has no surface near: summed
+    there, as a share of all pixels of such a view; 0 = only photos count."""
     side_views: Count = 24
     """Views of each instance that this is looked at from; no more in all than steps."""
     relabel_after: Natural = 100
