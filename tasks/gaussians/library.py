@@ -89,6 +89,22 @@ class StereoProblem(ctypes.Structure):
     )
 
 
+_SCENE, _IMAGES, _GRADIENTS, _PROBLEM = (
+    ctypes.POINTER(structure) for structure in (Scene, Images, Gradients, StereoProblem)
+)
+_INTERFACE: dict[str, tuple[Any, list[Any]]] = {
+    "ss_workspace": (_POINTER, []),
+    "ss_workspace_free": (None, [_POINTER]),
+    "ss_entries": (_INT64, [_POINTER]),
+    "ss_rasterize": (_INT, [_POINTER, _SCENE, _IMAGES, _INT]),
+    "ss_rasterize_backward": (_INT, [_POINTER, _SCENE, _IMAGES, _IMAGES, _GRADIENTS, _INT]),
+    "ss_photometric": (_INT, [_POINTER, *[_INT] * 3, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER, _INT]),
+    "ss_surface_loss": (None, [_INT64, *[_POINTER] * 9, _FLOAT, _FLOAT, _INT, *[_POINTER] * 3]),
+    "ss_adam": (None, [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE]),
+    "ss_patchmatch": (_INT, [_PROBLEM]),
+}
+"""What each function returns and takes."""
+
 BUILDS = ("avx512", "avx2", "baseline")
 """The instruction sets that the library is built for (on other processors than x86, the last one alone)."""
 
@@ -123,32 +139,9 @@ def library(name: str | None = None) -> Any:
             f"The CPU rasterizer {_place(name)} was built from other C++ sources than those in {_FOLDER / 'native'}; "
             "install the package again."
         )
-    by_reference = ctypes.POINTER
-    lib.ss_workspace.argtypes = []
-    lib.ss_workspace.restype = _POINTER
-    lib.ss_workspace_free.argtypes = [_POINTER]
-    lib.ss_workspace_free.restype = None
-    lib.ss_entries.argtypes = [_POINTER]
-    lib.ss_entries.restype = _INT64
-    lib.ss_rasterize.argtypes = [_POINTER, by_reference(Scene), by_reference(Images), _INT]
-    lib.ss_rasterize.restype = _INT
-    lib.ss_rasterize_backward.argtypes = [
-        _POINTER,
-        by_reference(Scene),
-        by_reference(Images),
-        by_reference(Images),
-        by_reference(Gradients),
-        _INT,
-    ]
-    lib.ss_rasterize_backward.restype = _INT
-    lib.ss_photometric.argtypes = [_POINTER, *[_INT] * 3, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER, _INT]
-    lib.ss_photometric.restype = _INT
-    lib.ss_surface_loss.argtypes = [_INT64, *[_POINTER] * 9, _FLOAT, _FLOAT, _INT, *[_POINTER] * 3]
-    lib.ss_surface_loss.restype = None
-    lib.ss_adam.argtypes = [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE]
-    lib.ss_adam.restype = None
-    lib.ss_patchmatch.argtypes = [by_reference(StereoProblem)]
-    lib.ss_patchmatch.restype = _INT
+    for function, (gives, takes) in _INTERFACE.items():
+        declared = getattr(lib, function)
+        declared.restype, declared.argtypes = gives, takes
     return lib
 
 
