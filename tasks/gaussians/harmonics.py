@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Float64
+from ss_flow.tasks.geometry.sampling import sphere
 
 _SAMPLES = 32
 
@@ -47,10 +48,7 @@ def rotated(sh: Float32, rotation: Float64) -> Float32:
     from more directions than it has rows; it is exact to the rounding of float64.
     """
     degree = round(sh.shape[1] ** 0.5) - 1
-    turns = np.arange(_SAMPLES) * np.pi * (3 - np.sqrt(5))  # directions spread evenly over the sphere, on a spiral
-    height = 1 - (2 * np.arange(_SAMPLES) + 1) / _SAMPLES
-    radius = np.sqrt(1 - height**2)
-    directions = np.stack([radius * np.cos(turns), radius * np.sin(turns), height], axis=1)
+    directions = sphere(_SAMPLES)
     there, back = basis(degree, directions), basis(degree, directions @ rotation)
     turned = sh.astype(np.float64)
     for band in range(1, degree + 1):
