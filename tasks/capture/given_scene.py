@@ -10,7 +10,8 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians
-from ss_flow.tasks.gaussians.rasterize import NAMES, backend_identity
+from ss_flow.tasks.gaussians.native_pass import PARAMETERS
+from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.read_ply import read_gaussians
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
@@ -88,7 +89,8 @@ def _checked(scene: Gaussians, name: str) -> Gaussians:
     """Raises InputError unless there are Gaussians, and all of them can be drawn."""
     if not len(scene):
         raise InputError(f"{name} holds no Gaussians; give the PLY file of a trained scene.")
-    wrong = ~np.isfinite(np.concatenate([getattr(scene, n).reshape(len(scene), -1) for n in NAMES], axis=1)).all(axis=1)
+    numbers = np.concatenate([getattr(scene, key).reshape(len(scene), -1) for key in PARAMETERS], axis=1)
+    wrong = ~np.isfinite(numbers).all(axis=1)
     wrong |= ~scene.quaternions.any(axis=1)
     if wrong.any():
         raise InputError(

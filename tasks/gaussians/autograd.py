@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
-from ss_flow.tasks.gaussians.rasterize import NAMES, GaussianTensors, Rendered
+from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
+from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered
 from ss_flow.tasks.geometry.cameras import Camera
 
 
@@ -54,5 +54,5 @@ class _Rasterize(torch.autograd.Function):
         given = [None if t is None else np.ascontiguousarray(t.numpy()) for t in towards[:4]]
         out = ctx.done.backward(*given)
         ctx.centers += torch.from_numpy(out["centers"])
-        gradients = [torch.from_numpy(out[name]) for name in (*NAMES, "background")]
+        gradients = [torch.from_numpy(out[name]) for name in (*PARAMETERS, "background")]
         return (*gradients, None, None, None, None)

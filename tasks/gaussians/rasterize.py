@@ -17,18 +17,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Gaussians, Int32
+from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.device import VARIABLE, has_device, wanted
 from ss_flow.tasks.gaussians.library import instruction_set
-from ss_flow.tasks.gaussians.native_pass import Settings
+from ss_flow.tasks.gaussians.native_pass import PARAMETERS, Settings
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.processor import on_this_processor
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
-
-NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
 @dataclass
@@ -50,7 +48,7 @@ class GaussianTensors:
         return len(self.means)
 
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The five parameters in the order of `NAMES`."""
+        """The five parameters in the order of `PARAMETERS`."""
         return self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh
 
     @classmethod
@@ -63,23 +61,8 @@ class GaussianTensors:
                 torch.tensor(np.asarray(getattr(gaussians, name), np.float32), device=device).requires_grad_(
                     requires_grad
                 )
-                for name in NAMES
+                for name in PARAMETERS
             )
-        )
-
-    def to_gaussians(self, *, instance_id: Int32, instance_conf: Any, part_id: Int32) -> Gaussians:
-        """The artifact, with quaternions of unit length and the given labels ([N] each)."""
-        means, quaternions, log_scales, opacity_logits, sh = (t.detach().cpu().numpy().copy() for t in self.tensors())
-        quaternions /= np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
-        return Gaussians(
-            means,
-            quaternions,
-            log_scales,
-            opacity_logits,
-            sh,
-            instance_id,
-            np.asarray(instance_conf, np.float32),
-            part_id,
         )
 
 
@@ -204,7 +187,7 @@ def _check(gaussians: GaussianTensors, labels: Tensor | None, num_labels: int, c
     import torch
 
     n = len(gaussians.means)
-    for name, tensor, shape in zip(NAMES, gaussians.tensors(), ((3,), (4,), (3,), (), (None, 3)), strict=True):
+    for name, tensor, shape in zip(PARAMETERS, gaussians.tensors(), ((3,), (4,), (3,), (), (None, 3)), strict=True):
         fits = tensor.dim() == len(shape) + 1 and len(tensor) == n
         if not fits or any(s is not None and s != t for s, t in zip(shape, tensor.shape[1:], strict=True)):
             expected = ", ".join(["N", *("K" if s is None else str(s) for s in shape)])

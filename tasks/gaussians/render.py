@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
 from ss_flow.tasks.gaussians.initialise import SH_ZERO
-from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
-from ss_flow.tasks.gaussians.rasterize import NAMES, device_here
+from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
+from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.geometry.cameras import Camera
 
 OPAQUE_LOGIT = 20.0
@@ -63,8 +63,8 @@ def render(
     """
     if opaque:
         gaussians = replace(gaussians, opacity_logits=np.full(len(gaussians), OPAQUE_LOGIT, np.float32))
-    parameters = tuple(np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in NAMES)
-    for name, array in zip(NAMES, parameters, strict=True):
+    parameters = tuple(np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in PARAMETERS)
+    for name, array in zip(PARAMETERS, parameters, strict=True):
         if not np.isfinite(array).all():
             raise ValueError(f"{name} holds values that are not finite")
     labels = channels_of(gaussians.instance_id, label_ids) if len(label_ids) else None
@@ -98,7 +98,7 @@ def weights_by_id(gaussians: Gaussians, camera: Camera, ids: NDArray[np.integer]
     three channels hold three ids at once.
     """
     grey = replace(gaussians, sh=np.zeros((len(gaussians), 1, 3), np.float32))  # no colour is cut off at 0
-    parameters = tuple(np.ascontiguousarray(getattr(grey, name), np.float32) for name in NAMES)
+    parameters = tuple(np.ascontiguousarray(getattr(grey, name), np.float32) for name in PARAMETERS)
     weigh = _weigher(_device(grey), parameters, camera, Settings((0.0, 0.0, 0.0), 0, 0, winners=False))
     found = np.unique(ids[ids >= 0]).tolist()
     for start in range(0, len(found), 3):

@@ -15,7 +15,7 @@ from ss_flow.tasks.geometry.cameras import Camera
 def draw(
     device: str, parameters: Sequence[Float32], labels: Int32 | None, camera: Camera, settings: Settings
 ) -> Rendered:
-    """A rendering without gradients. parameters: in the order of `NAMES`. labels: [N], < 0 = none."""
+    """A rendering without gradients. parameters: in the order of `PARAMETERS`. labels: [N], < 0 = none."""
     with torch.no_grad():
         return _drawn(GaussianTensors(*(torch.tensor(a, device=device) for a in parameters)), labels, camera, settings)
 

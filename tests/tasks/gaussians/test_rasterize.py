@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from ss_flow.tasks.gaussians import library, native_pass
 from ss_flow.tasks.gaussians.library import BUILDS, Workspace
 from ss_flow.tasks.gaussians.library import library as native_library
-from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
+from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, backend_identity, device_here, rasterize
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.processor import INSTRUCTION_SETS, features
@@ -31,7 +31,6 @@ DEVICES = [
     pytest.param("cuda", marks=pytest.mark.skipif(device_here() != "cuda", reason="no CUDA with gsplat here")),
 ]
 IMAGES = ("rgb", "alpha", "depth", "label_masks")
-NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
 def camera_at(rng: np.random.Generator, width: int, height: int, cx: float | None = None) -> Camera:
@@ -89,7 +88,7 @@ def compare(gaussians, camera, *, device="cpu", labels=None, num_labels=0, degre
         exact_loss = exact_loss + (theirs[name] * weight.double()).sum()
     loss.backward()
     exact_loss.backward()
-    for name, a, b in zip(NAMES, there.tensors(), exact, strict=True):
+    for name, a, b in zip(PARAMETERS, there.tensors(), exact, strict=True):
         if float(b.grad.norm()) > 1e-6:
             assert relative(a.grad.cpu(), b.grad) < tolerance, (name, relative(a.grad.cpu(), b.grad))
         else:
@@ -395,7 +394,7 @@ def test_the_same_call_gives_the_same_bytes():
     assert seen[0] == seen[1]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PARAMETERS)
 def test_a_parameter_that_is_not_finite_is_refused(name):
     gaussians = one()
     getattr(gaussians, name).data.view(-1)[0] = float("nan")
