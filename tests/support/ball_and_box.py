@@ -7,7 +7,7 @@ from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, InstanceMasks, LabelMap, SceneUnit
 from ss_flow.tasks.gaussians.views import Views
-from ss_flow.tasks.geometry.cameras import backproject, camera_of, cameras_by_view
+from ss_flow.tasks.geometry.cameras import backproject, camera_of, cameras_by_view, looking
 from ss_flow.tasks.geometry.images import encode_png
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 8
@@ -70,13 +70,7 @@ class SmallScene:
 
 def _look_from(place: np.ndarray) -> np.ndarray:
     forward = np.array([0, 0, 0.15]) - place
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
-    return pose
+    return looking(place, forward / np.linalg.norm(forward), np.array([0, 0, 1.0]))
 
 
 def _cast(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, MaskSet, Visibility
-from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.cameras import camera_of, looking
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.masks.packing import pack_masks
 
@@ -29,12 +29,8 @@ def cameras(scale: float = 1.0) -> Cameras:
     for angle in np.arange(VIEWS) * 2 * np.pi / VIEWS:
         eye = np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), 1.6])
         forward = np.array([0, 0, 0.2]) - eye
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ eye * scale
+        pose = looking(eye, forward / np.linalg.norm(forward), np.array([0, 0, 1.0]))
+        pose[:3, 3] *= scale
         poses.append(pose)
     return Cameras(
         names=tuple(f"{k}" for k in range(VIEWS)),

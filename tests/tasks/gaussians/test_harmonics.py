@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
+import gaussian_reference as reference
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from ss_flow.tasks.gaussians.harmonics import basis, rotated
-
-_spec = importlib.util.spec_from_file_location("gaussian_reference", Path(__file__).with_name("reference.py"))
-assert _spec and _spec.loader
-reference = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(reference)
 
 
 def directions(count: int, seed: int = 0) -> np.ndarray:

@@ -5,10 +5,9 @@ Split&Splat, Sec. 3.2.1: 3DGS on photos that are black outside the masks. Sec. 3
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass, replace
-from pathlib import Path
 
+import gaussian_reference as reference
 import numpy as np
 import pytest
 import torch
@@ -27,10 +26,6 @@ from ss_flow.tasks.gaussians.trainer import TrainParams, TrainResult, train
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import camera_extent, camera_of
 from ss_flow.tasks.splat import global_pass, merge, reconstruct
-
-_spec = importlib.util.spec_from_file_location("gaussian_reference", Path(__file__).with_name("reference.py"))
-reference = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(reference)
 
 PAPER = settings.preset(Params(), "paper").splat
 W_MASK = 0.15

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import platform
 from dataclasses import replace
-from pathlib import Path
 
+import gaussian_reference as reference
 import numpy as np
 import pytest
 import torch
@@ -20,11 +19,6 @@ from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, backend_identity, device_here, rasterize
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.processor import INSTRUCTION_SETS, features
-
-_spec = importlib.util.spec_from_file_location("gaussian_reference", Path(__file__).with_name("reference.py"))
-assert _spec is not None and _spec.loader is not None
-reference = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(reference)
 
 DEVICES = [
     "cpu",

@@ -5,7 +5,7 @@ import pytest
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
-from ss_flow.tasks.geometry.cameras import Camera, camera_of
+from ss_flow.tasks.geometry.cameras import Camera, camera_of, looking
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.split.regions.graph_segmentation import Boundary, RegionGraph, boundaries, find_planes, surface_of
 from ss_flow.tasks.split.segment_rgbd import SegmentRgbdParams, segment_rgbd
@@ -14,12 +14,8 @@ WIDTH, HEIGHT, FOCAL = 320, 240, 290.0
 
 
 def cameras_at(eye, target) -> Cameras:
-    z = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3] = [x, np.cross(z, x), z]
-    pose[:3, 3] = -pose[:3, :3] @ np.array(eye, float)
+    forward = np.subtract(target, eye)
+    pose = looking(np.array(eye, float), forward / np.linalg.norm(forward), np.array([0, 0, 1.0]))
     return Cameras(
         ("view",),
         np.array([[WIDTH, HEIGHT]], np.int32),
