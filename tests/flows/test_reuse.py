@@ -103,6 +103,9 @@ def test_why_names_the_parameter_and_the_chain_from_it(warm):
     told = ss_flow("why", "propagate", "--cache", warm.store).out
     assert told.startswith("split.propagate: input visibility changed (5 of 5 items)")
     assert "split.visibility: parameter tau_depth 0.02 -> 0.05" in told
+    for step in ("reconstruct[1]", "global_pass"):
+        told = ss_flow("why", step, "--cache", warm.store).out
+        assert told.startswith(f"splat.{step}: parameter visibility.tau_depth 0.02 -> 0.05")
     reused = ss_flow("why", "dense", "--cache", warm.store).out
     assert reused.strip() == "split.dense: reused; nothing that it depends on changed"
 
