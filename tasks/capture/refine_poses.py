@@ -20,6 +20,10 @@ from ss_flow.tasks.ranges import Count, Positive
 
 _LEAST_POINTS = 100
 """Fewer common points say nothing about the poses of a whole capture."""
+_LEAST_SCALE = 1e-6
+"""Refinement starts from the given poses and hardly leaves their scale; a smaller one means that they do not differ."""
+_LEAST_PHOTOS = 3
+"""Fewer refined photos do not tell how their world lies in the given one."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,14 @@ def refined_cameras(
     """
     pycolmap = load_pycolmap()
 
+    def unrefined(why: str) -> Cameras:
+        if insist:
+            raise InputError(
+                f"the poses cannot be refined: {why}; leave --refine-poses out, or give the photos without poses."
+            )
+        warn(f"The given poses were not refined: {why}.")
+        return cameras
+
     def lens(photo: Features, row: int) -> tuple[tuple[float, ...], Any]:
         numbers = [*cameras.intrinsics[row].tolist()]
         camera = pycolmap.Camera(model="PINHOLE", width=photo.width, height=photo.height, params=numbers)
@@ -83,20 +95,21 @@ def refined_cameras(
         mapper.complete_and_merge_tracks(triangulating)
         mapper.filter_points(filtering)
         if model.num_points3D() < _LEAST_POINTS:
-            seen = f"only {model.num_points3D()} points are seen in common as the given poses would have it"
-            if insist:
-                raise InputError(
-                    f"the poses cannot be refined: {seen}; leave --refine-poses out, or give the photos without poses."
-                )
-            warn(f"The given poses were not refined: {seen}.")
-            return cameras
+            return unrefined(f"only {model.num_points3D()} points are seen in common as the given poses would have it")
         _adjust(pycolmap, model, poses=True, intrinsics=params.intrinsics)
         mapper.filter_points(filtering)
         if error <= params.last_error:
             break
         error = max(error / 2, params.last_error)
     mapper.end_reconstruction(False)
-    return _result(pycolmap, model, cameras, params)
+    rows = [number - 1 for number in sorted(model.reg_image_ids()) if _points(model, number) >= params.min_points]
+    if len(rows) < _LEAST_PHOTOS:
+        return unrefined(f"fewer than {_LEAST_PHOTOS} photos see {params.min_points} points in common with others")
+    poses = np.stack([np.vstack([model.image(row + 1).cam_from_world().matrix(), (0, 0, 0, 1)]) for row in rows])
+    onto_given = _similarity(poses, cameras.world_to_camera[rows])
+    if onto_given is None:
+        return unrefined("the cameras stand in one place, which tells no scale")
+    return _result(pycolmap, model, cameras, rows, onto_given)
 
 
 def _limits(pycolmap: Any, error: float, focal: float, seed: int) -> tuple[Any, Any]:
@@ -128,11 +141,9 @@ def _adjust(pycolmap: Any, model: Any, *, poses: bool, intrinsics: bool) -> None
     pycolmap.create_default_bundle_adjuster(options, scope, model).solve()
 
 
-def _result(pycolmap: Any, model: Any, given: Cameras, params: RefinePosesParams) -> Cameras:
-    rows = [number - 1 for number in sorted(model.reg_image_ids()) if _points(model, number) >= params.min_points]
+def _result(pycolmap: Any, model: Any, given: Cameras, rows: list[int], onto_given: Float64) -> Cameras:
     after = _median_error(model)
-    poses = np.stack([np.vstack([model.image(row + 1).cam_from_world().matrix(), (0, 0, 0, 1)]) for row in rows])
-    model.transform(pycolmap.Sim3d(_similarity(poses, given.world_to_camera[rows])))
+    model.transform(pycolmap.Sim3d(onto_given))
     world_to_camera, intrinsics = given.world_to_camera.copy(), given.intrinsics.copy()
     for row in rows:
         world_to_camera[row, :3] = model.image(row + 1).cam_from_world().matrix()
@@ -150,15 +161,17 @@ def _result(pycolmap: Any, model: Any, given: Cameras, params: RefinePosesParams
     )
 
 
-def _similarity(poses: Float64, given: Float64) -> Float64:
+def _similarity(poses: Float64, given: Float64) -> Float64 | None:
     """[3, 4] the similarity that brings cameras onto the given ones: its rotation from how they look, which also holds
-    where they stand in a line; its scale and place from where they stand.
+    where they stand in a line; its scale and place from where they stand. None where they stand in one place.
     """
     u, _, vt = np.linalg.svd(np.einsum("kji,kjl->il", given[:, :3, :3], poses[:, :3, :3]))
     rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     source, target = _centers(poses) @ rotation.T, _centers(given)
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     scale = (a * b).sum() / max((a * a).sum(), 1e-12)
+    if scale < _LEAST_SCALE:
+        return None
     return np.column_stack([scale * rotation, target.mean(axis=0) - scale * source.mean(axis=0)])
 
 

@@ -7,6 +7,7 @@ import pytest
 from generated_views import jittered, views
 
 from ss_flow.errors import InputError
+from ss_flow.tasks.capture import refine_poses
 from ss_flow.tasks.capture.features import Features, features
 from ss_flow.tasks.capture.matches import match
 from ss_flow.tasks.capture.refine_poses import RefinePosesParams, refined_cameras
@@ -101,3 +102,22 @@ def test_photos_without_common_points_are_refused(scene):
     photos, true, _ = scene
     with pytest.raises(InputError, match="only 0 points are seen in common"):
         refined_cameras(photos, true, ())
+
+
+@pytest.mark.parametrize("enough", [0, 1, 2])
+def test_poses_stay_where_too_few_photos_see_enough_points(scene, enough, monkeypatch):
+    photos, true, matches = scene
+    monkeypatch.setattr(refine_poses, "_points", lambda model, number: 30 if number <= enough else 29)
+    with pytest.raises(InputError, match="fewer than 3 photos see 30 points in common"):
+        refined_cameras(photos, true, matches)
+    with pytest.warns(UserWarning, match="The given poses were not refined: fewer than 3 photos see 30 points"):
+        kept = refined_cameras(photos, true, matches, insist=False)
+    assert kept is true
+
+
+def test_cameras_in_one_place_tell_no_scale(scene):
+    _, true, _ = scene
+    turned = true.world_to_camera.copy()
+    turned[:, :3, 3] = 0
+    assert refine_poses._similarity(true.world_to_camera, turned) is None
+    assert refine_poses._similarity(turned, turned) is None
