@@ -48,7 +48,7 @@ class CaptureParams:
     """Photos, poses, depth."""
 
     stride: Count = 1
-    """Take every n-th view of a posed capture (ScanNet is evaluated at 20)."""
+    """Take every n-th view, where views that are left out count too (ScanNet is evaluated at 20)."""
     depth: Literal["auto", "sensor", "mvs", "mono", "rendered"] = "auto"
     """Where depth comes from; "auto" is the sensor where there is one, else the scene of --scene where one is given
     ("rendered"), else several views (mvs)."""

@@ -68,6 +68,7 @@ def open_colmap(root: Path) -> SceneFiles:
             raise InputError(f"{folder} has no camera {view.camera}, which its image {view.file_name} refers to.")
     registered = set(photos)
     unregistered = [p for place in sorted({p.parent for p in photos}) for p in files_in(place) if p not in registered]
+    everything = sorted([*photos, *unregistered], key=lambda p: natural_key(p.as_posix()))
     sparse = next((p for p in (folder / "points3D.bin", folder / "points3D.txt") if p.is_file()), None)
     return SceneFiles(
         kind="colmap",
@@ -79,6 +80,7 @@ def open_colmap(root: Path) -> SceneFiles:
         poses=tuple(v.pose for v in views),
         sparse=sparse,
         skipped=tuple(p.stem for p in unregistered),
+        all_names=tuple(dict.fromkeys(p.stem for p in everything)),
     )
 
 

@@ -59,6 +59,7 @@ def open_nerfstudio(path: Path) -> SceneFiles:
         poses=poses,
         metric=bool(with_depth),
         skipped=missing,
+        all_names=tuple(Path(frame["file_path"]).stem for frame in listed),
     )
 
 

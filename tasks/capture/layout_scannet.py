@@ -70,6 +70,7 @@ def open_scannet(root: Path) -> SceneFiles:
         poses=tuple(poses),
         metric=True,
         skipped=tuple(skipped),
+        all_names=tuple(stem for stem, _ in photos),
     )
 
 
@@ -178,11 +179,12 @@ def open_sens(path: Path) -> SceneFiles:
     Raises InputError when the file is damaged or holds no usable view.
     """
     index = read_sens_index(path)
+    names = tuple(f"frame-{i:06d}" for i in range(len(index.camera_to_world)))
     poses, entries, skipped = [], [], []
     for i, matrix in enumerate(index.camera_to_world):
         pose = _pose(matrix, f"{path}, frame {i}")
         if pose is None:
-            skipped.append(f"frame-{i:06d}")
+            skipped.append(names[i])
         else:
             poses.append(pose)
             entries.append(i)
@@ -192,7 +194,7 @@ def open_sens(path: Path) -> SceneFiles:
         kind="sens",
         root=path.parent,
         name=path.stem,
-        names=tuple(f"frame-{i:06d}" for i in entries),
+        names=tuple(names[i] for i in entries),
         recording=path,
         entries=tuple(entries),
         depth_scale=index.depth_scale,
@@ -201,4 +203,5 @@ def open_sens(path: Path) -> SceneFiles:
         poses=tuple(poses),
         metric=True,
         skipped=tuple(skipped),
+        all_names=names,
     )

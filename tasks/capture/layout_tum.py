@@ -53,6 +53,7 @@ def open_tum(root: Path) -> SceneFiles:
         poses=tuple(_pose(track, root / "groundtruth.txt", photo) for photo, track, _ in kept),
         metric=True,
         skipped=tuple(skipped),
+        all_names=tuple(Path(words[0]).stem for _, words in photos),
     )
 
 

@@ -126,13 +126,18 @@ def _open_loose(path: Path) -> SceneFiles:
     photos = _one_of_each(files_in(path) or files_in(path / "images"))
     recordings = files_in(path, VIDEO_SUFFIXES | {".sens"})
     if photos:
+        folder, stems = photos[0].parent, {photo.stem for photo in photos}
+        unread = [file for file in files_in(folder, UNREAD_SUFFIXES) if file.stem not in stems]
+        called = {photo: photo.stem for photo in photos} | {file: file.name for file in unread}
+        listed = files_in(folder, PHOTO_SUFFIXES | UNREAD_SUFFIXES)
         return SceneFiles(
             kind="photos",
             root=path,
             name=path.resolve().name,
             names=tuple(p.stem for p in photos),
             photos=tuple(photos),
-            skipped=tuple(file.name for file in files_in(photos[0].parent, UNREAD_SUFFIXES)),
+            skipped=tuple(file.name for file in unread),
+            all_names=tuple(called[file] for file in listed if file in called),
         )
     if len(recordings) > 1:
         raise InputError(f"{path} holds {len(recordings)} recordings; give the path of one of them.")

@@ -99,6 +99,8 @@ class SceneFiles:
     """Whether 0 in them means "not annotated"; otherwise it is background."""
     skipped: tuple[str, ...] = ()
     """Views of the capture that are left out, for lack of a photo that can be read, a pose or a depth map."""
+    all_names: tuple[str, ...] = ()
+    """Names of all views, those left out at their places among the others; empty = `names`."""
 
     @property
     def place(self) -> Path:
@@ -116,12 +118,25 @@ class SceneFiles:
         return None if self.poses is None else np.array(self.poses, np.float64).reshape(-1, 4, 4)
 
     def every(self, stride: int) -> SceneFiles:
-        """Every `stride`-th view, from the first on (spec, row 1)."""
+        """Those of every `stride`-th view, from the first on, that are not left out (spec, row 1).
+
+        Views left out count, so that ScanNet's 1:20 is frames 0, 20, 40 ... wherever tracking was lost.
+        Raises InputError when none remains.
+        """
         if stride < 1:
             raise InputError(f"frame stride {stride} is not possible; it must be 1 or more.")
-        return self.pick(range(0, len(self.names), stride))
+        all_names = (self.all_names or self.names)[::stride]
+        chosen = set(all_names)
+        views = [i for i, name in enumerate(self.names) if name in chosen]
+        if self.names and not views:
+            raise InputError(
+                f"{self.root} has no view that can be used among every {stride} views (capture.stride); take another "
+                "stride."
+            )
+        skipped = tuple(name for name in self.skipped if name in chosen)
+        return replace(self.pick(views), all_names=all_names, skipped=skipped)
 
-    def pick(self, views: range | list[int]) -> SceneFiles:
+    def pick(self, views: list[int]) -> SceneFiles:
         """Only these views, in this order."""
         per_view = ("names", "photos", "entries", "valid", "depths", "lenses", "poses", "ready_masks", "ground_truth")
         kept: dict[str, Any] = {}

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture import ingest
 from ss_flow.tasks.capture.layout_colmap import read_points
@@ -155,6 +156,48 @@ def test_every_second_view_keeps_everything_aligned(tmp_path):
     assert scene.names == ("2", "11")
     assert [p.stem for p in (*scene.photos, *scene.depths, *scene.valid, *scene.ground_truth)] == ["2", "11"] * 4
     np.testing.assert_allclose(scene.world_to_camera, WORLD_TO_CAMERA[[0, 2]], atol=1e-9)
+
+
+@pytest.mark.parametrize("layout", ["scannet", "nerfstudio", "tum", "colmap", "sens", "photos"])
+def test_views_that_are_left_out_count_among_every_so_many(tmp_path, layout):
+    if layout == "sens":  # whose second frame is lost
+        place, names = made.sens(tmp_path / "a.sens", count=5), [f"frame-{i:06d}" for i in range(5)]
+    else:
+        place, names = getattr(made, layout)(tmp_path), ["2", "10", "11"]
+    if layout == "scannet":
+        np.savetxt(tmp_path / "pose" / "10.txt", np.full((4, 4), -np.inf))
+    elif layout == "nerfstudio":
+        (tmp_path / "images" / "10.png").unlink()
+    elif layout == "tum":
+        (tmp_path / "depth.txt").write_text((tmp_path / "depth.txt").read_text().replace("101.01", "101.03"))
+    elif layout == "colmap":
+        (tmp_path / "images" / "1.png").write_bytes((tmp_path / "images" / "2.png").read_bytes())
+        names = ["1", *names]
+    elif layout == "photos":
+        (tmp_path / "10.jpg").rename(tmp_path / "10.dng")
+    whole = open_scene(place)
+    (lost,) = whole.skipped
+    place_of_lost = names.index(Path(lost).stem)
+    assert [Path(name).stem for name in whole.all_names] == names
+    assert whole.every(1) == whole
+    for stride in (2, 3):
+        part = whole.every(stride)
+        assert part.names == tuple(name for name in names[::stride] if name != Path(lost).stem)
+        assert part.skipped == ((lost,) if place_of_lost % stride == 0 else ())
+
+
+def test_a_stride_that_meets_lost_views_only_is_refused(tmp_path):
+    made.scannet(tmp_path)
+    for name in ("2", "11"):
+        np.savetxt(tmp_path / "pose" / f"{name}.txt", np.full((4, 4), -np.inf))
+    with pytest.raises(InputError, match=r"has no view that can be used .*capture\.stride.*; take another"):
+        open_scene(tmp_path).every(2)
+
+
+def test_a_raw_file_beside_its_photo_is_no_view_that_is_left_out(tmp_path):
+    made.photos(tmp_path)
+    (tmp_path / "10.dng").write_bytes(b"")
+    assert open_scene(tmp_path).skipped == ()
 
 
 def test_opening_is_light_and_quick(tmp_path):
