@@ -44,6 +44,7 @@ from ss_flow.flows.measures import measures
 from ss_flow.flows.params import Params
 from ss_flow.sweep import rows_of
 from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.capture.scene_files import capture_name, named_after
 from ss_flow.tasks.deliver.output import check_place, check_writable
 
 BATCH_FILE = "batch.json"
@@ -281,18 +282,18 @@ def _found(patterns: Sequence[str], list_file: Path | None) -> list[Path]:
 
 
 def folder_names(scenes: Iterable[Path]) -> dict[Path, str]:
-    """A folder name for each scene: its own; where several have the same, with its ending, its parents' names, or at
-    last a number."""
+    """A folder name for each scene: its own, as `run` has it; where several have the same, with its ending, its
+    parents' names, or at last a number."""
     left = list(scenes)
     names: dict[Path, str] = {}
     for depth in range(1, max(len(scene.parts) for scene in left) + 1):
-        for last in (lambda scene: scene.stem, lambda scene: scene.name):
-            tried = {scene: "-".join([*scene.parts[1:][-depth:-1], last(scene)]) for scene in left}
+        for last in (capture_name, lambda scene: named_after(scene).name):
+            tried = {scene: "-".join([*named_after(scene).parts[1:][-depth:-1], last(scene)]) for scene in left}
             counts = Counter([*names.values(), *tried.values()])
             names |= {scene: name for scene, name in tried.items() if counts[name] == 1}
             left = [scene for scene in left if scene not in names]
     for scene in left:
-        numbered = (f"{scene.stem}-{number}" for number in itertools.count(2))
+        numbered = (f"{capture_name(scene)}-{number}" for number in itertools.count(2))
         names[scene] = next(name for name in numbered if name not in names.values())
     return names
 

@@ -21,7 +21,7 @@ from ss_flow.flows.cli.telling import hits_of, print_table, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.capture.scene_files import SceneFiles, capture_name
 from ss_flow.tasks.deliver.output import check_place
 from ss_flow.tasks.gaussians.read_ply import read_columns
 
@@ -37,7 +37,8 @@ class Run:
     """A folder of photos, a video, a COLMAP workspace, a nerfstudio transforms.json, a ScanNet export or .sens file, or
     a TUM RGB-D folder."""
     out: OptionalPath = None
-    """The folder to write; by default ss-flow-out/NAME of the capture."""
+    """The folder to write; by default ss-flow-out/NAME, the name of the folder, or of the file without its
+    ending; for a transforms.json, the name of its folder."""
     scene: OptionalPath = None
     """A splat (.ply) that was trained elsewhere from this capture, to be labelled in the place of a reconstruction; its
     Gaussians stay as they are."""
@@ -66,7 +67,7 @@ class Run:
             params = settings.apply(params, [f"capture.calibrate={self.calibrate}"])
         if self.refine_poses:
             params = settings.apply(params, ["capture.refine_poses=always"])
-        out = self.out or Path("ss-flow-out") / self.capture.resolve().stem
+        out = self.out or Path("ss-flow-out") / capture_name(self.capture)
         scene = open_scene(self.capture, self.masks, self.hints, self.correct)
         if self.scene is not None:
             read_columns(self.scene)  # what is no PLY is refused before anything is computed

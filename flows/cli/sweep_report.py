@@ -17,6 +17,7 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.flows.cli.telling import plan_in_words, print_table, would_run
 from ss_flow.flows.measures import HEADLINE
 from ss_flow.sweep import Row
+from ss_flow.tasks.capture.scene_files import named_after
 
 Document = Mapping[str, Any]
 """A row of sweep.json."""
@@ -54,7 +55,7 @@ def short_names(names: Sequence[str]) -> list[str]:
 def scene_names(rows: Sequence[Document]) -> dict[str, str]:
     """A short name for each scene: the last part of its path, where no other one ends alike."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    last = [Path(scene).name for scene in scenes]
+    last = [named_after(Path(scene)).name for scene in scenes]
     return {scene: name if last.count(name) == 1 else scene for scene, name in zip(scenes, last, strict=True)}
 
 

@@ -24,6 +24,7 @@ from ss_flow.tasks.deliver.compressed import Thumbnail, data_uri
 from ss_flow.tasks.deliver.export.content import morton_order
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.palette import instance_colors
+from ss_flow.tasks.deliver.report import title_of
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 
@@ -45,7 +46,7 @@ def write_page(file: Path, run: FinishedRun) -> None:
     start = start_view(cameras, scene.means)
     objects = [(entry, pictured.get(entry["id"])) for entry in run.instances["instances"]]
     objects.sort(key=lambda of: -of[1].share if of[1] else 0.0)
-    title = PurePath(str(run.document["scene"])).name or "scene"
+    title = title_of(PurePath(str(run.document["scene"])))
     write_atomically(file, page_html(title, scene, start, objects))
 
 

@@ -73,7 +73,6 @@ def open_colmap(root: Path) -> SceneFiles:
     return SceneFiles(
         kind="colmap",
         root=root,
-        name=root.name,
         names=tuple(p.stem for p in photos),
         photos=photos,
         lenses=tuple(lenses[v.camera] for v in views),

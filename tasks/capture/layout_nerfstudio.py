@@ -49,7 +49,6 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     return SceneFiles(
         kind="nerfstudio",
         root=root,
-        name=root.resolve().name,
         names=tuple(p.stem for p in photos),
         photos=photos,
         valid=tuple(_listed(root, f.get("mask_path"), path) for f in frames),

@@ -60,7 +60,6 @@ def open_scannet(root: Path) -> SceneFiles:
     return SceneFiles(
         kind="scannet",
         root=root,
-        name=root.resolve().name,
         names=tuple(stem for stem, _ in kept),
         photos=tuple(photo for _, photo in kept),
         depths=None if depths is None else tuple(depths[stem] for stem, _ in kept),
@@ -193,7 +192,6 @@ def open_sens(path: Path) -> SceneFiles:
     return SceneFiles(
         kind="sens",
         root=path.parent,
-        name=path.stem,
         names=tuple(names[i] for i in entries),
         recording=path,
         entries=tuple(entries),

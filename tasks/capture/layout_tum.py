@@ -44,7 +44,6 @@ def open_tum(root: Path) -> SceneFiles:
     return SceneFiles(
         kind="tum",
         root=root,
-        name=root.resolve().name,
         names=tuple(p.stem for p in files),
         photos=files,
         depths=tuple(root / depth[0] for _, _, depth in kept if depth is not None) if depths is not None else None,

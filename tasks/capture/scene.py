@@ -105,7 +105,7 @@ def _open_layout(path: Path) -> SceneFiles:
         raise InputError(f"{path} does not exist; give the path of a scene: {ACCEPTED}.")
     if path.is_file():
         if path.suffix.lower() in VIDEO_SUFFIXES:
-            return SceneFiles(kind="video", root=path.parent, name=path.stem, recording=path)
+            return SceneFiles(kind="video", root=path.parent, recording=path)
         if path.suffix.lower() == ".sens":
             return open_sens(path)
         if path.name == "transforms.json":
@@ -133,7 +133,6 @@ def _open_loose(path: Path) -> SceneFiles:
         return SceneFiles(
             kind="photos",
             root=path,
-            name=path.resolve().name,
             names=tuple(p.stem for p in photos),
             photos=tuple(photos),
             skipped=tuple(file.name for file in unread),

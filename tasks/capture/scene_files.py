@@ -58,8 +58,6 @@ class SceneFiles:
     kind: str
     """"photos", "video", "colmap", "nerfstudio", "scannet", "sens" or "tum"."""
     root: Path
-    name: str
-    """Name of the folder, or the file's stem."""
     opened: Path | None = None
     """What the user named: the folder, or the video or JSON file in it."""
     names: tuple[str, ...] = ()
@@ -103,6 +101,11 @@ class SceneFiles:
     """Names of all views, those left out at their places among the others; empty = `names`."""
 
     @property
+    def name(self) -> str:
+        """What the capture is called."""
+        return capture_name(self.place)
+
+    @property
     def place(self) -> Path:
         """What its runs are recorded under."""
         return self.opened or self.root
@@ -144,6 +147,18 @@ class SceneFiles:
             values = getattr(self, name)
             kept[name] = tuple(values[i] for i in views) if values else values
         return replace(self, **kept)
+
+
+def named_after(path: Path) -> Path:
+    """The folder or file that a capture is called after, resolved: for a transforms.json, as all of nerfstudio's
+    captures have one, its folder."""
+    return (path.parent if path.name == "transforms.json" else path).resolve()
+
+
+def capture_name(path: Path) -> str:
+    """What a capture is called: a folder by its name, a file by its stem."""
+    place = named_after(path)
+    return place.name if place.is_dir() else place.stem
 
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:

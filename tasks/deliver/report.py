@@ -47,7 +47,7 @@ _METRIC_NAMES = {
 }
 _STAGES = {"split": "After Split", "refined": "Refined masks", "splat": "After Splat", "novel_view": "Novel views"}
 _BINS = 10
-_FOLDERS_OF_PHOTOS = ("color", "frames", "images", "input", "photos", "rgb")
+_OF_ANY_CAPTURE = ("color", "frames", "images", "input", "photos", "rgb", "transforms.json")
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def report_html(
         key=lambda e: (e["kind"] == "stuff", -shares.get(e["id"], 0.0), -e["num_points"]),
     )
     return environment.from_string(template).render(
-        scene=_title(PurePath(str(run.get("scene") or ""))),
+        scene=title_of(PurePath(str(run.get("scene") or ""))),
         status=run.get("status") or "unknown",
         models=_flat(run.get("models") or {}),
         metrics=_metrics(run.get("metrics") or {}),
@@ -160,9 +160,9 @@ def report_html(
     )
 
 
-def _title(scene: PurePath) -> str:
-    """What a capture is called: its folder; where that says only what lies in it, the folder around."""
-    return (scene.parent.name if scene.name.lower() in _FOLDERS_OF_PHOTOS else "") or scene.name or "scene"
+def title_of(scene: PurePath) -> str:
+    """What a capture is called for people: its last name; where many captures have that one, the folder around it."""
+    return (scene.parent.name if scene.name.lower() in _OF_ANY_CAPTURE else "") or scene.name or "scene"
 
 
 def _views(pictures: Sequence[Picture]) -> tuple[list[dict[str, Any]], list[dict[str, str]]]:

@@ -221,6 +221,9 @@ def test_a_step_that_needs_more_memory_than_the_run_may_use_is_refused(warm, den
         (["/x/v.1", "/x/v.2"], ["v.1", "v.2"]),
         (["/x/room", "/room"], ["x-room", "room"]),
         (["/x-room", "/x/room", "/y/room"], ["x-room", "room-2", "y-room"]),
+        (["/x/kitchen/transforms.json", "/x/office/transforms.json"], ["kitchen", "office"]),
+        (["/x/room/transforms.json", "/y/room/transforms.json"], ["x-room", "y-room"]),
+        (["/x/room/transforms.json", "/x/room"], ["room-2", "room-3"]),
     ],
 )
 def test_scenes_of_one_name_get_folders_of_their_own(scenes, names):

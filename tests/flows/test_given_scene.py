@@ -67,9 +67,7 @@ def test_the_folder_is_that_of_a_run_and_every_value_of_the_given_scene_is_in_it
     [(True, True, "sensor"), (True, False, "rendered"), (False, True, "sensor"), (False, False, "mvs")],
 )
 def test_depth_is_the_sensors_where_there_is_one_then_the_given_scenes(given, sensor, source):
-    scene = SceneFiles(
-        "scannet", Path(), "a", given_scene=Path("a.ply") if given else None, depths=() if sensor else None
-    )
+    scene = SceneFiles("scannet", Path(), given_scene=Path("a.ply") if given else None, depths=() if sensor else None)
     assert depth_source(scene, CaptureParams()) == source
 
 

@@ -7,12 +7,14 @@ import re
 import shutil
 from pathlib import Path
 
+import capture_folders as made
 import cv2
 import numpy as np
 import pytest
 from tiny_runs import SHORT, run_tiny, ss_flow, write_room
 
 from ss_flow.cache.store import Store
+from ss_flow.flows.cli import run as run_module
 from ss_flow.flows.generated import RoomParams
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians.read_ply import read_columns
@@ -36,6 +38,21 @@ def test_a_run_writes_what_the_readme_lists_and_nothing_else(tiny):
         "scene_labeled.ply",
     ]
     assert not list(tiny.out.parent.glob(".out.*"))
+
+
+def test_by_default_the_output_is_named_after_the_folder_the_file_or_a_transforms_jsons_folder(tmp_path, monkeypatch):
+    made.photos(tmp_path / "room 2024.05.01")
+    made.nerfstudio(tmp_path / "kitchen")
+    made.video(tmp_path / "walk.avi", count=2)
+    places: list[Path] = []
+    monkeypatch.setattr(run_module, "run_scene", lambda scene, out, *others, **options: places.append(out))
+    for capture in ("room 2024.05.01", "kitchen", "kitchen/transforms.json", "walk.avi"):
+        run_module.Run(tmp_path / capture).run()
+    assert [str(place) for place in places] == [
+        "ss-flow-out/room 2024.05.01",
+        *["ss-flow-out/kitchen"] * 2,
+        "ss-flow-out/walk",
+    ]
 
 
 def test_the_scene_is_a_standard_splat_and_the_labelled_one_has_the_same_rows(tiny):

@@ -13,7 +13,7 @@ from ss_flow.task import FileRef
 from ss_flow.tasks.capture import ingest
 from ss_flow.tasks.capture.layout_colmap import read_points
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.capture.scene_files import natural_key
+from ss_flow.tasks.capture.scene_files import capture_name, natural_key
 
 SHARED = Path(__file__).parents[3] / ".." / "shared" / "data"
 WORLD_TO_CAMERA = np.stack([np.linalg.inv(made.pose(i)) for i in range(3)])
@@ -198,6 +198,21 @@ def test_a_raw_file_beside_its_photo_is_no_view_that_is_left_out(tmp_path):
     made.photos(tmp_path)
     (tmp_path / "10.dng").write_bytes(b"")
     assert open_scene(tmp_path).skipped == ()
+
+
+@pytest.mark.parametrize("layout", ["photos", "scannet", "nerfstudio", "tum", "colmap"])
+def test_a_folder_gives_its_capture_its_whole_name(tmp_path, layout, monkeypatch):
+    root = getattr(made, layout)(tmp_path / "room 2024.05.01")
+    monkeypatch.chdir(root)
+    assert open_scene(root).name == open_scene(Path()).name == capture_name(root) == "room 2024.05.01"
+
+
+def test_a_file_gives_its_capture_its_stem_and_a_transforms_json_its_folders_name(tmp_path, monkeypatch):
+    assert open_scene(made.video(tmp_path / "walk.1.avi", count=2)).name == "walk.1"
+    folder = made.nerfstudio(tmp_path / "kitchen")
+    monkeypatch.chdir(folder)
+    assert open_scene(folder / "transforms.json").name == open_scene(Path("transforms.json")).name == "kitchen"
+    assert open_scene(folder).name == "kitchen"
 
 
 def test_opening_is_light_and_quick(tmp_path):

@@ -103,6 +103,7 @@ def test_metrics_read_as_words_and_counts_as_whole_numbers():
 def test_of_a_scenes_place_only_its_name_is_shown():
     html = report_html({**RUN, "scene": "/home/someone/captures/kitchen"}, pictures=())
     assert "<h1>kitchen</h1>" in html and "someone" not in html
+    assert "<h1>kitchen</h1>" in report_html({**RUN, "scene": "/captures/kitchen/transforms.json"}, pictures=())
 
 
 def test_warnings_are_told_once():

@@ -217,7 +217,7 @@ def test_the_pairs_of_lerfs_scenes_are_counted_as_published(tmp_path: Path, scen
 
 
 def test_a_scenes_labels_are_found_in_it_or_beside_it_as_in_lerf_ovs(tmp_path: Path) -> None:
-    scene = SceneFiles("colmap", tmp_path / "lerf_ovs" / "figurines", "figurines", names=("a",))
+    scene = SceneFiles("colmap", tmp_path / "lerf_ovs" / "figurines", names=("a",))
     scene.root.mkdir(parents=True)
     with pytest.raises(InputError, match="name their folder with --truth"):
         labels_of(scene)
