@@ -49,11 +49,12 @@ def open_scene(
     scene = replace(_open_layout(path), opened=path)
     if scene.kind != "video":
         _check_files(scene)
-    in_folder = path.is_dir() and scene.kind != "video"
+    # What lies beside a video or a .sens file that is named itself may belong to another one.
+    in_folder = scene.kind != "video" and (path.is_dir() or scene.kind == "nerfstudio")
     if masks is not None and hints is not None:
         raise InputError(f"{masks} and {hints} cannot be used together; give masks or hints.")
     if masks is None and hints is None and in_folder:
-        masks, hints = _found_masks(path)
+        masks, hints = _found_masks(scene.root)
     if scene.kind == "video" and (given := masks or hints or corrections):
         raise InputError(f"{given} cannot go with a video, whose frames have no names yet; extract the frames first.")
     if corrections is not None:
@@ -69,14 +70,14 @@ def open_scene(
             f"{masks} is no folder and no .json file; ready-made instance masks come as a folder of images named by "
             "view, or as a COCO file."
         )
-    if in_folder and (path / "instance").is_dir():
+    if in_folder and (scene.root / "instance").is_dir():
         scene = replace(
             scene,
-            ground_truth=_some_by_name(path / "instance", scene.names),
-            zero_is_void=not _names_zero(path / "instances.json"),
+            ground_truth=_some_by_name(scene.root / "instance", scene.names),
+            zero_is_void=not _names_zero(scene.root / "instances.json"),
         )
-    if in_folder and (path / "valid").is_dir() and not any(scene.valid):
-        scene = replace(scene, valid=_some_by_name(path / "valid", scene.names))
+    if in_folder and (scene.root / "valid").is_dir() and not any(scene.valid):
+        scene = replace(scene, valid=_some_by_name(scene.root / "valid", scene.names))
     if not scene.valid:
         scene = replace(scene, valid=(None,) * len(scene.names))
     return scene

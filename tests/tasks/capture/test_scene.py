@@ -1,5 +1,6 @@
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import capture_folders as made
@@ -149,6 +150,17 @@ def test_ready_masks_are_found_beside_any_layout_or_where_they_are_said_to_be(tm
     assert len(open_scene(tmp_path / "scene", masks=tmp_path / "elsewhere").ready_masks) == 3
     (tmp_path / "elsewhere").rename(tmp_path / "scene" / "instance_masks")
     assert open_scene(tmp_path / "scene").ready_masks[1].name == "10.png"
+
+
+def test_a_transforms_json_brings_what_lies_beside_it_as_its_folder_does(tmp_path):
+    made.nerfstudio(tmp_path)
+    for folder in ("instance", "valid", "instance_masks"):
+        for name in made.NAMES:
+            made.write(tmp_path / folder / f"{name}.png", np.zeros((made.HEIGHT, made.WIDTH), np.uint16))
+    (tmp_path / "instances.json").write_text('{"0": "table"}')
+    folder, file = open_scene(tmp_path), open_scene(tmp_path / "transforms.json")
+    assert file.ready_masks and file.ground_truth and all(file.valid) and not file.zero_is_void
+    assert replace(file, opened=tmp_path) == folder
 
 
 def test_every_second_view_keeps_everything_aligned(tmp_path):
