@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ss_flow.errors import InputError
@@ -171,7 +171,12 @@ def _known_names(scene: SceneFiles) -> tuple[str, ...] | None:
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> tuple[Frame, ...]:
     if scene.kind == "video":
         assert scene.recording is not None
-        return recordings.video_frames(video=reference(scene.recording), params=params.video)
+        sparser = replace(
+            params.video,
+            max_frames=-(-params.video.max_frames // params.stride),
+            stride=params.video.stride * params.stride,
+        )
+        return recordings.video_frames(video=reference(scene.recording), params=sparser)
     if scene.kind == "sens":
         assert scene.recording is not None
         return recordings.sens_frames(

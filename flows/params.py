@@ -48,7 +48,8 @@ class CaptureParams:
     """Photos, poses, depth."""
 
     stride: Count = 1
-    """Take every n-th view, where views that are left out count too (ScanNet is evaluated at 20)."""
+    """Take every n-th view, where views that are left out count too (ScanNet is evaluated at 20); of a video, one n-th
+    of the frames."""
     depth: Literal["auto", "sensor", "mvs", "mono", "rendered"] = "auto"
     """Where depth comes from; "auto" is the sensor where there is one, else the scene of --scene where one is given
     ("rendered"), else several views (mvs)."""

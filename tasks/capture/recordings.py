@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.running import progress
+from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame, UInt8
 from ss_flow.tasks.capture.ingest import IngestParams, frame_of, warn_of_skipped
@@ -25,7 +25,7 @@ class VideoParams:
     max_frames: Count = 120
     """The most frames that are taken, spread evenly over the video."""
     stride: Natural = 0
-    """Take one frame out of so many; 0 = as many as `max_frames` asks for."""
+    """Take one frame out of so many, or of more where `max_frames` would be exceeded; 0 = as many as that allows."""
     candidates: Count = 5
     """Out of each stride, so many frames are compared and the sharpest is taken."""
     min_sharpness: NonNegative = 0.3
@@ -48,7 +48,12 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
 
     where = str(video.path)
     total = _count_frames(where)
-    stride = params.stride or max(1, -(-total // params.max_frames))
+    stride = max(params.stride, -(-total // params.max_frames))
+    if 0 < params.stride < stride:
+        warn(
+            f"One frame out of {stride} is taken instead of one out of {params.stride}, since no more than "
+            f"{params.max_frames} are to be taken (capture.video.max_frames)."
+        )
     step = max(1, stride // max(1, params.candidates))
     reader = cv2.VideoCapture(where)
     best: list[tuple[float, int, Frame]] = []
@@ -72,7 +77,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
     warn_of_skipped(
         tuple(frame.name for sharpness, _, frame in best if sharpness < floor), "blurred beside the other frames"
     )
-    return tuple(kept[: params.max_frames])
+    return tuple(kept)
 
 
 def _count_frames(where: str) -> int:

@@ -55,6 +55,16 @@ def test_by_default_the_output_is_named_after_the_folder_the_file_or_a_transform
     ]
 
 
+def test_a_stride_thins_a_video_too(tmp_path):
+    video, store = made.video(tmp_path / "walk.avi"), tmp_path / "store"
+    until = ("--until", "video_frames", "--set", "capture.video.max_frames=10", "capture.video.min_sharpness=0")
+    counts = []
+    for further in ((), ("--set", "capture.stride=2"), ("--set", "capture.stride=2", "capture.video.stride=8")):
+        called = run_tiny(video, store, *until, *further)
+        counts.append(len(called.results()["video_frames"]))
+    assert counts == [10, 5, 3]
+
+
 def test_the_scene_is_a_standard_splat_and_the_labelled_one_has_the_same_rows(tiny):
     plain, labelled = (read_columns(tiny.out / name) for name in ("scene.ply", "scene_labeled.ply"))
     names = list(plain.dtype.names)

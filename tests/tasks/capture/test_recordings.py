@@ -31,6 +31,13 @@ def test_video_frames_are_few_and_small_when_asked(tmp_path):
     assert (frames[0].width, frames[0].height, frames[0].source_width) == (32, 24, 64)
 
 
+def test_a_stride_that_gives_too_many_frames_is_widened_over_the_whole_video_with_a_word(tmp_path):
+    video = ref(made.video(tmp_path / "a.avi"))
+    with pytest.warns(UserWarning, match="One frame out of 4 is taken instead of one out of 2, since no more than 10"):
+        frames = video_frames(video=video, params=VideoParams(max_frames=10, stride=2, candidates=4))
+    assert [f.name for f in frames] == [f"frame-{i:06d}" for i in range(1, 40, 4)]
+
+
 def test_a_sens_file_gives_its_photos_and_depth_by_entry(tmp_path):
     scene = open_scene(made.sens(tmp_path / "a.sens"))
     recording = ref(scene.recording)
