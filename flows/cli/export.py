@@ -171,7 +171,8 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
     digests = file_digests(run.store)
     names = run.results.one("cameras").names
     try:
-        photos = {photo.stem: photo.name for photo in open_scene(Path(run.document["scene"])).photos}
+        scene = open_scene(Path(run.document["scene"]))
+        photos = {name: f"{name}{photo.suffix}" for name, photo in zip(scene.names, scene.photos, strict=False)}
     except InputError:
         photos = {}
     files = [run.folder / "masks" / f"{name}.png" for name in names]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path, PureWindowsPath
+from collections.abc import Collection, Mapping
+from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -36,15 +36,16 @@ def coco_masks(
 ) -> tuple[MaskSet, ...]:
     """The masks of a COCO instance file, for each frame; those of one view may overlap.
 
-    names, lenses: of the capture's views. An image of the file is the view that has its file name's stem; a view that
-    the file does not list has no masks. Crowd regions, which stand for many objects at once, are left out. The masks
-    come in canonical order; `predicted_iou` is what the file gives as `predicted_iou` or `score`, else 1.
+    names, lenses: of the capture's views. An image of the file is the view that has its file name's stem, or its
+    path where views are called so (`scene_files.view_names`); a view that the file does not list has no masks. Crowd
+    regions, which stand for many objects at once, are left out. The masks come in canonical order; `predicted_iou` is
+    what the file gives as `predicted_iou` or `score`, else 1.
 
     Raises InputError when the file is not of this form, lists no view, or gives a mask that cannot be read or has not
     its photo's size.
     """
-    images, annotations = _contents(file.path)
     row = {name: i for i, name in enumerate(names)}
+    images, annotations = _contents(file.path, row.keys())
     if not row.keys() & images.keys():
         raise InputError(
             f"{file.path} lists no image named after a view; {names[0]}.jpg, for one, is expected among its file names."
@@ -69,8 +70,8 @@ def coco_masks(
     return tuple(result)
 
 
-def _contents(path: Path) -> tuple[dict[str, dict[str, Any]], dict[Any, list[dict[str, Any]]]]:
-    """The images of a COCO file by their stems, and its annotations, crowds left out, by their image's id."""
+def _contents(path: Path, names: Collection[str]) -> tuple[dict[str, dict[str, Any]], dict[Any, list[dict[str, Any]]]]:
+    """The images of a COCO file by their views, and its annotations, crowds left out, by their image's id."""
     document = read_json(path)
     if not isinstance(document, dict) or not all(_is_table(document.get(key)) for key in ("images", "annotations")):
         raise InputError(
@@ -81,12 +82,12 @@ def _contents(path: Path) -> tuple[dict[str, dict[str, Any]], dict[Any, list[dic
     for image in document["images"]:
         if not _is_id(image.get("id")) or not isinstance(image.get("file_name"), str):
             raise InputError(f"{path} lists an image without an `id` or a `file_name`; both are needed.")
-        stem = PureWindowsPath(image["file_name"]).stem  # whose separators are those of every system
-        if stem in images or image["id"] in ids:
+        view = _view(PureWindowsPath(image["file_name"]), names)  # whose separators are those of every system
+        if view in images or image["id"] in ids:
             raise InputError(
-                f"{path} lists two images with the id {image['id']!r} or the stem {stem!r}; both must be unique."
+                f"{path} lists two images with the id {image['id']!r} or the stem {view!r}; both must be unique."
             )
-        images[stem] = image
+        images[view] = image
         ids.add(image["id"])
     annotations: dict[Any, list[dict[str, Any]]] = {}
     crowds = 0
@@ -104,6 +105,13 @@ def _contents(path: Path) -> tuple[dict[str, dict[str, Any]], dict[Any, list[dic
     if crowds:
         warn(f"{crowds} crowd regions of {path.name} are left out: each stands for many objects at once.")
     return images, annotations
+
+
+def _view(file: PurePath, names: Collection[str]) -> str:
+    """The view that a file belongs to: one called by its path or by the end of it, else by its stem."""
+    parts = [*file.parent.parts, file.stem]
+    ends = ("_".join(parts[place:]) for place in range(len(parts)))
+    return next((end for end in ends if end in names), file.stem)
 
 
 def _is_table(rows: Any) -> bool:

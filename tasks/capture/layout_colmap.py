@@ -19,6 +19,7 @@ from ss_flow.tasks.capture.scene_files import (
     files_in,
     natural_key,
     read_text,
+    view_names,
 )
 
 _MODELS: tuple[tuple[str, int], ...] = (
@@ -69,17 +70,18 @@ def open_colmap(root: Path) -> SceneFiles:
     registered = set(photos)
     unregistered = [p for place in sorted({p.parent for p in photos}) for p in files_in(place) if p not in registered]
     everything = sorted([*photos, *unregistered], key=lambda p: natural_key(p.as_posix()))
+    called = view_names(photos, unregistered)
     sparse = next((p for p in (folder / "points3D.bin", folder / "points3D.txt") if p.is_file()), None)
     return SceneFiles(
         kind="colmap",
         root=root,
-        names=tuple(p.stem for p in photos),
+        names=tuple(called[p] for p in photos),
         photos=photos,
         lenses=tuple(lenses[v.camera] for v in views),
         poses=tuple(v.pose for v in views),
         sparse=sparse,
-        skipped=tuple(p.stem for p in unregistered),
-        all_names=tuple(dict.fromkeys(p.stem for p in everything)),
+        skipped=tuple(called[p] for p in unregistered),
+        all_names=tuple(dict.fromkeys(called[p] for p in everything)),
     )
 
 

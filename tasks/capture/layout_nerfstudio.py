@@ -13,7 +13,15 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_files import header_size
-from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, check_lens, natural_key, read_text, rigid_inverse
+from ss_flow.tasks.capture.scene_files import (
+    Pose,
+    SceneFiles,
+    check_lens,
+    natural_key,
+    read_text,
+    rigid_inverse,
+    view_names,
+)
 from ss_flow.tasks.geometry.cameras import Camera
 
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -40,7 +48,8 @@ def open_nerfstudio(path: Path) -> SceneFiles:
             f"{path} lists {len(listed)} photos, and none of them exists; the first is looked for at {first}."
         )
     frames, photos = [frame for frame, _ in found], tuple(photo for _, photo in found)
-    missing = tuple(Path(frame["file_path"]).stem for frame, photo in places if photo is None)
+    missing = [root / frame["file_path"] for frame, photo in places if photo is None]
+    called = view_names(photos, missing)
     with_depth = [f for f in frames if f.get("depth_file_path")]
     if with_depth and len(with_depth) < len(frames):
         lacking = next(f["file_path"] for f in frames if not f.get("depth_file_path"))
@@ -49,7 +58,7 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     return SceneFiles(
         kind="nerfstudio",
         root=root,
-        names=tuple(p.stem for p in photos),
+        names=tuple(called[p] for p in photos),
         photos=photos,
         valid=tuple(_listed(root, f.get("mask_path"), path) for f in frames),
         depths=tuple(root / f["depth_file_path"] for f in frames) if with_depth else None,
@@ -57,8 +66,8 @@ def open_nerfstudio(path: Path) -> SceneFiles:
         lenses=tuple(_lens({**document, **f}, p, path) for f, p in zip(frames, photos, strict=True)),
         poses=poses,
         metric=bool(with_depth),
-        skipped=missing,
-        all_names=tuple(Path(frame["file_path"]).stem for frame in listed),
+        skipped=tuple(called[p] for p in missing),
+        all_names=tuple(called[photo or root / frame["file_path"]] for frame, photo in places),
     )
 
 

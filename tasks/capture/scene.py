@@ -18,7 +18,7 @@ from ss_flow.tasks.capture.scene_files import (
     UNREAD_SUFFIXES,
     VIDEO_SUFFIXES,
     SceneFiles,
-    by_stem,
+    by_name,
     files_in,
     read_json,
 )
@@ -153,9 +153,8 @@ def _one_of_each(photos: list[Path]) -> list[Path]:
 
 
 def _check_files(scene: SceneFiles) -> None:
-    by_stem(list(scene.photos))
-    if len(set(scene.names)) < len(scene.names):
-        raise InputError(f"{scene.root} has two views of one name; every view needs a stem of its own.")
+    if scene.photos:
+        by_name(scene.names, scene.photos)
     # One listing a folder is far cheaper than asking for each file.
     listings: dict[Path, set[str]] = {}
     listed: list[Path | None] = [*scene.photos, *(scene.depths or ())]
@@ -171,7 +170,9 @@ def _check_files(scene: SceneFiles) -> None:
 
 
 def _some_by_name(folder: Path, names: Sequence[str]) -> tuple[Path | None, ...]:
-    found = by_stem(files_in(folder, _MASK_SUFFIXES))
+    files = [file for place in sorted(folder.glob("**/")) for file in files_in(place, _MASK_SUFFIXES)]
+    # As `view_names` has it where photos lie in several folders.
+    found = by_name(["_".join([*file.parent.relative_to(folder).parts, file.stem]) for file in files], files)
     matched = tuple(found.get(name) for name in names)
     if not any(matched):
         raise InputError(f"{folder} holds no image named after a view; {names[0]}.png, for one, is expected.")

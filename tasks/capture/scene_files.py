@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -179,14 +181,34 @@ def by_stem(paths: list[Path]) -> dict[str, Path]:
 
     Raises InputError when two share one.
     """
-    counts = Counter(p.stem for p in paths)
-    twice = [stem for stem, n in counts.items() if n > 1]
-    if twice:
-        clash = " and ".join(p.name for p in paths if p.stem == twice[0])
-        raise InputError(
-            f"{paths[0].parent} holds {clash}, whose stems are the same; every view needs a stem of its own."
-        )
-    return {p.stem: p for p in paths}
+    return by_name([p.stem for p in paths], paths)
+
+
+def by_name(names: Sequence[str], paths: Sequence[Path]) -> dict[str, Path]:
+    """Files by the names of the views that they belong to.
+
+    Raises InputError when two have one name.
+    """
+    found: dict[str, Path] = {}
+    for name, path in zip(names, paths, strict=True):
+        if name in found:
+            raise InputError(f"{found[name]} and {path} both belong to view {name}; every view needs its own stem.")
+        found[name] = path
+    return found
+
+
+def view_names(photos: Sequence[PurePath], left_out: Sequence[PurePath] = ()) -> dict[PurePath, str]:
+    """What views are called, by their photos: their stems; where photos in several folders have one stem, as those of
+    a rig's cameras do, all bear the folders below the one that holds them: `cam1_image0001`.
+
+    left_out: photos that are called likewise, but give no view.
+    """
+    files = [*photos, *left_out]
+    if len({p.stem for p in photos}) == len(photos) or len({p.parent for p in photos}) == 1:
+        return {p: p.stem for p in files}
+    folders = {p.parent.parts for p in files}
+    shared = next(i for i, parts in enumerate(itertools.zip_longest(*folders)) if len(set(parts)) > 1)
+    return {p: "_".join([*p.parent.parts[shared:], p.stem]) for p in files}
 
 
 def read_text(path: Path) -> str:

@@ -167,7 +167,7 @@ def depth_camera_elsewhere(root):
     return root
 
 
-@case("10.png", "stems are the same")
+@case("10.png", "both belong to view 10; every view needs its own stem")
 def two_photos_of_one_stem(root):
     made.write(made.photos(root) / "10.png", made.photo())
     return root

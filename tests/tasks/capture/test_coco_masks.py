@@ -170,6 +170,15 @@ def test_views_are_known_by_the_stems_of_file_names_and_those_not_listed_have_no
     assert (two.dense().shape, two.parent.shape) == ((0, HEIGHT, WIDTH), (0,))
 
 
+def test_views_that_are_called_by_their_path_are_known_by_it(tmp_path):
+    names = ("cam1_1", "cam2_1", "cam2_2")
+    views = frames(names=names, photos=refs(made.photos(tmp_path).iterdir()))
+    document = coco({"images/cam2/1.png": [], "cam1/1.png": [rectangle(0, 0, 8, 8)], "cam2_2.png": []})
+    (tmp_path / "masks.json").write_text(json.dumps(document))
+    found = coco_masks(views, made.cameras_of(views), names=names, file=ref(tmp_path / "masks.json"))
+    assert [len(masks) for masks in found] == [1, 0, 0]
+
+
 def test_crowd_regions_are_left_out_with_a_warning(tmp_path):
     made.photos(tmp_path)
     document = coco({f"{name}.jpg": [rectangle(0, 0, 8, 8)] for name in ("2", "10", "11")})

@@ -227,6 +227,52 @@ def test_a_file_gives_its_capture_its_stem_and_a_transforms_json_its_folders_nam
     assert open_scene(folder).name == "kitchen"
 
 
+def rig(root):
+    """A COLMAP workspace of two cameras, whose photos have the same names in two folders."""
+    made.colmap(root, binary=False)
+    (root / "images" / "cam1").mkdir()
+    (root / "images" / "cam2").mkdir()
+    for old, new in (("2", "cam1/1"), ("10", "cam1/2"), ("11", "cam2/1")):
+        (root / "images" / f"{old}.png").rename(root / "images" / f"{new}.png")
+        for model in ("0", "1"):
+            file = root / "sparse" / model / "images.txt"
+            file.write_text(file.read_text().replace(f" {old}.png", f" {new}.png"))
+    return root
+
+
+def test_photos_of_one_stem_in_several_folders_are_called_by_their_path(tmp_path):
+    scene = open_scene(rig(tmp_path))
+    assert scene.names == ("cam1_1", "cam1_2", "cam2_1")
+    made.write(tmp_path / "images" / "cam2" / "2.png", made.photo())
+    (tmp_path / "valid").mkdir()
+    made.write(tmp_path / "valid" / "cam1_2.png", made.photo()[..., 0])
+    made.write(tmp_path / "valid" / "cam2" / "1.png", made.photo()[..., 0])
+    scene = open_scene(tmp_path)
+    assert scene.skipped == ("cam2_2",) and scene.all_names[-1] == "cam2_2"
+    assert scene.valid == (None, tmp_path / "valid/cam1_2.png", tmp_path / "valid/cam2/1.png")
+
+
+def test_photos_of_a_transforms_json_are_called_by_their_path_only_where_stems_clash(tmp_path):
+    made.nerfstudio(tmp_path)
+    for old, new in (("2", "cam1/1"), ("10", "cam1/2"), ("11", "cam2/3")):
+        (tmp_path / "images" / new).parent.mkdir(exist_ok=True)
+        (tmp_path / f"images/{old}.png").rename(tmp_path / f"images/{new}.png")
+        text = (tmp_path / "transforms.json").read_text().replace(f"images/{old}.png", f"images/{new}.png")
+        (tmp_path / "transforms.json").write_text(text)
+    assert open_scene(tmp_path).names == ("1", "2", "3")
+    (tmp_path / "images/cam2/3.png").rename(tmp_path / "images/cam2/1.png")
+    (tmp_path / "transforms.json").write_text(text.replace("cam2/3.png", "cam2/1.png"))
+    assert open_scene(tmp_path).names == ("cam1_1", "cam1_2", "cam2_1")
+
+
+def test_photos_of_one_stem_in_one_folder_are_both_named_when_they_are_refused(tmp_path):
+    made.photos(tmp_path)
+    made.write(tmp_path / "10.png", made.photo())
+    with pytest.raises(InputError) as refused:
+        open_scene(tmp_path)
+    assert str(refused.value).startswith(f"{tmp_path / '10.jpg'} and {tmp_path / '10.png'} both belong to view 10")
+
+
 def test_opening_is_light_and_quick(tmp_path):
     import subprocess
 
