@@ -20,6 +20,7 @@ from ss_flow.tasks.artifacts import UInt8
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _NEXT_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+_EXIF_HEADER = b"Exif\0\0"
 _EXIF_ORIENTATION = 0x0112
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 
@@ -57,6 +58,8 @@ def inspect(data: bytes, where: str) -> Photo:
             return _inspect_jpeg(data)
         if data.startswith(_PNG_SIGNATURE):
             return _inspect_png(data)
+        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+            return Photo(data, "other", 0, 0, _webp_orientation(data))
         if _is_heic(data):
             width, height = _open_heic(data).size
             return Photo(data, "heic", width, height, 1)
@@ -88,8 +91,7 @@ def decode(data: bytes, where: str, flags: int) -> np.ndarray:
 
     if _is_heic(data):
         try:
-            heic = _open_heic(data)
-            return np.array(heic)[..., :3]  # a copy, since its memory goes with the object
+            return _in_colour(np.array(_open_heic(data)))  # a copy, since its memory goes with the object
         except (ValueError, EOFError) as error:
             raise InputError(f"{where} is cut short or damaged; a whole image file is expected.") from error
     buffer: UInt8 = np.frombuffer(data, np.uint8)
@@ -128,6 +130,13 @@ def _open_heic(data: bytes) -> Any:
     return pi_heif.open_heif(data, convert_hdr_to_8bit=True, bgr_mode=True)
 
 
+def _in_colour(image: np.ndarray) -> UInt8:
+    """[H, W, 3] a decoded HEIC without its opacity; black-and-white ones lack channels, and may come in 16 bits."""
+    channels = image.reshape(*image.shape[:2], -1)
+    colour = channels[..., :3] if channels.shape[2] > 2 else channels[..., [0, 0, 0]]
+    return (colour >> 8).astype(np.uint8) if colour.dtype == np.uint16 else colour
+
+
 def _inspect_jpeg(data: bytes) -> Photo:
     width = height = 0
     orientation, place = 1, 2
@@ -143,7 +152,7 @@ def _inspect_jpeg(data: bytes) -> Photo:
         (length,) = struct.unpack_from(">H", data, place)
         if marker in _FRAME_HEADERS:
             height, width = struct.unpack_from(">HH", data, place + 3)
-        elif marker == 0xE1 and data[place + 2 : place + 8] == b"Exif\0\0":
+        elif marker == 0xE1 and data[place + 2 : place + 8] == _EXIF_HEADER:
             orientation = _exif_orientation(data[place + 8 : place + length])
         place += length
     if not (width and height):
@@ -167,11 +176,23 @@ def _exif_orientation(tiff: bytes) -> int:
 
 def _inspect_png(data: bytes) -> Photo:
     width, height = struct.unpack_from(">II", data, 16)
-    place, kind = 8, b""
+    orientation, place, kind = 1, 8, b""
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, place)
         (checksum,) = struct.unpack_from(">I", data, place + 8 + length)
         if zlib.crc32(data[place + 4 : place + 8 + length]) != checksum:
             raise ValueError("checksum of a chunk is wrong")
+        if kind == b"eXIf":
+            orientation = _exif_orientation(data[place + 8 : place + 8 + length])
         place += 12 + length
-    return Photo(data, "png", width, height, 1)
+    return Photo(data, "png", width, height, orientation)
+
+
+def _webp_orientation(data: bytes) -> int:
+    place = 12
+    while place + 8 <= len(data):
+        kind, length = struct.unpack_from("<4sI", data, place)
+        if kind == b"EXIF":
+            return _exif_orientation(data[place + 8 : place + 8 + length].removeprefix(_EXIF_HEADER))
+        place += 8 + length + length % 2
+    return 1

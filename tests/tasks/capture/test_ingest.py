@@ -1,4 +1,5 @@
 import struct
+import zlib
 from pathlib import Path
 
 import capture_folders as made
@@ -29,9 +30,13 @@ def ingested(scene, **changes):
     )
 
 
+def tiff_of(orientation: int) -> bytes:
+    """EXIF that says how a photo is to be turned, and no more."""
+    return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
+
+
 def with_orientation(jpeg: bytes, orientation: int) -> bytes:
-    tiff = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
-    segment = b"Exif\0\0" + tiff
+    segment = b"Exif\0\0" + tiff_of(orientation)
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
 
 
@@ -79,6 +84,35 @@ def test_a_photo_that_was_exported_beside_its_original_is_one_view(tmp_path):
     original.write_bytes((SUPPORT / "quarters.heic").read_bytes())
     scene = open_scene(tmp_path)
     assert scene.names == ("2", "10", "11") and scene.photos[0].suffix != ".heic"
+
+
+@pytest.mark.parametrize("file", ["gray.heic", "gray_ten_bits.heic"])
+def test_black_and_white_photos_of_apples_phones_are_read_in_three_channels(tmp_path, file):
+    (tmp_path / "IMG_1.HEIC").write_bytes((SUPPORT / file).read_bytes())
+    (frame,) = ingested(open_scene(tmp_path))
+    image = decode_rgb(frame)
+    assert image.shape == (96, 128, 3)
+    assert np.abs(image - np.arange(128)[:, None].astype(int)).max() < 6  # a ramp from left to right
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", [".png", ".webp"])
+def test_png_and_webp_are_turned_upright_too(tmp_path, suffix, orientation):
+    stored = cv2.resize(made.photo(width=4, height=3), (64, 48), interpolation=cv2.INTER_CUBIC)
+    data, exif = cv2.imencode(suffix, stored)[1].tobytes(), tiff_of(orientation)
+    if suffix == ".png":  # the chunk stands behind the header's
+        chunk = b"eXIf" + exif
+        data = data[:33] + struct.pack(">I", len(exif)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    else:
+        extended = b"\x08\0\0\0" + (63).to_bytes(3, "little") + (47).to_bytes(3, "little")
+        chunks = b"VP8X" + struct.pack("<I", 10) + extended + data[12:] + b"EXIF" + struct.pack("<I", len(exif)) + exif
+        data = b"RIFF" + struct.pack("<I", len(chunks) + 4) + b"WEBP" + chunks
+    (tmp_path / f"a{suffix}").write_bytes(data)
+    frame = ingested(open_scene(tmp_path), jpeg_quality=0)[0]
+    jpeg = with_orientation(cv2.imencode(".jpg", stored)[1].tobytes(), orientation)
+    expected = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert decode_rgb(frame).shape == expected.shape
+    assert np.abs(decode_rgb(frame).astype(int) - expected).mean() < 3
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
