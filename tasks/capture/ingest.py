@@ -16,7 +16,7 @@ from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Frame
 from ss_flow.tasks.capture.layout_colmap import read_points
-from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map
+from ss_flow.tasks.capture.lens import Lens, without_distortion
 from ss_flow.tasks.capture.photo_files import Photo, decode, read_gray, read_photo
 from ss_flow.tasks.capture.scene_files import Pose
 from ss_flow.tasks.geometry.images import encode_png
@@ -107,10 +107,7 @@ def frame_of(
     keep = np.ones((height, width), bool) if mask is None else _valid_mask(mask, width, height)
     distorted = lens is not None and not lens.pinhole
     if lens is not None and distorted:
-        source = undistortion_map(lens.scaled(width, height))
-        image = cv2.remap(image, source, None, cv2.INTER_LINEAR)
-        keep = cv2.remap(keep.astype(np.uint8), source, None, cv2.INTER_NEAREST) > 0
-        keep &= inside_source(source)
+        image, keep = without_distortion(image, keep, lens.scaled(width, height))
     scale = min(1.0, params.max_side / max(width, height))
     w, h = (max(1, round(width * scale)), max(1, round(height * scale)))
     if scale < 1:

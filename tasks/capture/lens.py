@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, UInt8
 
 _NEWTON_STEPS = 40
 _NEWTON_CLOSE = 1e-6
@@ -126,6 +126,20 @@ def undistorted(points: Float64, lens: Lens) -> Float64:
         place, off = np.where(better[:, None], tried, place), np.where(better[:, None], off_tried, off)
         share = np.where(better, np.minimum(1, 2 * share), share / 4)
     return found
+
+
+def without_distortion(image: UInt8, keep: Bool, lens: Lens) -> tuple[UInt8, Bool]:
+    """A photo as a pinhole of the same intrinsics would have taken it, and which of its pixels count.
+
+    image: [H, W, 3]. keep: [H, W] which pixels of the photo count. Beyond the photo its border is repeated, as pixels
+    that count mix with what lies half a pixel outside; nothing further out counts.
+    """
+    import cv2
+
+    source = undistortion_map(lens)
+    straight: UInt8 = cv2.remap(image, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    kept = cv2.remap(keep.astype(np.uint8), source, None, cv2.INTER_NEAREST) > 0
+    return straight, kept & inside_source(source)
 
 
 def inside_source(source_map: Float32) -> Bool:

@@ -17,7 +17,7 @@ from ss_flow.tasks.capture.colmap import load_pycolmap
 from ss_flow.tasks.capture.colmap_database import fill_database
 from ss_flow.tasks.capture.features import FeatureParams, Features
 from ss_flow.tasks.capture.ingest import warn_of_skipped
-from ss_flow.tasks.capture.lens import Lens, inside_source, undistortion_map
+from ss_flow.tasks.capture.lens import Lens, without_distortion
 from ss_flow.tasks.capture.matches import FIRST_FOCAL, Matches
 from ss_flow.tasks.capture.pairs import Look, PairParams
 from ss_flow.tasks.capture.pose_fit import matches_that_fit
@@ -166,8 +166,6 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
 
     Pixels that the lens does not reach after undistortion become invalid.
     """
-    import cv2
-
     frame_of = {frame.name: frame for frame in frames}
     placed = set(cameras.names)
     warn_of_skipped(tuple(frame.name for frame in frames if frame.name not in placed), "for which no pose was found")
@@ -177,10 +175,7 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
         if cameras.radial.size and cameras.radial[i] != 0:
             fx, fy, cx, cy = (float(x) for x in cameras.intrinsics[i])
             lens = Lens(frame.width, frame.height, fx, fy, cx, cy, (float(cameras.radial[i]), 0.0, 0.0, 0.0))
-            source = undistortion_map(lens)
-            image = cv2.remap(decode_rgb(frame), source, None, cv2.INTER_LINEAR)
-            keep = cv2.remap(decode_valid(frame).astype(np.uint8), source, None, cv2.INTER_NEAREST) > 0
-            keep &= inside_source(source)
+            image, keep = without_distortion(decode_rgb(frame), decode_valid(frame), lens)
             valid = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
             frame = replace(frame, encoded=encode_png(image), valid=valid)
         result.append(frame)

@@ -1,5 +1,6 @@
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import capture_folders as made
@@ -15,6 +16,7 @@ from ss_flow.tasks.capture.lens import Lens, depth_to_color_map
 from ss_flow.tasks.capture.photo_files import read_photo
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.sensor_depth import depth
+from ss_flow.tasks.capture.sfm import registered
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
 
 SUPPORT = Path(__file__).parents[2] / "support"
@@ -150,6 +152,22 @@ def test_undistortion_makes_a_pinhole_of_the_same_intrinsics(tmp_path):
     assert bright.mean(axis=0) == pytest.approx([50.5, 50.5 + 0.3 * focal], abs=0.6)
     valid = decode_valid(frame)
     assert valid[50, 50] and not valid[0, 0]
+
+
+@pytest.mark.parametrize("k", [0.01, 0.05])
+def test_undistortion_darkens_no_pixel_that_counts(tmp_path, k):
+    made.write(tmp_path / "a.png", np.full((240, 320, 3), 200, np.uint8))
+    lens = Lens(320, 240, 300, 300, 160, 120, (k, 0.0, 0.0, 0.0))
+    photos, lossless = (ref(tmp_path / "a.png"),), IngestParams(jpeg_quality=0)
+    (frame,) = frames(names=("a",), photos=photos, lenses=(lens,), params=lossless)
+    valid = decode_valid(frame)
+    assert 0.8 < valid.mean() < 1
+    assert (decode_rgb(frame)[valid] == 200).all()
+    plain = frames(names=("a",), photos=photos, params=lossless)
+    found = replace(made.cameras_of(plain, k), intrinsics=np.array([[300.0, 300.0, 160.0, 120.0]]))
+    (same,) = registered(plain, found)
+    np.testing.assert_array_equal(decode_valid(same), valid)
+    assert (decode_rgb(same)[valid] == 200).all()
 
 
 def test_a_scaled_pixel_counts_only_when_all_of_it_does(tmp_path):
