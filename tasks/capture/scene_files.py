@@ -165,7 +165,9 @@ def capture_name(path: Path) -> str:
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key under which "2.jpg" comes before "10.jpg"."""
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"([0-9]+)", text) if part)
+    # Digits are 0 to 9, unlike those of `str.isdigit`, of which int() does not read all, such as a superscript 2.
+    parts = (part for part in re.split(r"([0-9]+)", text) if part)
+    return tuple((0, int(part), "") if part[0] in "0123456789" else (1, 0, part) for part in parts)
 
 
 def files_in(folder: Path, suffixes: frozenset[str] = PHOTO_SUFFIXES) -> list[Path]:

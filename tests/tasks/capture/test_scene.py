@@ -299,6 +299,13 @@ def test_numbers_in_names_sort_by_value(numbers):
     assert sorted(names, key=natural_key) == [f"frame_{n}.jpg" for n in sorted(numbers)]
 
 
+def test_names_may_hold_digits_that_are_no_decimals():
+    assert sorted(["\u00b22.jpg", "1\u00b212.jpg", "1\u00b22.jpg"], key=natural_key)[:2] == [
+        "1\u00b22.jpg",
+        "1\u00b212.jpg",
+    ]
+
+
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real captures are not beside the project")
 def test_the_real_captures_open():
     shelf, office = open_scene(SHARED / "apc_shelf"), open_scene(SHARED / "hololens_office")
