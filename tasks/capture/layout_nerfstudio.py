@@ -1,4 +1,4 @@
-"""nerfstudio's `transforms.json`, which Polycam, Record3D and many others write too."""
+"""nerfstudio's `transforms.json`, which `ns-process-data` also makes of what Polycam, Record3D and others export."""
 
 from __future__ import annotations
 
