@@ -34,8 +34,16 @@ _MODELS: tuple[tuple[str, int], ...] = (
     ("SIMPLE_RADIAL_FISHEYE", 4),
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 )
-"""Names of the camera models and their numbers of parameters, by model id."""
+"""Names of COLMAP's camera models and their numbers of parameters, by model id (COLMAP 4.2); `_lens` knows those that
+are read."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import struct
 from pathlib import Path
 
 import capture_folders as made
@@ -373,6 +374,14 @@ def colmap_cameras_cut(root):
 @case("images.bin", "is missing")
 def colmap_images_missing(root):
     (made.colmap(root) / "sparse" / "1" / "images.bin").unlink()
+    return root
+
+
+@case("cameras.bin", "has a camera of model EUCM; undistort the images first")
+def colmap_lens_of_a_newer_version(root):
+    made.colmap(root, binary=True)
+    cameras = root / "sparse" / "1" / "cameras.bin"
+    cameras.write_bytes(struct.pack("<QIiQQ6d", 1, 7, 16, 32, 24, 30, 30, 16, 12, 0.5, 1))
     return root
 
 
