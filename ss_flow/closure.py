@@ -12,18 +12,35 @@ from __future__ import annotations
 import ast
 import functools
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from blake3 import blake3
 
-from ss_flow.sources import Imports, Module, imports_of, module_of, native_sources, source_digest, source_of
+from ss_flow.sources import (
+    Imports,
+    Module,
+    forget_sources,
+    imports_of,
+    module_of,
+    native_sources,
+    read_loaded,
+    source_digest,
+    source_of,
+)
 
 FOLLOWED = ("ss_flow.tasks", "ss_flow.flows")
 """Packages whose definitions are followed, besides the package of the function itself."""
 
 ENGINE = "ss_flow"
+
+reading = threading.RLock()
+"""Held while sources are read or walked through: what was read is not exchanged in between."""
+_packages: set[str] = set()
+"""The packages in which tasks are declared, besides ours."""
+_generation = 0
 
 
 @dataclass(frozen=True)
@@ -63,8 +80,30 @@ def code_closure(function: Callable[..., Any]) -> dict[str, str]:
 
 def forget() -> None:
     """Read the sources anew the next time; a process reads each of them once."""
-    for remembered in (_closure, _digests, _needed, _read, module_of, source_of, source_digest):
+    with reading:
+        forget_sources()
+        _forget_trees()
+
+
+def _forget_trees() -> None:
+    global _generation
+    _generation += 1
+    for remembered in (_closure, _digests, _needed, _read, module_of, source_digest):
         remembered.cache_clear()
+
+
+def fix_sources(own: str = "") -> int:
+    """Read the sources of all that is loaded and followed, so that keys stand for what runs, whatever is edited later.
+
+    own: a package whose modules are followed, too, from now on. Returns a number that is another one after a source was
+    edited before it was loaded: what was said of closures before then does not hold for what runs now.
+    """
+    with reading:
+        if own and own != ENGINE:
+            _packages.add(own)
+        if read_loaded((*FOLLOWED, *_packages)):
+            _forget_trees()
+        return _generation
 
 
 @functools.cache

@@ -20,6 +20,7 @@ from ss_flow.cache.location import open_store
 from ss_flow.cache.store import Action, Store
 from ss_flow.keys import Components, Value
 from ss_flow.running import Listener, Surroundings, remove_checkpoint, running
+from ss_flow.sameness import check_sameness
 from ss_flow.task import Resources, Task
 
 SAMPLE_SECONDS = 0.2
@@ -49,9 +50,12 @@ class Cancelled(Exception):
 def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     """Run a call in this thread. Whatever the task raises passes through; nothing is then stored under the key.
 
-    Raises Gone when an input is no longer in the store.
+    Raises Gone when an input is no longer in the store, ExecutorLost when this process would compute, or has computed,
+    something else than the key stands for.
     """
     task = find_task(invocation.task)
+    check = functools.partial(check_sameness, task, invocation.components, invocation.label, store.closures)
+    check()
     arguments = {name: _read(value, store, name in task.streamed) for name, value in invocation.inputs.items()}
     checkpoint = store.checkpoint(invocation.key)
     warned: list[str] = []
@@ -60,6 +64,7 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     with running(surroundings), _peaks.watching() as peak:
         result = task.run(arguments, invocation.parameters)
     seconds = time.monotonic() - started
+    check()  # a module that the task itself loaded may have been edited since its key was made
     items = result if task.returns_list else (result,)
     action = Action(
         key=invocation.key,

@@ -24,7 +24,7 @@ from blake3 import blake3
 
 from ss_flow import closure, sources
 from ss_flow.cache.files import write_atomically
-from ss_flow.closure import Closure, closure_of
+from ss_flow.closure import Closure, closure_of, reading
 from ss_flow.sources import source_digest
 
 _ANALYSIS = b"".join(Path(file).read_bytes() for file in (closure.__file__, sources.__file__))
@@ -35,9 +35,10 @@ _SIGNS = {"python": platform.python_version(), "analysis": blake3(_ANALYSIS).hex
 def kept_closure(function: Callable[..., Any], folder: Path) -> Closure:
     """What `closure_of` says, from the folder where it holds that; it is kept there otherwise."""
     file = folder / f"{function.__module__}-{function.__qualname__}.txt"
-    if (known := _read(file)) is not None:
-        return known
-    found = closure_of(function)
+    with reading:
+        if (known := _read(file)) is not None:
+            return known
+        found = closure_of(function)
     content = {**_SIGNS, **vars(found), "modules": sorted(found.modules)}
     text = json.dumps(content, separators=(",", ":"))
     with contextlib.suppress(OSError):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ss_flow.cache.canonical import digest
-from ss_flow.closure import Closure, closure_of
+from ss_flow.closure import Closure, closure_of, fix_sources
 from ss_flow.distributions import version, versions_of
 from ss_flow.task import FileRef, Task
 
@@ -64,6 +64,7 @@ class Keys:
     def recipe(self, task: Task[..., Any]) -> Recipe:
         """What all calls of the task have in common."""
         if id(task) not in self._recipes:
+            fix_sources()
             self._recipes[id(task)] = (task, Recipe.of(task, self._closure(task.function)))
         return self._recipes[id(task)][1]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import importlib.util
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,9 +55,46 @@ def source_digest(name: str) -> str:
         return ""
 
 
-@functools.cache
+_known: dict[str, tuple[object, Source | None]] = {}
+"""Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then."""
+
+
 def source_of(name: str) -> Source | None:
-    """A module as it is written; None when there is none, or none in Python."""
+    """A module as it is written; None when there is none, or none in Python. It is read once."""
+    if name not in _known:
+        _known[name] = _specification(name), _read(name)
+    return _known[name][1]
+
+
+def read_loaded(packages: tuple[str, ...]) -> bool:
+    """Read the modules of these packages that are loaded, each as soon as possible after that, whoever asks later.
+
+    Returns whether any of them is not as it was when it was read last, before it was loaded, or loaded again.
+    """
+    changed = False
+    for name in [name for name in sys.modules if name.startswith(packages)]:
+        specification = _specification(name)
+        if name in _known and _known[name][0] is specification:
+            continue
+        try:
+            source = _read(name)
+        except (OSError, ValueError):  # its file has gone; who needs it will say so
+            continue
+        changed = changed or (name in _known and _known[name][1] != source)
+        _known[name] = specification, source
+    return changed
+
+
+def forget_sources() -> None:
+    """Read every module anew the next time."""
+    _known.clear()
+
+
+def _specification(name: str) -> object:
+    return getattr(sys.modules.get(name), "__spec__", None)
+
+
+def _read(name: str) -> Source | None:
     parent = source_of(package) if (package := name.rpartition(".")[0]) else None
     if parent is not None and not parent.is_package:
         return None  # a name in a module; to look further would import that

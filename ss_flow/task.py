@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
+from ss_flow.closure import fix_sources
 from ss_flow.graph import current_flow
 
 P = ParamSpec("P")
@@ -173,6 +174,7 @@ def task(
     """
 
     def declare(function: Callable[P, R]) -> Task[P, R]:
+        fix_sources(function.__module__.partition(".")[0])
         step = name or _default_name(function)
         declared: Any = Task(function, step, resources, uses, isolate, environment)
         functools.update_wrapper(declared, function)

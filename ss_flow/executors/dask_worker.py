@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import pickle
 import socket
@@ -13,11 +12,8 @@ from typing import Any
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.location import is_url
 from ss_flow.cache.store import Action
-from ss_flow.errors import ExecutorLost
-from ss_flow.execute import Cancelled, Invocation, execute_here, find_task
+from ss_flow.execute import Cancelled, Invocation, execute_here
 from ss_flow.executors.worker import Worker
-from ss_flow.explain import first_difference
-from ss_flow.keys import Components, Recipe
 
 PROGRESS_SECONDS = 0.25
 TOPIC = "ss-flow"
@@ -68,7 +64,6 @@ def _execute(invocation: Invocation, run: str) -> Action:
     if run in _stopped:
         raise Cancelled(invocation.label)
     _check_store(invocation.store)
-    _check_sameness(invocation)
     if not invocation.isolate:
         return execute_here(invocation, listener)
     process = Worker()
@@ -85,26 +80,6 @@ def _check_store(location: str) -> None:
             f"the host {socket.gethostname()} does not have the store {location}: every worker of a Dask cluster must "
             "find it in the same place. Put it on a shared file system (--cache DIR), and run again."
         )
-
-
-def _check_sameness(invocation: Invocation) -> None:
-    """Raises ExecutorLost when this host's code, packages or processor are not those that the key stands for."""
-
-    def named(parts: Components) -> Components:
-        return {**parts, "code": {invocation.task: parts["code"]}}
-
-    wanted = invocation.components
-    if difference := first_difference(named(wanted), named({**wanted, **_recipe(invocation.task)})):
-        raise ExecutorLost(
-            f"a worker on the host {socket.gethostname()} would compute {invocation.label} otherwise: {difference}. "
-            "Every worker needs the same code, packages and kind of processor as the host that starts the run; "
-            "restart the workers after an update."
-        )
-
-
-@functools.cache
-def _recipe(task: str) -> Components:
-    return Recipe.of(find_task(task)).components
 
 
 def stop_calls(run: str) -> list[str]:

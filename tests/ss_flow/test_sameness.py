@@ -1,0 +1,124 @@
+"""Code that is edited while a run goes on: a key stands for the code that computed its result."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import textwrap
+
+import pytest
+
+from ss_flow import closure
+from ss_flow.engine import run_flow
+from ss_flow.errors import ExecutorLost
+from ss_flow.events import Reporter
+
+STEPS = """
+    import numpy as np
+
+    from ss_flow.task import task
+    from ss_flow_toy import Number, number
+    from ss_flow_probed_helper import double
+
+
+    @task()
+    def first(*, value: float) -> Number:
+        return number(value)
+
+
+    @task()
+    def second(x: Number) -> Number:
+        return number(double(float(x.value[0])))
+
+
+    @task(isolate=True)
+    def alone(x: Number) -> Number:
+        return number(double(float(x.value[0])))
+
+
+    @task()
+    def late(x: Number) -> Number:
+        from ss_flow_probed_late import double
+
+        return number(double(float(x.value[0])))
+"""
+HELPER = "def double(x):\n    return 2 * x\n"
+EDITED = "def double(x):\n    return x + x + 1\n"
+
+
+class Editing(Reporter):
+    """Edits a file as soon as something happens to a step."""
+
+    def __init__(self, path, kind, step):
+        self.path, self.moment = path, (kind, step)
+
+    def event(self, kind, **details):
+        if (kind, details.get("step")) == self.moment:
+            self.path.write_text(EDITED)
+
+
+@pytest.fixture
+def probed(tmp_path, monkeypatch):
+    """Modules of tasks in a folder, and a function that imports them as a new process would."""
+    folder = tmp_path / "code"
+    folder.mkdir()
+    (folder / "ss_flow_probed.py").write_text(textwrap.dedent(STEPS))
+    for name in ("helper", "late"):
+        (folder / f"ss_flow_probed_{name}.py").write_text(HELPER)
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # whose times are too coarse for what is edited at once
+
+    def load():
+        for name in [n for n in sys.modules if n.startswith("ss_flow_probed")]:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        closure.forget()
+        return importlib.import_module("ss_flow_probed")
+
+    load.folder = folder
+    yield load
+    closure.forget()
+
+
+def run(store, steps, name, reporter=None):
+    """The value of a step, and what happened to it."""
+    task = getattr(steps, name)
+    report = run_flow(lambda: {"x": task(steps.first(value=3.0))}, store, scene="probed", reporter=reporter, jobs=1)
+    return float(store.get(report.values["x"]).value[0]), report.nodes[-1]["event"]
+
+
+def test_what_the_old_code_computed_is_no_result_of_the_code_that_was_edited_meanwhile(store, probed):
+    editing = Editing(probed.folder / "ss_flow_probed_helper.py", "finished", "ss_flow_probed.first")
+    assert run(store, probed(), "second", editing) == (6.0, "finished")
+    assert run(store, probed(), "second") == (7.0, "finished")
+    (probed.folder / "ss_flow_probed_helper.py").write_text(HELPER)
+    assert run(store, probed(), "second") == (6.0, "hit")
+
+
+def test_a_key_stands_for_the_code_as_it_was_loaded_long_before_the_run(store, probed):
+    steps = probed()
+    (probed.folder / "ss_flow_probed_helper.py").write_text(EDITED)
+    assert run(store, steps, "second") == (6.0, "finished")
+    assert run(store, probed(), "second") == (7.0, "finished")
+
+
+def test_code_that_is_loaded_again_counts_as_it_is_then(store, probed):
+    steps = probed()
+    assert run(store, steps, "second") == (6.0, "finished")
+    (probed.folder / "ss_flow_probed_helper.py").write_text(EDITED)
+    importlib.reload(sys.modules["ss_flow_probed_helper"])
+    assert run(store, importlib.reload(steps), "second") == (7.0, "finished")
+
+
+@pytest.mark.parametrize(
+    ("step", "file", "moment"),
+    [
+        ("alone", "ss_flow_probed_helper.py", ("finished", "ss_flow_probed.first")),
+        ("late", "ss_flow_probed_late.py", ("started", "ss_flow_probed.late")),
+    ],
+    ids=["by a process that starts late", "within a task"],
+)
+def test_code_that_was_edited_before_it_is_loaded_is_refused(store, probed, step, file, moment):
+    with pytest.raises(ExecutorLost, match=f"otherwise than its key says: code of ss_flow_probed:{step} changed"):
+        run(store, probed(), step, Editing(probed.folder / file, *moment))
+    assert run(store, probed(), step) == (7.0, "finished")
