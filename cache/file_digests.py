@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ss_flow.cache.canonical import digest, digest_file
-from ss_flow.cache.files import write_atomically
+from ss_flow.cache.files import stamp, write_atomically
 
 T = TypeVar("T")
 
@@ -35,13 +35,12 @@ class FileDigests:
     def __call__(self, path: Path) -> str:
         """The blake3 digest of a file. Raises OSError when it cannot be read."""
         place = os.path.abspath(path)
-        status = os.stat(place)
-        stamp: list[object] = [status.st_size, status.st_mtime_ns, status.st_ino]
+        now: list[object] = [*stamp(place)]
         known = self._known.get(place)
-        if known is not None and known[:3] == stamp and not self._verify:
+        if known is not None and known[:3] == now and not self._verify:
             return str(known[3])
         content = digest_file(place)
-        self._known[place] = [*stamp, content]
+        self._known[place] = [*now, content]
         self._changed = True
         return content
 

@@ -61,6 +61,12 @@ def read_stamped(path: str) -> tuple[bytes, float]:
         os.close(handle)
 
 
+def stamp(path: Path | str) -> tuple[int, int, int]:
+    """Size, time of change and inode of a file: while they are the same, so is its content. Raises OSError."""
+    status = os.stat(path)
+    return status.st_size, status.st_mtime_ns, status.st_ino
+
+
 def folder_bytes(folder: Path) -> int:
     """How many bytes the files below a folder take."""
     return sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())

@@ -18,10 +18,11 @@ import psutil
 
 from ss_flow.cache.location import open_store
 from ss_flow.cache.store import Action, Store
+from ss_flow.errors import InputError
 from ss_flow.keys import Components, Value
 from ss_flow.running import Listener, Surroundings, remove_checkpoint, running
 from ss_flow.sameness import check_sameness
-from ss_flow.task import Resources, Task
+from ss_flow.task import Resources, Task, files_in
 
 SAMPLE_SECONDS = 0.2
 
@@ -51,7 +52,7 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     """Run a call in this thread. Whatever the task raises passes through; nothing is then stored under the key.
 
     Raises Gone when an input is no longer in the store, ExecutorLost when this process would compute, or has computed,
-    something else than the key stands for.
+    something else than the key stands for; InputError when a file is no longer as its reference says.
     """
     task = find_task(invocation.task)
     check = functools.partial(check_sameness, task, invocation.components, invocation.label, store.closures)
@@ -65,6 +66,8 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
         result = task.run(arguments, invocation.parameters)
     seconds = time.monotonic() - started
     check()  # a module that the task itself loaded may have been edited since its key was made
+    if changed := [str(ref.path) for ref in files_in(invocation.parameters) if ref.has_changed()]:
+        raise InputError(f"{invocation.label} read {changed[0]}, which has changed since the run started; run again.")
     items = result if task.returns_list else (result,)
     action = Action(
         key=invocation.key,

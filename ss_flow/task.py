@@ -7,15 +7,18 @@ hashed into its key. It reads nothing else. Called in a flow, a task returns a `
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
+from ss_flow.cache.canonical import digest_file
+from ss_flow.cache.files import stamp
 from ss_flow.closure import fix_sources
 from ss_flow.graph import current_flow
 
@@ -42,6 +45,37 @@ class FileRef:
     path: Path = field(metadata={"key": False})
     digest: str
     """blake3 of the content, hexadecimal."""
+    stamp: tuple[int, ...] = field(default=(), init=False, compare=False, metadata={"key": False})
+    """Size, time of change and inode when this was made; () when there was no such file."""
+
+    def __post_init__(self) -> None:
+        with contextlib.suppress(OSError):
+            object.__setattr__(self, "stamp", stamp(self.path))
+
+    def has_changed(self) -> bool:
+        """Whether the file holds anything else than when this was made; it is read only where its stamp differs."""
+        try:
+            now = stamp(self.path)
+            return now != self.stamp and _digest_of(self.path, now) != self.digest
+        except OSError:
+            return True
+
+
+@functools.lru_cache(maxsize=256)
+def _digest_of(path: Path, stamp: tuple[int, ...]) -> str:
+    return digest_file(path)
+
+
+def files_in(value: Any) -> Iterator[FileRef]:
+    """The files that a parameter refers to."""
+    if isinstance(value, FileRef):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        for one in dataclasses.fields(value):
+            yield from files_in(getattr(value, one.name))
+    elif isinstance(value, tuple | list | Mapping):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from files_in(item)
 
 
 Reference = Callable[[Path], FileRef]

@@ -18,6 +18,7 @@ import pytest
 import ss_flow_toy as toy
 
 from ss_flow.cache import codec
+from ss_flow.cache.canonical import digest_file
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
 from ss_flow.engine import Request, run_flow, run_flows
@@ -25,6 +26,7 @@ from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.graph import each
 from ss_flow.runs import latest_runs
+from ss_flow.task import FileRef
 
 
 def run(store, build=toy.flow, **options):
@@ -183,6 +185,39 @@ def test_a_disk_that_is_full_now_and_then_costs_runs_but_no_result(store, execut
     assert report is not None
     assert report.values == expected
     assert refusals or executor == "processes"  # the workers write with a codec of their own
+
+
+def test_an_input_file_that_changes_after_its_key_was_made_fails_its_step_and_leaves_no_result(store, tmp_path):
+    file = tmp_path / "factor.txt"
+    file.write_text("2.0")
+
+    class Changing(Reporter):
+        def event(self, kind, **details):
+            if (kind, details.get("step")) == ("started", "ss_flow_toy.source"):
+                file.write_text("5.0")
+
+    def flow():
+        return {"x": toy.times_file(toy.source(values=(3.0,))[0], files=(FileRef(file, digest_file(file)),))}
+
+    failure = run_flow(flow, store, scene="toy", reporter=Changing()).values["x"]
+    assert isinstance(failure.error, InputError)
+    assert "factor.txt, which has changed since the run started" in str(failure.error)
+    file.write_text("2.0")
+    os.utime(file, (1, 1))
+    again = run_flow(flow, store, scene="toy")
+    assert again.nodes[-1]["event"] == "finished" and float(store.get(again.values["x"]).value[0]) == 6.0
+
+
+def test_a_file_that_was_only_touched_is_read_again_and_found_to_be_the_same(store, tmp_path):
+    file = tmp_path / "factor.txt"
+    file.write_text("2.0")
+
+    def flow():
+        ref = FileRef(file, digest_file(file))
+        os.utime(file, (1, 1))
+        return {"x": toy.times_file(toy.source(values=(3.0,))[0], files=(ref,))}
+
+    assert run_flow(flow, store, scene="toy").failures == []
 
 
 def test_a_store_that_vanishes_ends_the_run_with_one_sentence(store):

@@ -13,7 +13,7 @@ import numpy as np
 
 from ss_flow.graph import each, expand
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
-from ss_flow.task import Bundle, Resources, task
+from ss_flow.task import Bundle, FileRef, Resources, task
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,12 @@ def source(*, values: tuple[float, ...]) -> tuple[Number, ...]:
 @task()
 def square(x: Number) -> Number:
     return number(helper(float(x.value[0])))
+
+
+@task()
+def times_file(x: Number, *, files: tuple[FileRef, ...]) -> Number:
+    """Multiplies with the number in a file."""
+    return number(float(x.value[0]) * float(files[0].path.read_text()))
 
 
 @task()
