@@ -115,11 +115,15 @@ def _closure(module_name: str, function_name: str) -> Closure:
     modules: set[str] = set()
     sources: set[str] = set()
     pending = [(module_name, function_name.partition(".")[0])]
+    seen: set[tuple[str, str]] = set()
     while pending:
         module_name, name = pending.pop()
+        if (module_name, name) in seen:
+            continue
+        seen.add((module_name, name))
         sources.add(module_name)
         module = module_of(module_name)
-        if module is None or f"{module_name}.{name}" in found:
+        if module is None:
             continue
         if name not in module.definitions:
             for origin, attribute in module.imports.get(name, ()):

@@ -127,6 +127,11 @@ def test_functions_that_call_each_other_end(package):
     assert set(package(step=step)) == {"probe.step.run", "probe.step.other"}
 
 
+def test_a_package_that_imports_a_module_of_its_own_under_the_name_of_the_module_ends(package):
+    step = "from probe import maths\n\ndef run(x):\n    return maths.twice(x)\n"
+    assert "probe.maths.FACTOR" in package(step=step, maths=MATHS, __init__="from . import maths\n")
+
+
 def modules_of(package, **modules: str) -> frozenset[str]:
     package(**modules)
     return closure.closure_of(importlib.import_module("probe.step").run).modules
