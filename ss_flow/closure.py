@@ -25,6 +25,7 @@ from ss_flow.sources import (
     forget_sources,
     imports_of,
     module_of,
+    module_without_stars,
     native_sources,
     read_loaded,
     source_digest,
@@ -69,8 +70,17 @@ class _Needs:
 
 
 def closure_of(function: Callable[..., Any]) -> Closure:
-    """What a module-level function depends on."""
-    return _closure(function.__module__, function.__qualname__)
+    """What a module-level function depends on.
+
+    Raises TypeError when its source is not found, as that of a script or of a notebook is not.
+    """
+    found = _closure(function.__module__, function.__qualname__)
+    if not found.definitions:
+        raise TypeError(
+            f"the code of {function.__module__}.{function.__qualname__} cannot be followed, so no key would stand for "
+            "it; a task must be a function of a module that can be imported."
+        )
+    return found
 
 
 def code_closure(function: Callable[..., Any]) -> dict[str, str]:
@@ -88,7 +98,7 @@ def forget() -> None:
 def _forget_trees() -> None:
     global _generation
     _generation += 1
-    for remembered in (_closure, _digests, _needed, _read, module_of, source_digest):
+    for remembered in (_closure, _digests, _needed, _read, module_of, module_without_stars, source_digest):
         remembered.cache_clear()
 
 
@@ -125,11 +135,12 @@ def _closure(module_name: str, function_name: str) -> Closure:
         module = module_of(module_name)
         if module is None:
             continue
+        sources.update(module.stars)
+        for origin, attribute in module.imports.get(name, ()):
+            modules.add(origin.partition(".")[0])
+            if attribute is not None and origin.startswith(followed):
+                pending.append((origin, attribute))
         if name not in module.definitions:
-            for origin, attribute in module.imports.get(name, ()):
-                modules.add(origin.partition(".")[0])
-                if attribute is not None and origin.startswith(followed):
-                    pending.append((origin, attribute))
             continue
         found |= _digests(module_name, name)
         needs = _needed(module_name, name, followed)
@@ -179,22 +190,43 @@ def _dependencies(
     module: Module, nodes: list[ast.AST], local: Imports, followed: tuple[str, ...], looked_for: set[str]
 ) -> Iterator[tuple[str, str]]:
     for node in nodes:
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            for origin, attribute in local.get(node.value.id, ()):
-                if not origin.startswith(followed):
-                    continue
-                if attribute is None:
-                    yield origin, node.attr
-                    continue
-                looked_for.add(f"{origin}.{attribute}")
-                if source_of(f"{origin}.{attribute}"):
-                    yield f"{origin}.{attribute}", node.attr
+        if isinstance(node, ast.Attribute):
+            first, *between = _dotted(node.value)
+            for origin, attribute in local.get(first, ()):
+                path = between if attribute is None else [attribute, *between]
+                if (holder := _module_at(origin, path, followed, looked_for)) is not None:
+                    yield holder, node.attr
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
             if node.id in module.definitions:
                 yield module.name, node.id
             for origin, attribute in local.get(node.id, ()):
                 if attribute is not None and origin.startswith(followed):
                     yield origin, attribute
+
+
+def _module_at(module: str, path: list[str], followed: tuple[str, ...], looked_for: set[str]) -> str | None:
+    """The module that `module.a.b` stands for, through what packages import; None when that is none to follow."""
+    names, seen = list(path), set[tuple[str, ...]]()
+    while module.startswith(followed) and (module, *names) not in seen:
+        seen.add((module, *names))
+        if not names:
+            return module
+        looked_for |= {module, inner := f"{module}.{names[0]}"}
+        if source_of(inner):
+            module, names = inner, names[1:]
+        elif (holder := module_of(module)) is not None and (origins := holder.imports.get(names[0])):
+            module, attribute = origins[0]
+            names = names[1:] if attribute is None else [attribute, *names[1:]]
+    return None
+
+
+def _dotted(node: ast.expr) -> list[str]:
+    """The names of `a.b.c`; [""] for another expression."""
+    names: list[str] = []
+    while isinstance(node, ast.Attribute):
+        names.append(node.attr)
+        node = node.value
+    return [node.id, *reversed(names)] if isinstance(node, ast.Name) else [""]
 
 
 def _loaded_by_name(nodes: list[ast.AST]) -> Iterator[str]:

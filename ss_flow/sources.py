@@ -5,13 +5,15 @@ from __future__ import annotations
 import ast
 import functools
 import importlib.util
+import itertools
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from blake3 import blake3
 
+STAR = "*"
 NATIVE_SOURCES = "NATIVE_SOURCES"
 """A module-level tuple of file names, relative to the module: sources of the native code it loads."""
 
@@ -37,7 +39,10 @@ class Module:
     name: str
     is_package: bool
     definitions: dict[str, list[ast.stmt]] = field(default_factory=dict)
+    """The statements that bind each name, or change what it stands for."""
     imports: Imports = field(default_factory=dict)
+    stars: tuple[str, ...] = ()
+    """The modules that all names are imported from, directly or not."""
 
 
 @functools.cache
@@ -95,6 +100,8 @@ def _specification(name: str) -> object:
 
 
 def _read(name: str) -> Source | None:
+    if name == "__main__":  # not the name that it is imported by
+        return None
     parent = source_of(package) if (package := name.rpartition(".")[0]) else None
     if parent is not None and not parent.is_package:
         return None  # a name in a module; to look further would import that
@@ -111,15 +118,38 @@ def _read(name: str) -> Source | None:
 @functools.cache
 def module_of(name: str) -> Module | None:
     """What a module defines and imports at its top level; None when there is none in Python."""
+    module = module_without_stars(name)
+    if module is None or STAR not in module.imports:
+        return module
+    imports = {local: list(origins) for local, origins in module.imports.items()}
+    stars: dict[str, None] = {}
+    pending = [origin for origin, _ in imports.pop(STAR)]
+    while pending:
+        origin = pending.pop()
+        if origin in stars:
+            continue
+        stars[origin] = None
+        if (other := module_without_stars(origin)) is not None:
+            pending += [further for further, _ in other.imports.get(STAR, ())]
+            for local in {*other.definitions, *other.imports} - {STAR}:
+                imports.setdefault(local, []).append((origin, local))
+    return replace(module, imports=imports, stars=tuple(stars))
+
+
+@functools.cache
+def module_without_stars(name: str) -> Module | None:
+    """The same, with `from ... import *` as the import of a name "*"."""
     source = source_of(name)
     if source is None:
         return None
     module = Module(name, source.is_package)
-    tree = ast.parse(source.text)
-    for statement in _top_level(tree.body):
-        for bound in _bound_names(statement):
-            module.definitions.setdefault(bound, []).append(statement)
-    module.imports = imports_of(module, _top_level(tree.body))
+    statements = list(_top_level(ast.parse(source.text).body))
+    bound = {name for statement in statements for name in _bound_names(statement)}
+    for statement in statements:
+        for changed in dict.fromkeys([*_bound_names(statement), *(n for n in _changed_names(statement) if n in bound)]):
+            module.definitions.setdefault(changed, []).append(statement)
+    nodes = (ast.walk(statement) if isinstance(statement, _BLOCKS) else (statement,) for statement in statements)
+    module.imports = imports_of(module, itertools.chain.from_iterable(nodes))
     return module
 
 
@@ -137,7 +167,7 @@ def _top_level(body: list[ast.stmt]) -> Iterator[ast.stmt]:
             yield statement
 
 
-def _bound_names(statement: ast.stmt) -> list[str]:
+def _bound_names(statement: ast.AST) -> list[str]:
     match statement:
         case ast.FunctionDef(decorator_list=decorators):
             return [statement.name, *dict.fromkeys(_dispatching(decorators))]
@@ -147,7 +177,38 @@ def _bound_names(statement: ast.stmt) -> list[str]:
             return [n.id for target in statement.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
         case ast.AnnAssign(target=ast.Name(id=name)) | ast.AugAssign(target=ast.Name(id=name)):
             return [name]
+        case ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)) | ast.MatchMapping(rest=str(name)):
+            return [name]
+        case _ if isinstance(statement, _BLOCKS):
+            inner = [name for child in ast.walk(statement) if child is not statement for name in _bound_names(child)]
+            return [*inner, *(n.id for n in ast.walk(statement) if isinstance(n, ast.Name) and _is_written(n))]
     return []
+
+
+_BLOCKS = (ast.For, ast.AsyncFor, ast.While, ast.With, ast.AsyncWith, ast.Match)
+
+
+def _changed_names(statement: ast.stmt) -> Iterator[str]:
+    """The names whose objects a statement changes: `x[...] = y`, `x.y = z`, `x.append(y)`, `fill(x)`."""
+    if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return
+    for node in ast.walk(statement):
+        changed: list[ast.expr] = []
+        if isinstance(node, ast.Subscript | ast.Attribute) and _is_written(node):
+            changed = [node]
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+            changed = [*node.value.args, *(keyword.value for keyword in node.value.keywords)]
+            if not isinstance(node.value.func, ast.Name):
+                changed.append(node.value.func)
+        for part in changed:
+            while isinstance(part, ast.Subscript | ast.Attribute | ast.Starred | ast.Call):
+                part = part.func if isinstance(part, ast.Call) else part.value
+            if isinstance(part, ast.Name):
+                yield part.id
+
+
+def _is_written(node: ast.Name | ast.Subscript | ast.Attribute) -> bool:
+    return not isinstance(node.ctx, ast.Load)
 
 
 def _dispatching(decorators: list[ast.expr]) -> Iterator[str]:
@@ -164,7 +225,8 @@ def imports_of(module: Module, nodes: Iterable[ast.AST]) -> Imports:
     for node in nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
-                found.setdefault(alias.asname or alias.name.partition(".")[0], []).append((alias.name, None))
+                top = alias.name.partition(".")[0]  # `import a.b` binds a
+                found.setdefault(alias.asname or top, []).append((alias.name if alias.asname else top, None))
         elif isinstance(node, ast.ImportFrom):
             package = module.name if module.is_package else module.name.rpartition(".")[0]
             for _ in range(node.level - 1):

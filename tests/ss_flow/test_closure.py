@@ -83,11 +83,60 @@ def test_an_edited_helper_or_constant_is_named(package, edit, changed):
         "from probe import maths\n\ndef run(x):\n    return maths.twice(x)\n",
         "from .maths import twice as double\n\ndef run(x):\n    return double(x)\n",
         "import probe.maths as m\n\ndef run(x):\n    return m.twice(x)\n",
+        "import probe.maths\n\ndef run(x):\n    return probe.maths.twice(x)\n",
+        "def run(x):\n    import probe.maths\n    return probe.maths.twice(x)\n",
+        "import probe as p\n\ndef run(x):\n    return p.maths.twice(x)\n",
+        "from probe.maths import *\n\ndef run(x):\n    return twice(x)\n",
+        "from probe.all import *\n\ndef run(x):\n    return twice(x)\n",
+        "from probe.all import m\n\ndef run(x):\n    return m.twice(x)\n",
+        "import contextlib\nwith contextlib.suppress(ImportError):\n    from probe.maths import twice\n\n"
+        "def run(x):\n    return twice(x)\n",
     ],
-    ids=["local import", "module attribute", "relative import with alias", "module alias"],
+    ids=[
+        "local import",
+        "module attribute",
+        "relative import with alias",
+        "module alias",
+        "dotted",
+        "dotted, local",
+        "dotted through an alias",
+        "star",
+        "star of a star",
+        "alias of another module",
+        "in a block",
+    ],
 )
 def test_every_form_of_import_is_followed(package, step):
-    assert "probe.maths.FACTOR" in package(step=step, maths=MATHS)
+    further = "from probe.maths import *\nfrom probe.all import *\nfrom probe import maths as m\n"
+    assert "probe.maths.FACTOR" in package(step=step, maths=MATHS, all=further)
+
+
+@pytest.mark.parametrize(
+    "filling",
+    [
+        "for k in range(3):\n    TABLE[k] = k * TWO\n",
+        "TABLE.update(a=TWO)\n",
+        "TABLE.setdefault('a', []).append(TWO)\n",
+        "TABLE['a'] = 1\nTABLE['a'] += TWO\n",
+        "fill(TABLE, TWO)\n",
+        "while not TABLE:\n    fill(TABLE, TWO)\n",
+        "import contextlib\nwith contextlib.suppress(KeyError):\n    TABLE = {1: TWO}\n",
+        "match TWO:\n    case int(TABLE):\n        pass\n",
+    ],
+    ids=["loop", "method", "chain", "added to", "argument", "while", "block", "pattern"],
+)
+def test_the_statements_that_fill_a_table_belong_to_it(package, filling):
+    step = "TWO = 2\nOTHER = 1\nTABLE = {}\n\ndef fill(t, x):\n    t[x] = x\n\n\ndef run(x):\n    return TABLE\n\n"
+    found = package(step=step + filling)
+    assert "probe.step.TWO" in found and "probe.step.OTHER" not in found
+    edited = package(step=step + filling.replace("TWO", "3"))
+    assert found["probe.step.TABLE"] != edited["probe.step.TABLE"]
+
+
+def test_a_function_of_a_script_is_refused_since_its_code_cannot_be_followed():
+    exec("def run(x):\n    return x\n", namespace := {"__name__": "__main__"})
+    with pytest.raises(TypeError, match=r"code of __main__\.run cannot be followed"):
+        closure.closure_of(namespace["run"])
 
 
 def test_what_only_a_type_checker_sees_does_not_count(package):
