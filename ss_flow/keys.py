@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import platform
+import types
+import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +20,7 @@ SCHEMA = 3
 """Raised when the meaning of keys or of stored objects changes: everything is then computed anew."""
 
 _SIMPLE = (str, int, float, bool, type(None))
+_PLAIN = (*_SIMPLE, bytes)
 Components = dict[str, Any]
 Value = tuple[str, ...] | str
 """What an input resolves to: one digest, or the digests of a list."""
@@ -58,7 +62,7 @@ class Keys:
     def __init__(self, closure: Callable[[Callable[..., Any]], Closure] = closure_of) -> None:
         self._closure = closure
         self._recipes: dict[int, tuple[object, Recipe]] = {}
-        self._parameters: dict[int, tuple[object, str]] = {}
+        self._parameters: dict[tuple[int, str, Any], tuple[object, str]] = {}
         self._lists: dict[tuple[str, ...], str] = {}
 
     def recipe(self, task: Task[..., Any]) -> Recipe:
@@ -74,7 +78,8 @@ class Keys:
         Raises TypeError when a parameter is of a type that has no canonical form.
         """
         given = [
-            (name, value if type(value) in _SIMPLE else self._digest(name, value)) for name, value in parameters.items()
+            (name, value if type(value) in _SIMPLE else self._digest(name, value, task.hints.get(name)))
+            for name, value in parameters.items()
         ]
         counted = [(name, self.input(value)) for name, value in inputs.items()]
         return digest((self.recipe(task).digest, given, counted))
@@ -94,38 +99,68 @@ class Keys:
         and inputs (a digest by name, also for a list, so that its length does not count in every record)."""
         flat: dict[str, Any] = {}
         for name, value in parameters.items():
-            flat |= _flat("" if name == "params" else name, value)
+            flat |= _flat("" if name == "params" else name, value, task.hints.get(name))
         return {
             **self.recipe(task).components,
             "parameters": flat,
             "inputs": {name: self.input(value) for name, value in inputs.items()},
         }
 
-    def _digest(self, name: str, value: Any) -> str:
+    def _digest(self, name: str, value: Any, hint: Any) -> str:
         if not dataclasses.is_dataclass(value):
-            return digest(_flat(name, value))
-        if id(value) not in self._parameters:  # kept together with the value, so that its id is not used again
-            self._parameters[id(value)] = (value, digest(_flat(name, value)))
-        return self._parameters[id(value)][1]
+            return digest(_flat(name, value, hint))
+        known = (id(value), name, hint)
+        if known not in self._parameters:  # kept together with the value, so that its id is not used again
+            self._parameters[known] = (value, digest(_flat(name, value, hint)))
+        return self._parameters[known][1]
 
 
-def _flat(name: str, value: Any) -> dict[str, Any]:
-    """A parameter as {dotted name: plain value}; a file counts by content alone."""
+def _flat(name: str, value: Any, hint: Any) -> dict[str, Any]:
+    """A parameter as {dotted name: plain value}; a file counts by content alone.
+
+    hint: its declared type. Where that does not tell a dataclass's class, or no field would, the class counts too.
+    """
     if isinstance(value, FileRef):
         return {name: value.digest}
+    flat: dict[str, Any] = {}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        items: Any = (
-            (f.name, getattr(value, f.name)) for f in dataclasses.fields(value) if f.metadata.get("key", True)
-        )
+        kind = type(value)
+        counted = [f.name for f in dataclasses.fields(value) if f.metadata.get("key", True)]
+        items: Any = [(field, getattr(value, field), _hints(kind).get(field)) for field in counted]
+        if not items or [typing.get_origin(one) or one for one in _candidates(hint)] != [kind]:
+            flat[name or "params"] = f"{kind.__module__}.{kind.__qualname__}"
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes) and any(map(_is_nested, value)):
-        items = ((str(i), item) for i, item in enumerate(value))
+        items = [(str(i), item, _hint_of_item(hint, i)) for i, item in enumerate(value)]
     else:
         digest(value)  # refuses a type that has no canonical form, here where the parameter's name is known
         return {name: _plain(value)}
-    flat: dict[str, Any] = {}
-    for inner, item in items:
-        flat |= _flat(f"{name}.{inner}" if name else inner, item)
+    for inner, item, inner_hint in items:
+        flat |= _flat(f"{name}.{inner}" if name else inner, item, inner_hint)
     return flat
+
+
+def _candidates(hint: Any) -> list[Any]:
+    """What a value of a declared type may be, besides plain values."""
+    among = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+    return [one for one in among if one not in _PLAIN and typing.get_origin(one) is not typing.Literal]
+
+
+def _hint_of_item(hint: Any, index: int) -> Any:
+    for one in _candidates(hint):
+        among = typing.get_args(one)
+        if typing.get_origin(one) is not tuple or among[1:] == (...,):
+            index = 0
+        return among[index] if index < len(among) else None
+    return None
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    """The declared types of a dataclass's fields; none where one of them is not known at run time."""
+    try:
+        return typing.get_type_hints(kind)
+    except NameError:
+        return {}
 
 
 def _plain(value: Any) -> Any:

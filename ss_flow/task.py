@@ -133,6 +133,11 @@ class Task(Generic[P, R]):
         return self.function(**whole, **parameters)  # type: ignore[call-arg]
 
     @functools.cached_property
+    def hints(self) -> dict[str, Any]:
+        """The declared types of all arguments, and of the result as "return"."""
+        return typing.get_type_hints(self.function)
+
+    @functools.cached_property
     def _defaults(self) -> dict[str, Any]:
         """The parameters by name; `Parameter.empty` for one that has no default."""
         return {p.name: p.default for p in self.signature.parameters.values() if p.kind == p.KEYWORD_ONLY}
@@ -159,13 +164,12 @@ class Task(Generic[P, R]):
     @functools.cached_property
     def _artifacts(self) -> dict[str, Any]:
         """The types of the positional parameters by name."""
-        hints = typing.get_type_hints(self.function)
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        return {p.name: hints[p.name] for p in self.signature.parameters.values() if p.kind in positional}
+        return {p.name: self.hints[p.name] for p in self.signature.parameters.values() if p.kind in positional}
 
     @functools.cached_property
     def returns_list(self) -> bool:
-        return typing.get_origin(typing.get_type_hints(self.function)["return"]) is tuple
+        return typing.get_origin(self.hints["return"]) is tuple
 
 
 def _is_bundle(kind: Any) -> bool:

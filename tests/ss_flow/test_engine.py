@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from dataclasses import dataclass
 
 import pytest
 import ss_flow_toy as toy
@@ -16,6 +17,7 @@ from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
+from ss_flow.task import task
 
 
 def run(store, build, **kwargs):
@@ -381,10 +383,71 @@ def test_a_record_does_not_grow_with_the_lists_that_go_in_and_a_list_is_kept_onc
 
 
 def test_lists_that_differ_only_in_order_or_length_have_other_keys():
-    task, keys = toy.total, Keys()
+    keys = Keys()
     lists = [("aa", "bb"), ("bb", "aa"), ("aa",), ("aa", "bb", "bb"), ("aabb",), ()]
-    assert len({keys.key(task, {"xs": each_list}, {}) for each_list in lists}) == len(lists)
-    assert keys.key(task, {"xs": ("aa",)}, {}) != keys.key(task, {"xs": "aa"}, {})
+    assert len({keys.key(toy.total, {"xs": each_list}, {}) for each_list in lists}) == len(lists)
+    assert keys.key(toy.total, {"xs": ("aa",)}, {}) != keys.key(toy.total, {"xs": "aa"}, {})
+
+
+@dataclass(frozen=True)
+class Linear:
+    slope: float = 1.0
+
+
+@dataclass(frozen=True)
+class Square(Linear):
+    pass
+
+
+@dataclass(frozen=True)
+class Nothing:
+    pass
+
+
+@dataclass(frozen=True)
+class Holder:
+    one: Linear | Nothing
+    many: tuple[Linear, ...] = ()
+
+
+@task()
+def modelled(
+    *,
+    base: Linear = Linear(),
+    union: Linear | Holder | None = None,
+    several: tuple[Linear, ...] | None = None,
+    empty: Nothing | None = None,
+) -> Linear:
+    return Linear()
+
+
+def test_the_class_of_a_parameter_counts_where_its_declared_type_does_not_tell_it():
+    given = [
+        {},
+        {"base": Square()},
+        {"union": Linear()},
+        {"union": Square()},
+        {"union": Holder(Linear())},
+        {"union": Holder(Square())},
+        {"union": Holder(Nothing())},
+        {"union": Holder(Nothing(), (Linear(),))},
+        {"union": Holder(Nothing(), (Square(),))},
+        {"several": (Linear(),)},
+        {"several": (Square(),)},
+        {"empty": Nothing()},
+    ]
+    assert len({Keys().key(modelled, {}, one) for one in given}) == len(given)
+    parts = [Keys().components(modelled, {}, one)["parameters"] for one in ({"base": Linear()}, {"base": Square()})]
+    assert parts == [{"base.slope": 1.0}, {"base": f"{__name__}.Square", "base.slope": 1.0}]
+    assert Keys().components(modelled, {}, {"several": (Linear(2.0),)})["parameters"] == {"several.0.slope": 2.0}
+
+
+def test_a_parameter_that_two_tasks_share_has_the_same_keys_whoever_comes_first():
+    shared = Linear(2.0)
+    calls = [{"base": shared}, {"union": shared}]
+    one, other = Keys(), Keys()
+    found = {one.key(modelled, {}, call) for call in calls} | {other.key(modelled, {}, call) for call in calls[::-1]}
+    assert len(found) == 2
 
 
 def test_a_cut_last_line_of_the_event_log_is_left_out(store):
