@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import itertools
 import json
 import math
 import os
@@ -284,7 +285,10 @@ def _plain(content: Any, where: str) -> Any:
 
 
 def _restored(content: Any, hint: Any) -> Any:
-    if typing.get_origin(hint) is tuple and isinstance(content, list):
-        inner = typing.get_args(hint)[:1] or (Any,)
-        return tuple(_restored(item, inner[0]) for item in content)
-    return float(content) if hint is float else content
+    """A field as it was written: lists as the tuples that they are declared to be; nothing else is converted."""
+    if typing.get_origin(hint) is not tuple or not isinstance(content, list):
+        return content
+    inner = typing.get_args(hint)
+    if inner[1:] == (...,):
+        inner = inner[:1] * len(content)
+    return tuple(_restored(item, kind) for item, kind in itertools.zip_longest(content, inner[: len(content)]))

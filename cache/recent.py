@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections import OrderedDict
 from typing import Any
@@ -49,4 +50,5 @@ class Recent:
 
 
 def _array_bytes(value: Any) -> int:
-    return 256 + sum(item.nbytes for item in vars(value).values() if isinstance(item, np.ndarray))
+    fields = (getattr(value, field.name) for field in dataclasses.fields(value))
+    return 256 + sum(field.nbytes for field in fields if isinstance(field, np.ndarray))

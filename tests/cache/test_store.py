@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+import ss_flow_toy as toy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -263,3 +264,15 @@ def test_a_store_that_cannot_be_written_says_so_in_one_sentence(store, monkeypat
         store.put(value)
     with pytest.raises(StoreFailure, match="it has vanished"):
         store.open_claims().take("k")
+
+
+@pytest.mark.parametrize(
+    "score",
+    [toy.Score(3), toy.Score(0.5, (0.5, 7)), toy.Score(0.5, (1, 2)), toy.Score(0.5, path=((1, 2), "right"))],
+    ids=["whole number", "types in turn", "whole numbers", "nested"],
+)
+def test_what_is_stored_comes_back_as_it_was_and_not_as_its_type_declares(store, score):
+    digest = store.put(score)
+    for found in (store.get(digest), store.get(digest), Store(store.root).get(digest)):
+        for name in ("value", "at", "path"):
+            assert repr(getattr(found, name)) == repr(getattr(score, name))

@@ -6,7 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,16 @@ from ss_flow.task import Bundle, FileRef, Resources, task
 @dataclass(frozen=True)
 class Number:
     value: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Plain values of declared types."""
+
+    value: float
+    at: tuple[float, int] = (0.0, 0)
+    path: tuple[tuple[int, ...], str] = ((), "")
+    cells: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
 
 def number(value: float) -> Number:
