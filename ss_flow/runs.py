@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 DONE = ("hit", "finished")
 RUNS_BACK = 5
 """How many runs `why` looks back."""
+NAME_BYTES = 100
+"""How much of a scene's name the name of a run's folder takes: file systems allow 255 bytes in all."""
 ENDS = (*DONE, "failed", "skipped", "would run")
 """Kinds of events that say what a node came to."""
 
@@ -99,6 +101,7 @@ def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 def start_run(runs: Path, header: dict[str, Any]) -> Run:
     """Open a run: its folder, with what was asked."""
     name = "".join(c if c.isalnum() else "-" for c in Path(header["scene"]).name)
+    name = name.encode()[:NAME_BYTES].decode(errors="ignore")  # never in the middle of a character
     folder = runs / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}-{uuid.uuid4().hex[:6]}"
     folder.mkdir(parents=True)
     header = header | {"started": time.time()}

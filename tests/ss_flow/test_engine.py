@@ -450,6 +450,13 @@ def test_a_parameter_that_two_tasks_share_has_the_same_keys_whoever_comes_first(
     assert len(found) == 2
 
 
+@pytest.mark.parametrize("name", ["x" * 300, "\u5199" * 100, "\u00e9" * 100])
+def test_the_folder_of_a_run_has_a_name_that_file_systems_take(store, name):
+    folder = run_flow(lambda: {}, store, scene=f"/scenes/{name}").run_folder
+    assert name[:30] in folder and len(folder.rpartition("/")[2].encode()) <= 130
+    assert [found.scene for found in latest_runs(store.runs)] == [f"/scenes/{name}"]
+
+
 def test_a_cut_last_line_of_the_event_log_is_left_out(store):
     run(store, toy.flow)
     latest = next(latest_runs(store.root / "roots" / "runs"))
