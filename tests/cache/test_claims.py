@@ -5,7 +5,9 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import psutil
 import pytest
 
 from ss_flow.cache import claims as module
@@ -47,6 +49,14 @@ def test_the_claim_of_another_process_with_the_same_number_is_taken_over(store, 
     ours = json.loads(claims._token)
     place(store).write_text(json.dumps({**ours, "started": ours["started"] - 1000}))
     assert claims.take("k")
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="only here the start has a clock that nobody sets")
+def test_the_claim_of_a_living_process_holds_when_the_clock_is_set(store, claims, monkeypatch):
+    place(store).write_text(json.dumps({**json.loads(claims._token), "token": "another"}))
+    now = psutil.Process().create_time()
+    monkeypatch.setattr(psutil.Process, "create_time", lambda process: now + 3600)
+    assert not claims.take("k")
 
 
 def test_the_claim_of_another_host_expires_by_our_own_clock_only(store, claims, monkeypatch):

@@ -450,7 +450,7 @@ def test_a_parameter_that_two_tasks_share_has_the_same_keys_whoever_comes_first(
     assert len(found) == 2
 
 
-@pytest.mark.parametrize("name", ["x" * 300, "\u5199" * 100, "\u00e9" * 100])
+@pytest.mark.parametrize("name", ["x" * 300, "\u5199" * 100, "\u00e9" * 100], ids=["long", "3 bytes", "2 bytes"])
 def test_the_folder_of_a_run_has_a_name_that_file_systems_take(store, name):
     folder = run_flow(lambda: {}, store, scene=f"/scenes/{name}").run_folder
     assert name[:30] in folder and len(folder.rpartition("/")[2].encode()) <= 130
