@@ -199,6 +199,9 @@ class Folder:
                 return False
             try:
                 os.write(handle, content)
+            except OSError:
+                os.unlink(f"{self._folder}/{key}")  # an empty one would be in everyone's way until it expires
+                raise
             finally:
                 os.close(handle)
         return True

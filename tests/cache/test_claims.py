@@ -12,6 +12,7 @@ import pytest
 
 from ss_flow.cache import claims as module
 from ss_flow.cache.claims import Claims
+from ss_flow.cache.errors import StoreFailure
 
 
 @pytest.fixture
@@ -57,6 +58,16 @@ def test_the_claim_of_a_living_process_holds_when_the_clock_is_set(store, claims
     now = psutil.Process().create_time()
     monkeypatch.setattr(psutil.Process, "create_time", lambda process: now + 3600)
     assert not claims.take("k")
+
+
+def test_a_disk_that_is_full_leaves_no_empty_claim(store, claims, monkeypatch):
+    def full(handle, content):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.os, "write", full)
+    with pytest.raises(StoreFailure, match="No space left"):
+        claims.take("k")
+    assert not place(store).exists()
 
 
 def test_the_claim_of_another_host_expires_by_our_own_clock_only(store, claims, monkeypatch):
