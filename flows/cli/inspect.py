@@ -183,7 +183,7 @@ def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
 
 
 def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:
-    """From a changed input back, step by step, to the change that began it."""
+    """From a changed input back, step by step, to the change that began it; of a step's nodes that of the same item."""
     found: list[str] = []
     seen = {node["step"]}
     while (why := node.get("why", "")).startswith("input "):
@@ -191,7 +191,7 @@ def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:
         changed = [n for n in nodes if n["step"] == producer and "why" in n and n["event"] == "finished"]
         if not changed or producer in seen:
             break
-        node = changed[0]
+        node = next((n for n in changed if n["item"] == node["item"]), changed[0])
         seen.add(node["step"])
         found.append(f"{node['step']}: {node['why']}")
     return found

@@ -9,9 +9,12 @@ import re
 import cv2
 import numpy as np
 import pytest
+import ss_flow_toy as toy
 from tiny_runs import run_tiny, ss_flow
 
 from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+from ss_flow.graph import labelled
 from ss_flow.runs import latest_runs
 from ss_flow.tasks import artifacts
 
@@ -66,6 +69,25 @@ def test_why_looks_further_back_where_the_latest_run_is_of_something_else(warm):
     assert told[1].startswith("split.propagate: ")
     assert ss_flow("why", "propagate", "/edited", "--cache", warm.store).code == 2
     assert ss_flow("cache", "show", "propagate", "--cache", warm.store).code == 0
+
+
+def test_why_goes_back_by_the_nodes_of_the_same_item(tmp_path):
+    def flow(limits, values):
+        results = {}
+        for item, limit, value in zip("ab", limits, values, strict=True):
+            with labelled(item):
+                results[item] = toy.square(toy.clip(toy.source(values=(value,))[0], limit=limit))
+        return results
+
+    store = Store(tmp_path / "store")
+    run_flow(lambda: flow((2.0, 9.0), (5.0, 1.0)), store, scene="/toy", jobs=1)
+    run_flow(lambda: flow((3.0, 9.0), (5.0, 4.0)), store, scene="/toy", jobs=1)
+    told = {item: ss_flow("why", f"square[{item}]", "--cache", store.root).out.splitlines() for item in "ab"}
+    assert told["a"][1:] == ["  because ss_flow_toy.clip: parameter limit 2.0 -> 3.0"]
+    assert told["b"][1:] == [
+        "  because ss_flow_toy.clip: input x changed",
+        "  because ss_flow_toy.source: parameter values [1.0] -> [4.0]",
+    ]
 
 
 def test_the_graph_is_mermaid_with_a_box_a_step_and_what_feeds_it(tiny):
