@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
 from typing import Any
 
+from ss_flow.cache.canonical import digest
 from ss_flow.keys import Components
 
 SHOWN_CHARACTERS = 60
@@ -51,8 +52,9 @@ def changed_inputs(before: Components, now: Components) -> list[str]:
 
 
 def _changed(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    missing = object()
-    return [n for n in {**now, **before} if before.get(n, missing) != now.get(n, missing)]
+    """Names whose values differ as keys see it: 1, 1.0 and True do, and so do 0.0 and -0.0."""
+    names = {**now, **before}
+    return [n for n in names if n not in before or n not in now or digest(before[n]) != digest(now[n])]
 
 
 def _shown(values: dict[str, Any], name: str) -> str:

@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ss_flow.cache.canonical import digest
 from ss_flow.closure import Closure, closure_of, fix_sources
 from ss_flow.distributions import version, versions_of
@@ -75,11 +77,12 @@ class Keys:
     def key(self, task: Task[..., Any], inputs: Mapping[str, Value], parameters: Mapping[str, Any]) -> str:
         """The key of one call.
 
-        Raises TypeError when a parameter is of a type that has no canonical form.
+        Raises TypeError when a parameter is not plain data.
         """
+        plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in parameters.items()}
         given = [
             (name, value if type(value) in _SIMPLE else self._digest(name, value, task.hints.get(name)))
-            for name, value in parameters.items()
+            for name, value in plain.items()
         ]
         counted = [(name, self.input(value)) for name, value in inputs.items()]
         return digest((self.recipe(task).digest, given, counted))
@@ -132,8 +135,7 @@ def _flat(name: str, value: Any, hint: Any) -> dict[str, Any]:
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes) and any(map(_is_nested, value)):
         items = [(str(i), item, _hint_of_item(hint, i)) for i, item in enumerate(value)]
     else:
-        digest(value)  # refuses a type that has no canonical form, here where the parameter's name is known
-        return {name: _plain(value)}
+        return {name: _plain(name, value)}
     for inner, item, inner_hint in items:
         flat |= _flat(f"{name}.{inner}" if name else inner, item, inner_hint)
     return flat
@@ -163,9 +165,17 @@ def _hints(kind: type) -> dict[str, Any]:
         return {}
 
 
-def _plain(value: Any) -> Any:
+def _plain(name: str, value: Any) -> Any:
     """A value as JSON gives it back, so that a key's parts compare equal after being stored."""
-    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, tuple | list):
+        return [_plain(name, item) for item in value]
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {key: _plain(name, item) for key, item in value.items()}
+    if isinstance(value, _SIMPLE):
+        return value
+    raise TypeError(f"the parameter {name} holds a {type(value).__name__}, which is not plain data; make it an input")
 
 
 def _is_nested(value: Any) -> bool:

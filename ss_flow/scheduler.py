@@ -182,9 +182,11 @@ class Scheduler:
         known = self._flows[node.flow].previous(node.label)
         if known is None:
             return "never computed for this scene"
-        before = self._store.action(known, whole=False)
-        if before is None or known == key:
+        if known == key:
             return "its result is no longer in the store"
+        before = self._store.action(known, whole=False)
+        if before is None:
+            return "what changed is not known: the record of the last time is no longer in the store"
         closure = self._keys.recipe(node.task).closure
         code = before.components["code"]
         known_code = closure if code == parts["code"] else self._store.part(code) or {}

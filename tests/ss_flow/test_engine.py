@@ -5,6 +5,7 @@ import threading
 import time
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import ss_flow_toy as toy
 
@@ -474,6 +475,40 @@ def test_a_result_gone_from_the_store_is_computed_again(store):
     assert ran(again) == ["ss_flow_toy.total"]
     assert again.values == report.values
     assert json.loads(json.dumps(again.nodes[-1]))["why"] == "its result is no longer in the store"
+
+
+def test_what_changed_is_not_known_where_the_record_of_the_last_time_is_gone(store):
+    run(store, toy.flow)
+    for entry in list(store.actions()):
+        store.forget(entry.name)
+    why = {n["step"]: n["why"] for n in run(store, lambda: toy.flow(limit=5.0)).nodes if n["event"] == "finished"}
+    assert why["ss_flow_toy.source"] == "its result is no longer in the store"
+    assert why["ss_flow_toy.clip"].startswith("what changed is not known")
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "said"),
+    [(1, 1.0, "1 -> 1.0"), (-0.0, 0.0, "-0.0 -> 0.0"), (True, 1, "True -> 1"), ({"a": 1}, {"a": 1.0}, "{'a': 1} -> ")],
+)
+def test_values_that_only_python_takes_for_equal_are_told_apart(then, now, said):
+    parts = {"task": {}, "code": {}, "packages": {}, "environment": {}, "inputs": {}}
+    changed = first_difference({**parts, "parameters": {"x": then}}, {**parts, "parameters": {"x": now}})
+    assert changed.startswith(f"parameter x {said}")
+    same = {**parts, "parameters": {"x": float("nan"), "y": {"a": 1, "b": 2}}}
+    assert first_difference(same, {**parts, "parameters": {"y": {"b": 2, "a": 1}, "x": float("nan")}}) == ""
+
+
+def test_a_numpy_scalar_counts_as_the_number_that_it_is(store):
+    first = run(store, lambda: toy.flow(limit=5.0))
+    assert ran(run(store, lambda: toy.flow(limit=np.float64(5.0)))) == []
+    assert ran(run(store, lambda: toy.flow(values=(np.float64(1.0), 2, np.float32(3.0)))))
+    assert first.failures == []
+
+
+@pytest.mark.parametrize("value", [np.zeros(2), b"bytes", {"a": (1, np.zeros(2))}, {1: 2}, 1j])
+def test_a_parameter_that_is_not_plain_data_is_refused_before_anything_is_computed(value):
+    with pytest.raises(TypeError, match="the parameter limit holds a"):
+        Keys().key(toy.clip, {"x": "aa"}, {"limit": value})
 
 
 def test_an_unknown_executor_is_refused_in_one_sentence(store):
