@@ -83,11 +83,6 @@ def closure_of(function: Callable[..., Any]) -> Closure:
     return found
 
 
-def code_closure(function: Callable[..., Any]) -> dict[str, str]:
-    """Digests of all definitions that `function` depends on, by qualified name, itself included."""
-    return dict(closure_of(function).definitions)
-
-
 def forget() -> None:
     """Read the sources anew the next time; a process reads each of them once."""
     with reading:

@@ -55,7 +55,6 @@ class Report:
     nodes: list[dict[str, Any]]
     """One event for every node that was reached, with its time: hit, finished, failed, skipped or would run."""
     failures: list[Failure]
-    run_folder: str
 
     def succeeded(self) -> dict[str, Value]:
         """The outputs by name. Raises the error of the first that failed."""
@@ -169,7 +168,6 @@ class _Run:
     ) -> None:
         self._requests, self._store, self._claims = requests, store, claims
         self._logs: list[Log] = []
-        self._folders = ["" for _ in requests]
         self._healed: set[str] = set()
         self._open = set(range(len(requests)))
         self._flows, self._targets = self._built()
@@ -179,12 +177,11 @@ class _Run:
         runs = store.runs
         previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
         self._previous = [previous[request.scene] for request in requests]
-        for position, request in enumerate(requests):
+        for request in requests:
             events = None
             if recorded:
                 folder = start_run(runs, {"scene": request.scene, **request.header}).folder
                 claims.take(RUN_CLAIM + folder.name)
-                self._folders[position] = str(folder)
                 events = folder / "events.jsonl"
             self._logs.append(Log(events, store.root))
             self._reporters.append(Reporters(self._logs[-1], request.reporter) if request.reporter else self._logs[-1])
@@ -223,7 +220,7 @@ class _Run:
             failures = scheduler.failures[flow]
             results = {name: _digests(value) for name, value in values.items() if not isinstance(value, Failure)}
             self._reporters[position].event("run ended", failed=len(failures), results=results)
-            report = Report(values, settled(self._logs[position].ended), failures, self._folders[position])
+            report = Report(values, settled(self._logs[position].ended), failures)
             self._open.discard(position)
             if position not in self._reported:
                 try:

@@ -24,7 +24,7 @@ def package(tmp_path, monkeypatch):
             del sys.modules[name]
         importlib.invalidate_caches()
         closure.forget()
-        return closure.code_closure(importlib.import_module("probe.step").run)
+        return closure.closure_of(importlib.import_module("probe.step").run).definitions
 
     return closure_of
 

@@ -15,7 +15,7 @@ import pytest
 from registered_tasks import registered_tasks
 
 from ss_flow import keys
-from ss_flow.closure import Closure, code_closure
+from ss_flow.closure import Closure, closure_of
 from ss_flow.keys import Recipe
 from ss_flow.task import Task
 from ss_flow.tasks import processor
@@ -50,7 +50,7 @@ def top_level(value: Any) -> str:
 def imported(task: Task[..., Any]) -> dict[str, str]:
     """The modules of others that the compiled code of a task's closure imports or names, and who does."""
     found: dict[str, str] = {}
-    for qualified in code_closure(task.function):
+    for qualified in closure_of(task.function).definitions:
         module, _, name = qualified.rpartition(".")
         for code, known in code_objects(getattr(sys.modules.get(module), name, None)):
             for step in dis.get_instructions(code):
@@ -76,7 +76,9 @@ def test_the_key_of_a_task_knows_every_distribution_that_its_code_imports(name):
 
 def test_a_key_that_lacks_a_distribution_is_found_by_that_test(monkeypatch):
     task = TASKS["splat.plan"]
-    monkeypatch.setattr(keys, "closure_of", lambda function: Closure(code_closure(function), frozenset({"numpy"}), {}))
+    monkeypatch.setattr(
+        keys, "closure_of", lambda function: Closure(closure_of(function).definitions, frozenset({"numpy"}), {})
+    )
     assert set(unknown(task)) == {"scipy"}
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ss_flow.closure import code_closure
+from ss_flow.closure import closure_of
 from ss_flow.errors import InputError
 from ss_flow.keys import Recipe
 from ss_flow.tasks.gaussians import library
@@ -21,7 +21,7 @@ FOLDER = Path(library.__file__).parent
 def test_every_native_source_counts_in_the_keys_of_training():
     listed = {path.relative_to(FOLDER).as_posix() for path in (FOLDER / "native").iterdir()}
     assert set(library.NATIVE_SOURCES) == listed
-    closure = code_closure(reconstruct.function)
+    closure = closure_of(reconstruct.function).definitions
     assert all(f"{library.__name__}:{source}" in closure for source in listed)
 
 
