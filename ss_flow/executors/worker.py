@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import queue
 import signal
 import subprocess
@@ -121,8 +122,14 @@ def serve(descriptor: int) -> None:
         try:
             reply: tuple[str, Any] = ("finished", execute_here(invocation, listener))
         except Exception as error:
-            reply = ("raised", error)
-        try:
-            connection.send(reply)
-        except Exception as error:  # what cannot be pickled travels as its text
-            connection.send(("raised", RuntimeError(f"{type(reply[1]).__name__}: {reply[1]} ({error})")))
+            reply = ("raised", _portable(error))
+        connection.send(reply)
+
+
+def _portable(error: Exception) -> Exception:
+    """An exception that arrives as it is; what cannot be pickled, or not be made again from that, becomes its text."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception as fault:
+        return RuntimeError(f"{type(error).__name__}: {error} ({fault})")
+    return error

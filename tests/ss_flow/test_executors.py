@@ -127,9 +127,10 @@ def test_what_a_task_raises_comes_back_as_itself(store, executor):
     assert str(error) == "negative"
 
 
-def test_what_cannot_travel_comes_back_as_its_text(store, executor):
-    error = executor.error(call(store, toy.unsayable, 2.0))
-    assert type(error) is (ValueError if executor.name == "threads" else RuntimeError)
+@pytest.mark.parametrize(("task", "raised"), [(toy.unsayable, ValueError), (toy.unmade, toy.Unmade)])
+def test_what_cannot_travel_comes_back_as_its_text(store, executor, task, raised):
+    error = executor.error(call(store, task, 2.0))
+    assert type(error) is (raised if executor.name == "threads" else RuntimeError)
     assert "two is too much" in str(error)
     assert value(store, executor.run(call(store, toy.square, 3.0)).outputs[0]) == 9.0
 

@@ -222,6 +222,19 @@ def unsayable(x: Number) -> Number:
     raise ValueError("two is too much", lambda: x)
 
 
+class Unmade(Exception):
+    """Can be pickled, but not be made again from what its text is."""
+
+    def __init__(self, first: str, second: str) -> None:
+        super().__init__(f"{first} {second}")
+
+
+@task()
+def unmade(x: Number) -> Number:
+    """Raises what cannot be read back."""
+    raise Unmade("two is", "too much")
+
+
 @task()
 def nap(x: Number) -> Number:
     time.sleep(0.05)
