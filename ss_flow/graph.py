@@ -50,6 +50,10 @@ class Node:
         """One artifact of a list."""
         return Item(self.flow, self.step, str(index), self, index)
 
+    def __iter__(self) -> Iterator[Node]:
+        """Refused: Python would take one item after the other for ever."""
+        raise TypeError(f"how many items {self.label} has is known only when it runs; use `each` to go through them")
+
 
 @dataclass(eq=False)
 class Call(Node):

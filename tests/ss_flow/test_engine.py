@@ -520,6 +520,12 @@ def test_an_input_that_is_no_node_is_refused():
         gather([1.0])
 
 
+def test_a_node_cannot_be_gone_through_as_a_list():
+    flow = Flow("x")
+    with flow.building(), pytest.raises(TypeError, match="use `each`"):
+        tuple(toy.source(values=(1.0,)))
+
+
 def test_a_gpu_counts_where_the_driver_shows_one_unless_tasks_are_said_to_use_none(monkeypatch):
     monkeypatch.setattr(engine.glob, "glob", lambda pattern: ["/dev/nvidia0", "/dev/nvidia1"])
     assert [engine._this_machine(gpus).gpus for gpus in (None, 0, 1)] == [1, 0, 1]
