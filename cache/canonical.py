@@ -99,7 +99,7 @@ class _Encoder:
         for item in value:  # most are digests and names, or pairs with them
             kind = type(item)
             if kind is str:
-                content = item.encode()
+                content = _bytes(item)
                 pending += b"s" + _LENGTH(len(content)) + content
             elif kind is tuple or kind is list:
                 self._add_items(item)
@@ -112,7 +112,7 @@ class _Encoder:
             if not isinstance(name, str):
                 raise TypeError(f"cannot digest a mapping with a key of type {type(name).__name__}")
         for name in sorted(value):
-            self._tagged(b"k", name.encode())
+            self._tagged(b"k", _bytes(name))
             self.add(value[name])
 
     def _add_array(self, array: np.ndarray) -> None:
@@ -133,8 +133,12 @@ class _Encoder:
             self._hasher.update(block.view(np.uint8).data)
 
 
+def _bytes(text: str) -> bytes:
+    return text.encode(errors="surrogatepass")  # the name of a file may hold bytes that are no text
+
+
 _ENCODERS: dict[type, Callable[[_Encoder, Any], None]] = {
-    str: lambda encoder, value: encoder._tagged(b"s", value.encode()),
+    str: lambda encoder, value: encoder._tagged(b"s", _bytes(value)),
     bool: lambda encoder, value: encoder._tagged(b"b", b"\x01" if value else b"\x00"),
     int: lambda encoder, value: encoder._tagged(b"i", str(value).encode()),
     float: lambda encoder, value: encoder._tagged(b"f", _FLOAT(float("nan") if value != value else value)),

@@ -276,3 +276,12 @@ def test_what_is_stored_comes_back_as_it_was_and_not_as_its_type_declares(store,
     for found in (store.get(digest), store.get(digest), Store(store.root).get(digest)):
         for name in ("value", "at", "path"):
             assert repr(getattr(found, name)) == repr(getattr(score, name))
+
+
+def test_the_digest_of_a_file_whose_name_is_no_text_is_remembered(tmp_path):
+    file = tmp_path / "a\udcff.jpg"
+    file.write_bytes(b"x")
+    digests = FileDigests(tmp_path / "files.json")
+    known = digests(file)
+    digests.save()
+    assert FileDigests(tmp_path / "files.json")._known[str(file)][3] == known
