@@ -33,7 +33,7 @@ from ss_flow.cache.bucket import Bucket
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims, Seen
 from ss_flow.cache.codec import OtherFields
-from ss_flow.cache.errors import Gone, writing
+from ss_flow.cache.errors import Gone, OtherVersion, writing
 from ss_flow.cache.files import rename_folder, user_cache
 from ss_flow.cache.store import GRACE_SECONDS, MEMORY_BYTES, Action, Entry, Store, verified
 
@@ -138,7 +138,7 @@ class RemoteStore(Store):
         try:
             value = verified(place, object_digest)
         except OtherFields as error:
-            raise self._other_version(object_digest, error) from None
+            raise OtherVersion(object_digest, str(error)) from None
         except ValueError as error:
             self.discard(object_digest)
             raise Gone(object_digest, f"was damaged ({error})") from None

@@ -165,7 +165,10 @@ class Store:
         """
         value = self._recent.get(object_digest)
         if value is None:
-            value = self._load(object_digest)
+            try:
+                value = self._load(object_digest)
+            except OtherVersion as found:
+                raise self._with_its_step(found) from None
             self._recent.keep(object_digest, value)
         return value
 
@@ -179,17 +182,16 @@ class Store:
         try:
             return verified(self.object_path(object_digest), object_digest)
         except codec.OtherFields as error:
-            raise self._other_version(object_digest, error) from None
+            raise OtherVersion(object_digest, str(error)) from None
         except ValueError as error:
             self.discard(object_digest)
             raise Gone(object_digest, f"was damaged ({error})") from None
 
-    def _other_version(self, object_digest: str, error: codec.OtherFields) -> OtherVersion:
-        """What to raise for an object of another version; names the step that made it, where one is recorded."""
+    def _with_its_step(self, found: OtherVersion) -> OtherVersion:
+        """The same, naming the step that made the object, where one is recorded; reads every record."""
         recorded = (self.action(entry.name, whole=False) for entry in self.actions())
-        makers = (action.step for action in recorded if action and object_digest in action.outputs)
-        step = next(makers, None)
-        return OtherVersion(object_digest, f"{error}{f' (a result of {step})' if step else ''}")
+        step = next((action.step for action in recorded if action and found.digest in action.outputs), None)
+        return OtherVersion(found.digest, f"{found.reason} (a result of {step})") if step else found
 
     def restore(self, object_digest: str) -> None:
         """Restore what can be restored when someone else finds an object missing that this process counts on."""

@@ -228,7 +228,10 @@ def test_an_object_whose_type_has_other_fields_by_now_stays_and_is_not_called_da
         with pytest.raises(OtherVersion) as told:
             Store(store.root).get(output)
         assert said in str(told.value) and "split.look" in str(told.value) and "damaged" not in str(told.value)
+        walks, actions = [], Store.actions
+        patch.setattr(Store, "actions", lambda store: walks.append(store) or actions(store))
         assert verify(store).damaged == ()
+        assert len(walks) == 1  # not once for each such object
     assert Store(store.root).get(output).name == "x"
 
 
