@@ -37,13 +37,18 @@ class Resolution:
     """The values of nodes, as they become known.
 
     load: gives the artifact of a digest, for what decides how the graph goes on. call: gets a call whose inputs are
-    known; it must be settled sooner or later. skipped: hears of a call that cannot be made, and why.
+    known; it must be settled sooner or later. skipped: hears of a call that cannot be made, and why. failed: hears of
+    a node that cannot be expanded, or picks what its list does not have.
     """
 
     def __init__(
-        self, load: Callable[[str], Any], call: Callable[[Call], None], skipped: Callable[[Call, Failure], None]
+        self,
+        load: Callable[[str], Any],
+        call: Callable[[Call], None],
+        skipped: Callable[[Call, Failure], None],
+        failed: Callable[[Node, Failure], None],
     ) -> None:
-        self._load, self._call, self._skipped = load, call, skipped
+        self._load, self._call, self._skipped, self._failed = load, call, skipped, failed
         self.values: dict[Node, Value | Failure] = {}
         self.known_calls: dict[Flow, KnownCalls] = defaultdict(KnownCalls)
         self._unresolved: dict[Node, int] = {}
@@ -147,16 +152,10 @@ class Resolution:
                     self._skipped(node, failed)
                     self.settle(node, failed)
             case Item():
-                value = self.values[node.source]
-                assert not isinstance(value, str), f"{node.label} is one of a list, but its source is a single artifact"
-                self.settle(node, value if isinstance(value, Failure) else value[node.index])
+                chosen = self._chosen(node, node.source, (node.index,))
+                self.settle(node, chosen if isinstance(chosen, Failure) else chosen[0])
             case Pick():
-                value = self.values[node.source]
-                assert not isinstance(value, str), (
-                    f"{node.label} is some of a list, but its source is a single artifact"
-                )
-                chosen = value if isinstance(value, Failure) else tuple(value[i] for i in node.positions)
-                self.settle(node, chosen)
+                self.settle(node, self._chosen(node, node.source, node.positions))
             case Gather():
                 self.settle(node, self._gathered(node))
             case Expand():
@@ -184,6 +183,22 @@ class Resolution:
                     return value
         return None
 
+    def _chosen(self, node: Node, source: Node, positions: Sequence[int]) -> tuple[str, ...] | Failure:
+        """Some items of a list."""
+        value = self.values[source]
+        if isinstance(value, Failure):
+            return value
+        assert not isinstance(value, str), f"{node.label} is of a list, but its source is a single artifact"
+        try:
+            return tuple(value[position] for position in positions)
+        except IndexError:
+            return self._fail(node, IndexError(f"{node.label} is not among the {len(value)} items of its list"))
+
+    def _fail(self, node: Node, error: Exception) -> Failure:
+        failure = Failure(node.label, error)
+        self._failed(node, failure)
+        return failure
+
     def _gathered(self, node: Gather) -> Value | Failure:
         whole = self._whole(node)
         if len(whole) < len(node.items):
@@ -205,9 +220,13 @@ class Resolution:
         self._replace(node, functools.partial(node.build, *arguments))
 
     def _replace(self, node: Node, build: Callable[[], Node]) -> None:
-        """Let a node come to what the node that `build` adds comes to."""
-        with node.flow.building(node.item):
-            inner = build()
+        """Let a node come to what the node that `build` adds comes to; it fails where that cannot be added."""
+        try:
+            with node.flow.building(node.item):
+                inner = build()
+        except Exception as error:  # the other flows go on
+            self.settle(node, self._fail(node, error))
+            return
         self._expanded[node] = inner
         self.need(inner)
         self._await(node, [inner])

@@ -73,7 +73,7 @@ class Scheduler:
         self._dry = dry
         self._keys = Keys(functools.partial(kept_closure, folder=store.closures))
         self._tokens = Tokens(capacity)
-        self._graph = Resolution(store.get, self._call, self._skip)
+        self._graph = Resolution(store.get, self._call, self._skip, self._fail_node)
         self._jobs: dict[str, Job] = {}
         self._queue = Queue()
         self._claimed_elsewhere: dict[str, Job] = {}
@@ -272,6 +272,12 @@ class Scheduler:
             details["why"] = why
         self._flows[node.flow].reporter.event(kind, **details)
         self._graph.settle(node, action.outputs if action.is_list else action.outputs[0])
+
+    def _fail_node(self, node: Node, failure: Failure) -> None:
+        """A node failed that is no call: nothing was computed."""
+        self.failures[node.flow].append(failure)
+        bad_input = isinstance(failure.error, InputError)
+        self._tell("failed", node, key="", error=_described(failure.error), bad_input=bad_input)
 
     def _fail(self, job: Job, error: BaseException) -> None:
         del self._jobs[job.key]

@@ -520,6 +520,27 @@ def test_an_input_that_is_no_node_is_refused():
         gather([1.0])
 
 
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        (
+            lambda xs: each(xs, toy.source(values=(1.0,)), build=lambda x, y: toy.square(x)),
+            "lists of different lengths",
+        ),
+        (lambda xs: each(xs, build=lambda x: toy.total((3.0,))), "must be a node"),
+        (lambda xs: toy.square(xs[7]), "not among the 2 items"),
+        (lambda xs: toy.total(pick(xs, [0, 7])), "not among the 2 items"),
+    ],
+    ids=["lengths", "no node", "item", "pick"],
+)
+def test_a_node_that_cannot_be_expanded_fails_and_the_other_flows_go_on(store, bad, said):
+    flows = [lambda: {"x": bad(toy.source(values=(1.0, 2.0)))}, toy.flow]
+    failed, good = engine.run_flows([engine.Request(flow, "toy") for flow in flows], store)
+    (failure,) = failed.failures
+    assert said in str(failure.error) and failed.values["x"] is failure
+    assert good.failures == [] and value(store, good.values["total"]) == 14.0
+
+
 def test_a_node_cannot_be_gone_through_as_a_list():
     flow = Flow("x")
     with flow.building(), pytest.raises(TypeError, match="use `each`"):
