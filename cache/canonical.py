@@ -99,7 +99,7 @@ class _Encoder:
         for item in value:  # most are digests and names, or pairs with them
             kind = type(item)
             if kind is str:
-                content = _bytes(item)
+                content = item.encode() if item.isascii() else _bytes(item)
                 pending += b"s" + _LENGTH(len(content)) + content
             elif kind is tuple or kind is list:
                 self._add_items(item)

@@ -79,10 +79,9 @@ class Keys:
 
         Raises TypeError when a parameter is not plain data.
         """
-        plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in parameters.items()}
         given = [
-            (name, value if type(value) in _SIMPLE else self._digest(name, value, task.hints.get(name)))
-            for name, value in plain.items()
+            (name, value if type(value) in _SIMPLE else self._counted(name, value, task.hints.get(name)))
+            for name, value in parameters.items()
         ]
         counted = [(name, self.input(value)) for name, value in inputs.items()]
         return digest((self.recipe(task).digest, given, counted))
@@ -109,7 +108,9 @@ class Keys:
             "inputs": {name: self.input(value) for name, value in inputs.items()},
         }
 
-    def _digest(self, name: str, value: Any, hint: Any) -> str:
+    def _counted(self, name: str, value: Any, hint: Any) -> Any:
+        if isinstance(value, np.generic):
+            return value.item()
         if not dataclasses.is_dataclass(value):
             return digest(_flat(name, value, hint))
         known = (id(value), name, hint)
