@@ -21,7 +21,7 @@ from ss_flow.flows.results import FinishedRun
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.export.coco import coco
-from ss_flow.tasks.deliver.output import check_writable, replacing
+from ss_flow.tasks.deliver.output import check_place, check_writable, replacing
 from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorted
 from ss_flow.tasks.geometry.images import suffix_of
 
@@ -189,11 +189,9 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
 
 def _check_place(out: Path, *, folder: bool) -> None:
     """Raises InputError unless the export can be written here: a new place, or that of an earlier export."""
-    if folder and out.exists():
-        if not out.is_dir():
-            raise InputError(f"{out} is a file; this export is a folder, so --out must name one.")
-        if any(out.iterdir()) and not (out / MANIFEST).is_file():
-            raise InputError(f"{out} holds something else than an earlier export; name another folder with --out.")
-    if not folder and out.is_dir():
+    if folder:
+        check_place(out, MANIFEST, "an earlier export")
+    elif out.is_dir():
         raise InputError(f"{out} is a folder; this export is a file, so --out must name one.")
-    check_writable(out.parent)
+    else:
+        check_writable(out.parent)

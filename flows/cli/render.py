@@ -20,10 +20,12 @@ from ss_flow.flows.render import CameraPath, Shot, shoot
 from ss_flow.flows.results import FinishedRun
 from ss_flow.graph import stored
 from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
-from ss_flow.tasks.deliver.output import check_writable, replacing
+from ss_flow.tasks.deliver.output import check_place, check_writable, replacing
 from ss_flow.tasks.deliver.pictures import What
 
 CAMERAS_FILE = "transforms.json"
+MANIFEST = "render.json"
+"""Tells earlier pictures, which may be replaced, from a capture, which has a transforms.json too."""
 _LEAST, _MOST = 8, 8192
 
 
@@ -85,7 +87,8 @@ class Render:
                 written = _write_film(out, run, report)
             else:
                 panels, depth_unit = 1 + self.before, unit if self.what == "depth" else None
-                written = _write_pictures(out, run, report, panels=panels, depth_unit=depth_unit)
+                about = {"result": str(run.folder), "what": self.what, "path": self.path}
+                written = _write_pictures(out, run, report, about, panels=panels, depth_unit=depth_unit)
 
         with display(console(json=self.json)) as screen:
             request = Request(build, run.document["scene"], reporter=screen, done=done)
@@ -140,10 +143,12 @@ def _write_film(out: Path, run: FinishedRun, report: Report) -> int:
     return len(made["pictures"])
 
 
-def _write_pictures(out: Path, run: FinishedRun, report: Report, *, panels: int, depth_unit: float | None) -> int:
+def _write_pictures(
+    out: Path, run: FinishedRun, report: Report, about: dict[str, Any], *, panels: int, depth_unit: float | None
+) -> int:
     """Write the pictures and their cameras; returns how many there are.
 
-    panels: so many renderings stand side by side in each.
+    about: what render.json says of them. panels: so many renderings stand side by side in each.
     """
     made = report.succeeded()
     paths, pictures = made["cameras"], made["pictures"]
@@ -159,17 +164,18 @@ def _write_pictures(out: Path, run: FinishedRun, report: Report, *, panels: int,
         document = transforms_document(cameras, files)
         if depth_unit is not None:
             document["depth_unit_scale_factor"] = depth_unit
-        (filling / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
+        for name, content in ((CAMERAS_FILE, document), (MANIFEST, about | {"files": files})):
+            (filling / name).write_text(json.dumps(content, indent=1), encoding="utf-8")
     return len(files)
 
 
 def _check_place(out: Path, *, is_film: bool) -> None:
     """Raises InputError unless the pictures can be written here: a new place, or that of earlier ones."""
-    if is_film and out.is_dir():
+    if not is_film and out.is_file():
+        raise InputError(f"{out} is a file that does not end in .mp4; --out must name a film or a folder.")
+    if not is_film:
+        check_place(out, MANIFEST, "earlier pictures")
+    elif out.is_dir():
         raise InputError(f"{out} is a folder; a film is a file, so --out must name one.")
-    if not is_film and out.exists():
-        if not out.is_dir():
-            raise InputError(f"{out} is a file that does not end in .mp4; --out must name a film or a folder.")
-        if any(out.iterdir()) and not (out / CAMERAS_FILE).is_file():
-            raise InputError(f"{out} holds something else than earlier pictures; name another folder with --out.")
-    check_writable(out.parent)
+    else:
+        check_writable(out.parent)

@@ -23,13 +23,19 @@ from ss_flow.tasks.geometry.images import encode_png
 RUN_FILE = "run.json"
 
 
-def check_place(folder: Path, mark: str = RUN_FILE) -> None:
+def check_place(folder: Path, mark: str = RUN_FILE, what: str = "an earlier result") -> None:
     """Raises InputError unless an output folder can be written here: a new one, or in the place of an earlier one,
-    which holds the file `mark`."""
+    which holds the file `mark`.
+
+    what: what is written, in words.
+    """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; --out must name a folder.")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / mark).is_file():
-        raise InputError(f"{folder} holds something else than an earlier result; name another folder with --out.")
+        raise InputError(
+            f"{folder} holds something else than {what}, since it has no {mark}; name another folder with --out, or "
+            "move this one away."
+        )
     _check_nearest(folder, folder.absolute().parents)
 
 

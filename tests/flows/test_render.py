@@ -119,3 +119,16 @@ def test_a_folder_of_something_else_stays_as_it_is(tiny, tmp_path):
     (tmp_path / "photo.jpg").write_bytes(b"x")
     answer = render(tiny, "--frames", "1", "--out", tmp_path)
     assert answer.code == 2 and "holds something else than earlier pictures" in answer.err
+
+
+def test_a_capture_that_has_a_file_of_cameras_too_stays_as_it_is(tiny, tmp_path):
+    capture, pictures = tmp_path / "capture", tmp_path / "pictures"
+    assert ss_flow("export", tiny.out, "--cache", tiny.store, "--format", "nerfstudio", "--out", capture).code == 0
+    (capture / "export.json").unlink()
+    before = bytes_of(capture)
+    answer = render(tiny, "--frames", "1", "--out", capture)
+    assert answer.code == 2 and "it has no render.json; name another folder with --out, or move this" in answer.err
+    assert bytes_of(capture) == before
+    for frames in ("2", "1"):
+        assert render(tiny, "--frames", frames, "--out", pictures).code == 0
+    assert sorted(bytes_of(pictures)) == ["00000.png", "render.json", "transforms.json"]
