@@ -29,19 +29,21 @@ def check_place(folder: Path, mark: str = RUN_FILE, what: str = "an earlier resu
 
     what: what is written, in words.
     """
-    if folder.exists() and not folder.is_dir():
+    place = Path(os.path.realpath(folder))
+    if os.path.lexists(place) and not place.is_dir():  # or a link in a circle
         raise InputError(f"{folder} is a file; --out must name a folder.")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / mark).is_file():
         raise InputError(
             f"{folder} holds something else than {what}, since it has no {mark}; name another folder with --out, or "
             "move this one away."
         )
-    _check_nearest(folder, folder.absolute().parents)
+    _check_nearest(folder, place.parents)
 
 
 def check_writable(folder: Path) -> None:
     """Raises InputError unless files can be written into this folder, which need not be there yet."""
-    _check_nearest(folder, (folder.absolute(), *folder.absolute().parents))
+    place = Path(os.path.realpath(folder))
+    _check_nearest(folder, (place, *place.parents))
 
 
 def _check_nearest(folder: Path, places: Iterable[Path]) -> None:
@@ -57,10 +59,11 @@ def _check_nearest(folder: Path, places: Iterable[Path]) -> None:
 def replacing(folder: Path) -> Iterator[Path]:
     """Yield a folder to fill, beside `folder`; when all went well it takes `folder`'s place.
 
+    Of a symbolic link it is the place that it leads to: the link stays.
     A reader sees the old content or the new. After a crash the unfinished folder, whose name begins with a dot, may
     remain; the next run takes it away.
     """
-    folder = folder.absolute()
+    folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
     unfinished = re.compile(rf"\.{re.escape(folder.name)}\.[0-9a-f]{{8}}(\.old)?\.partial")
     for stale in folder.parent.iterdir():

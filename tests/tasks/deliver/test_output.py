@@ -62,6 +62,29 @@ def test_a_relative_name_is_taken_from_where_one_is(tmp_path, monkeypatch):
     assert (tmp_path / "out/a").exists()
 
 
+@pytest.mark.parametrize("made", [True, False])
+def test_a_link_stays_and_what_it_leads_to_is_replaced(made, tmp_path):
+    target, link = tmp_path / "disk/deep/out", tmp_path / "here/out"
+    link.parent.mkdir()
+    link.symlink_to(target)
+    if made:
+        target.mkdir(parents=True)
+        (target / RUN_FILE).write_text("{}")
+    check_place(link)
+    with replacing(link) as filling:
+        (filling / "a").touch()
+    assert link.is_symlink() and names(link) == ["a"]
+    assert names(link.parent) == ["out"] and names(target.parent) == ["out"]
+
+
+def test_the_place_that_a_link_leads_to_is_checked(tmp_path):
+    (tmp_path / "file").touch()
+    for name, target in (("below a file", "file/out"), ("circle", "circle"), ("to a file", "file")):
+        (tmp_path / name).symlink_to(target)
+        with pytest.raises(InputError, match=f"{name} (cannot be written|is a file)"):
+            check_place(tmp_path / name)
+
+
 @pytest.mark.parametrize("make", ["nothing", "empty", "earlier result", "deep"])
 def test_a_place_that_is_free_or_holds_an_earlier_result_is_accepted(make, tmp_path):
     place = tmp_path / ("a/b/c/out" if make == "deep" else "out")
