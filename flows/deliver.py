@@ -66,10 +66,10 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
     return {
         "status": status,
         "warnings": [{"label": label, "text": text} for text, label in warnings.items()],
-        "scene": str(scene.place),
+        "scene": str(scene.place.absolute()),
         "params": settings.flat(params),
         "models": models,
-        "given_scene": None if scene.given_scene is None else str(scene.given_scene),
+        "given_scene": None if scene.given_scene is None else str(scene.given_scene.absolute()),
         "reference_photo": (store.get(wanted["colours"][0]).reference or None) if "colours" in wanted else None,
         "metrics": {
             METRICS[name]: store.get(value).values

@@ -158,7 +158,8 @@ class View:
             out.print(
                 f"The scene has {count:,} Gaussians. If the browser has no GPU: --draw-at-most {_FEW} draws fewer."
             )
-        again = shlex.join(["ss-flow", "run", run.document["scene"], "--correct", str(hints), "--out", str(run.folder)])
+        options = ["--correct", str(hints.absolute()), "--out", str(run.folder.absolute())]
+        again = shlex.join(["ss-flow", "run", run.document["scene"], *options])
         saved = f"Edits are saved in {escape(str(script))} ({len(operations)} so far)."
         try:
             with contextlib.suppress(KeyboardInterrupt):

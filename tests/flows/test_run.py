@@ -134,6 +134,19 @@ def test_run_json_holds_what_was_asked_what_was_done_and_what_was_measured(tiny)
     assert all(n["peak_rss_mb"] > 0 and n["seconds"] >= 0 for n in nodes)
 
 
+def test_run_json_names_the_capture_so_that_it_is_found_from_elsewhere(warm, tmp_path, monkeypatch):
+    (tmp_path / "link").symlink_to(warm.scene)
+    (tmp_path / "splat.ply").write_bytes((warm.out / "scene.ply").read_bytes())
+    monkeypatch.chdir(tmp_path)
+    assert run_tiny(Path("link"), warm.store, out=Path("out")).document()["scene"] == str(tmp_path / "link")
+    labelled = run_tiny(Path("link"), warm.store, "--scene", "splat.ply", "--until", "ingest").document()
+    assert labelled["given_scene"] == str(tmp_path / "splat.ply")
+    monkeypatch.chdir(warm.scene)
+    photos = sorted(photo.name for photo in (warm.scene / "color").iterdir())
+    assert ss_flow("export", warm.out, "--format", "coco", "--out", tmp_path / "a.json").code == 0
+    assert [image["file_name"] for image in json.loads((tmp_path / "a.json").read_text())["images"]] == photos
+
+
 def test_with_json_stdout_holds_one_document_and_it_is_run_json(first_run):
     on_disk = json.loads((first_run.out / "run.json").read_text())
     printed = first_run.called.document()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -52,6 +53,20 @@ class TestWithTheExtra:
         script.write_text(json.dumps({"operations": [{"op": "remove", "instances": [999]}]}))
         called = ss_flow("view", tiny.out, "--cache", tiny.store, "--script", script)
         assert called.code == 2 and "operation 1 (remove): instances is [999]" in called.err
+
+    def test_the_command_that_corrects_works_from_anywhere(self, tiny, tmp_path, monkeypatch):
+        def wait() -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("ss_flow.flows.cli.view._wait", wait)
+        monkeypatch.chdir(tiny.out.parent)
+        hints = tmp_path / "h.json"
+        asked = ["--correct", os.path.relpath(hints), "--cache", tiny.store, "--port", "0"]
+        called = ss_flow("view", tiny.out.name, *asked)
+        command = called.out.partition("made by: ")[2].partition(", and the run's")[0]
+        run, scene, correct, out = (shlex.split(command)[place] for place in (1, 2, 4, 6))
+        assert (run, scene, out) == ("run", str(tiny.scene), str(tiny.out)), called
+        assert os.path.isabs(correct) and os.path.samefile(os.path.dirname(correct), tmp_path)
 
     @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
     def test_it_serves_until_it_is_interrupted_and_that_is_its_good_end(self, tiny, how):
