@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -19,6 +19,7 @@ from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows.generated import RoomParams, generate, write_scene
+from ss_flow.resolution import Failure
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import UInt8
 from ss_flow.tasks.deliver.output import replacing
@@ -63,48 +64,70 @@ def photographs(*, room: RoomParams, masks: Masks, annotated: str) -> tuple[Capt
         )
 
 
-def demo_scene(out: Path, room: RoomParams, masks: Masks, store: Store, reporter: Reporter) -> Path:
-    """Have a room's capture in `out`/scene; where the same one lies there already, no file is touched.
+def demo_scene(
+    folder: Path, room: RoomParams, masks: Masks, store: Store, reporter: Reporter, engine: Mapping[str, Any]
+) -> bool:
+    """Have a room's capture in a folder; where the same one lies there already, no file is touched.
 
-    reporter: hears of the photographing. Returns the folder. Raises InputError when `out` holds something else.
+    reporter: hears of the photographing. engine: options of `run_flows`; in a dry run nothing is written.
+    Returns whether the capture is there. Raises InputError when the folder holds something else.
     """
-    return _placed(out / "scene", room, masks, "", store, reporter)
+    return _placed(folder, room, masks, "", store, reporter, engine)
 
 
 def generated_scenes(
-    out: Path, rooms: Sequence[RoomParams], masks: Masks, store: Store, reporter: Reporter
+    out: Path,
+    rooms: Sequence[RoomParams],
+    masks: Masks,
+    store: Store,
+    reporter: Reporter,
+    engine: Mapping[str, Any],
 ) -> list[Path]:
     """Have rooms with all that tables are measured by in `out`/room-SEED.
 
     Beside the capture itself: the annotated scan in ScanNet's files, the labels of three views in LERF-OVS's, and
-    clicks on every object in the views that show most of it. Returns their folders. Raises InputError when `out` holds
-    something else.
+    clicks on every object in the views that show most of it. engine: options of `run_flows`. Returns their folders.
+    Raises InputError when `out` holds something else.
     """
     folders = [out / f"room-{room.seed}" for room in rooms]
     for folder, room in zip(folders, rooms, strict=True):
-        _placed(folder, room, masks, folder.name, store, reporter)
+        _placed(folder, room, masks, folder.name, store, reporter, engine)
     return folders
 
 
-def _placed(folder: Path, room: RoomParams, masks: Masks, annotated: str, store: Store, reporter: Reporter) -> Path:
+def _placed(
+    folder: Path,
+    room: RoomParams,
+    masks: Masks,
+    annotated: str,
+    store: Store,
+    reporter: Reporter,
+    engine: Mapping[str, Any],
+) -> bool:
     known = _recipe(folder) if folder.exists() else None
+    there = False
 
     def done(report: Report) -> None:
+        nonlocal there
+        if engine["dry"] and isinstance(report.values["files"], Failure):
+            return
         digests = report.succeeded()["files"]
         recipe = {"room": asdict(room), "files": list(digests)}
-        if known == recipe:
+        there = known == recipe
+        if there or engine["dry"]:
             return
         with replacing(folder) as filling:
             for digest in digests:
                 _write(store.get(digest), filling)
             (filling / RECIPE).write_text(json.dumps(recipe, indent=1), encoding="utf-8")
+        there = True
 
     def build() -> dict[str, Any]:
         return {"files": photographs(room=room, masks=masks, annotated=annotated)}
 
     request = Request(build, str(folder.resolve()), reporter=reporter, done=done)
-    run_flows([request], store, recorded=False)
-    return folder
+    run_flows([request], store, recorded=False, **engine)
+    return there
 
 
 def _recipe(folder: Path) -> Any:

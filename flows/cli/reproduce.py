@@ -75,11 +75,13 @@ class Reproduce:
         options = self.execution
         if options.dry_run or options.until:
             raise InputError("a table is always measured whole; leave out --dry-run and --until.")
-        options.engine()  # refuses what is out of range before anything is written
+        # Refuses what is wrong before anything is written.
+        settings.apply(settings.preset(Params(), options.preset), options.texts)
+        engine = options.engine()
         store = options.store.open_store()
         digests = file_digests(store, verify=options.verify)
         tell = console(json=options.json)
-        scenes = self._scenes(plan, store, tell)
+        scenes = self._scenes(plan, store, tell, engine)
         runs = [
             Run(section, variant, scene, seed)
             for section in plan.sections
@@ -108,12 +110,12 @@ class Reproduce:
             tell_table(document, tell)
         return 0
 
-    def _scenes(self, plan: Plan, store: Store, tell: Console) -> list[Path]:
+    def _scenes(self, plan: Plan, store: Store, tell: Console, engine: Mapping[str, Any]) -> list[Path]:
         if self.data == GENERATED:
             room = RoomParams(views=self.views, width=self.width, height=self.width * 3 // 4, held_out=0)
             rooms = [replace(room, seed=seed) for seed in range(self.rooms)]
             with display(tell) as screen:
-                return generated_scenes(self.out, rooms, self.masks, store, screen)
+                return generated_scenes(self.out, rooms, self.masks, store, screen, engine)
         return scenes_of(Path(self.data), plan.data, one=self.table in _OF_ONE_SCENE)
 
     def _params(self, plan: Plan, variant: Variant, seed: int) -> Params:

@@ -98,15 +98,28 @@ class Demo:
     """How to run."""
 
     def run(self) -> int:
-        from ss_flow.flows.demo import demo_scene
+        from ss_flow.flows.demo import demo_scene, photographs
         from ss_flow.flows.generated import RoomParams
 
+        options, scene = self.execution, self.out / "scene"
+        params = settings.preset(Params(), options.preset)
+        settings.apply(params, options.texts)  # refuses what is wrong before anything is written, as all of this does
+        engine = options.engine()
+        if self.seed < 0:
+            raise InputError(f"--seed {self.seed} is out of range; it must be 0 or more.")
         check_place(self.out / "result")
         room = RoomParams(objects=self.objects, views=self.views, seed=self.seed)
-        with display(console(json=self.execution.json)) as screen:
-            scene = demo_scene(self.out, room, self.masks, self.execution.store.open_store(), screen)
-        params = settings.preset(Params(), self.execution.preset)
-        return run_scene(open_scene(scene), self.out / "result", params, self.execution)
+        out = console(json=options.json)
+        with display(out) as screen:
+            there = demo_scene(scene, room, self.masks, options.store.open_store(), screen, engine)
+        if there:
+            return run_scene(open_scene(scene), self.out / "result", params, options)
+        first = {"label": photographs.name, "why": f"{scene} does not hold this room"}
+        if options.json:
+            print(json.dumps({"would_run": [first]}))
+        else:
+            out.print(escape("would run {label}: {why}; what follows depends on the photos".format(**first)))
+        return 0
 
 
 def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions, *, undistorted: bool = False) -> int:

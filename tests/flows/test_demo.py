@@ -85,6 +85,38 @@ def test_the_demo_leaves_a_scene_folder_of_something_else_alone(tmp_path):
     assert (tmp_path / "demo/scene/holiday.jpg").read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (["--preset", "quick"], "preset 'quick' is unknown"),
+        (["--set", "tau_label=7"], "must be between 0 and 1"),
+        (["--jobs", "-1"], "--jobs -1 is out of range"),
+        (["--memory", "much"], "--memory"),
+        (["--executor", "slurm"], "choose one of: threads"),
+        (["--seed", "-1"], "--seed -1 is out of range"),
+    ],
+)
+def test_wrong_options_are_refused_before_a_room_is_photographed(wrong, says, tmp_path):
+    for command in (["demo"], ["reproduce", "scannet", "--data", "generated"]):
+        if command == ["demo"] or "--seed" not in wrong:
+            called = ss_flow(*command, "--out", tmp_path / "demo", "--cache", tmp_path / "store", *wrong)
+            assert called.code == 2 and says in called.err
+    assert not (tmp_path / "demo").exists() and not list(tmp_path.glob("store/actions/*/*"))
+
+
+def test_a_dry_run_of_the_demo_writes_nothing(tmp_path):
+    room = ["--objects", "1", "--views", "3", "--masks", "truth", "--cache", tmp_path / "store"]
+    dry = ["--dry-run", "--out", tmp_path / "a", *room]
+    told = ss_flow("demo", *dry)
+    assert told.code == 0 and "would run demo.photographs" in told.out and not (tmp_path / "a").exists()
+    assert not list(tmp_path.glob("store/actions/*/*"))
+    assert ss_flow("demo", "--out", tmp_path / "a", "--until", "cameras", *room).code == 0
+    assert "would run capture.ingest" in ss_flow("demo", *dry).out
+    other = ss_flow("demo", *dry, "--seed", "1", "--json").document()["would_run"]
+    assert [one["label"] for one in other] == ["demo.photographs"]
+    assert not (tmp_path / "a/result").exists()
+
+
 def test_the_demo_refuses_an_output_below_a_file_before_it_builds_anything(tmp_path):
     (tmp_path / "f").write_text("x")
     called = ss_flow("demo", "--out", tmp_path / "f", "--cache", tmp_path / "store")
