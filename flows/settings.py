@@ -75,11 +75,10 @@ def preset(params: T, name: str) -> T:
     if name == "default":
         return params
     folder = resources.files("ss_flow.flows") / "presets"
-    file = folder / f"{name}.toml"
-    if not file.is_file():
-        known = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    known = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    if name not in known:
         raise InputError(f"preset {name!r} is unknown; choose one of: {', '.join(['default', *known])}.")
-    table = tomllib.loads(file.read_text(encoding="utf-8"))
+    table = tomllib.loads((folder / f"{name}.toml").read_text(encoding="utf-8"))
     return overlaid(preset(params, table.pop("base", "default")), table)
 
 

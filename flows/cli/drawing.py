@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.cache.store import Store
+from ss_flow.errors import InputError
 from ss_flow.flows.results import of_type
 from ss_flow.runs import Run
 from ss_flow.tasks.artifacts import Cameras, Frame, PointCloud
@@ -15,12 +16,18 @@ from ss_flow.tasks.geometry.images import encode_png
 
 
 def draw_results(store: Store, run: Run, values: Sequence[Any], view: int, file: Path) -> None:
-    """Draw one result, or a sheet of several, as a PNG file."""
+    """Draw one result, or a sheet of several, as a PNG file.
+
+    view: the position of the view that looks at points and Gaussians. Raises InputError when the run has no such view.
+    """
     frames = of_type(store, run, Frame)
     by_name = {frame.name: frame for frame in frames}
+    cameras = next(iter(of_type(store, run, Cameras)), None)
+    if cameras is not None and not 0 <= view < len(cameras.names):
+        raise InputError(f"--view {view} is out of range; the run has views 0 to {len(cameras.names) - 1}.")
     context: dict[str, Any] = {
         "frames": frames,
-        "cameras": next(iter(of_type(store, run, Cameras)), None),
+        "cameras": cameras,
         "points": next(iter(of_type(store, run, PointCloud)), None),
         "view": view,
     }

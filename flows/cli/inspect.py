@@ -271,13 +271,14 @@ class CacheShow:
             raise InputError(f"{self.png} cannot be written; --png must name a file in a folder.")
         run, digests = results_named(store, self.scene, self.what)
         values = [store.get(digest) for digest in digests]
-        out = console(json=False)
-        for line in told(values, digests, store, run):
-            out.print(escape(line))
         if self.png:
             from ss_flow.flows.cli.drawing import draw_results
 
             draw_results(store, run or latest_run(store, self.scene), values, self.view, self.png)
+        out = console(json=False)
+        for line in told(values, digests, store, run):
+            out.print(escape(line))
+        if self.png:
             out.print(escape(f"drawn to {self.png}"))
         return 0
 

@@ -24,7 +24,7 @@ from ss_flow.flows.deliver import deliver, run_document, weight_free
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
 from ss_flow.flows.split_splat import LEADS_TO, LEADS_TO_CAMERAS, split_splat
-from ss_flow.graph import Flow, gather, nodes_by_step
+from ss_flow.graph import Call, Flow, Gather, Node, gather, nodes_by_step
 from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
@@ -168,9 +168,11 @@ def prepare(
                 encoder=networks.encoder,
             )
         target = options.target
-        if target is None or target in results:
+        if target is None:
             return results
-        return results | {target: _until(target, results)}
+        node = results[target] if target in results else _until(target, results)
+        _check_item(str(options.until), node)
+        return results | {target: node}
 
     return Prepared(scene, params, networks, build)
 
@@ -194,6 +196,14 @@ def _until(step: str, results: Mapping[str, Any]) -> Any:
         steps = sorted({name.rpartition(".")[2] for name in known} - results.keys())
         raise InputError(f"--until {step!r} names no step; there are {', '.join([*results, *steps])}.")
     return gather(found)
+
+
+def _check_item(until: str, node: Node) -> None:
+    """Raises InputError when --until names an item, as in "propagate[3]", of a step that is known to have no such."""
+    item = until.partition("[")[2].removesuffix("]")
+    nodes = node.items if isinstance(node, Gather) else [node]
+    if item and all(isinstance(one, Call) and one.item != item for one in nodes):
+        raise InputError(f"--until {until!r} names an item that is not there; leave out [{item}].")
 
 
 def header(prepared: Prepared, options: RunOptions) -> dict[str, Any]:

@@ -56,6 +56,10 @@ RUNS: dict[str, tuple[Make, str]] = {
         lambda base, scene: [scene, "--preset", "quick"],
         "choose one of: default, fast, paper",
     ),
+    "a preset by its file": (
+        lambda base, scene: [scene, "--preset", "../presets/fast"],
+        "preset '../presets/fast' is unknown; choose one of",
+    ),
     "a parameter that is misspelt": (
         lambda base, scene: [scene, "--set", "split.tau_lable=0.8"],
         "did you mean 'split.tau_label'?",
@@ -85,6 +89,10 @@ RUNS: dict[str, tuple[Make, str]] = {
         "--until 'train' names no step; there are ingest",
     ),
     "no step at all": (lambda base, scene: [scene, "--until", ""], "--until '' names no step; there are ingest"),
+    "an item of a step that has none": (
+        lambda base, scene: [scene, "--until", "propagate[9999]"],
+        r"--until 'propagate\[9999\]' names an item that is not there; leave out \[9999\]",
+    ),
     "a dry run into what holds other things": (
         lambda base, scene: [scene, "--dry-run", "--out", file(folder(base / "papers") / "a.txt").parent],
         "papers holds something else than an earlier result",
@@ -287,6 +295,8 @@ def test_a_search_after_its_store_went_away_says_so_and_makes_no_new_one(warm):
         (["why", "nope"], "has no step 'nope'; it has .*split.propagate"),
         (["cache", "show", "nope"], "is neither a step of the latest runs nor a digest"),
         (["cache", "show", "segment[0099]"], r"'segment\[0099\]' is neither"),
+        (["cache", "show", "scene", "--view", "99", "--png", "x.png"], "--view 99 is out of range; .* views 0 to 4"),
+        (["cache", "show", "scene", "--view", "-1", "--png", "x.png"], "--view -1 is out of range"),
         (["status", "elsewhere"], "knows no run of elsewhere"),
         (["graph", "elsewhere"], "knows no run of elsewhere"),
         (["cache", "ls", "elsewhere"], "knows no run of elsewhere"),
