@@ -18,7 +18,7 @@ from rich.table import Table
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import console
 from ss_flow.flows.cli.telling import print_table
-from ss_flow.flows.results import read_run
+from ss_flow.flows.results import id_image, read_run
 from ss_flow.tasks.evaluate.comparison import Correspondence, correspondence
 
 _SHOWN = 10
@@ -101,13 +101,8 @@ def _views_of_both(first: Path, second: Path) -> list[tuple[Path, Path]]:
 
 
 def _id_images(views: list[tuple[Path, Path]]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    import cv2
-
     for files in views:
-        a, b = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files)
-        for file, image in zip(files, (a, b), strict=True):
-            if image is None or image.ndim != 2:
-                raise InputError(f"{file} is damaged: it is no image of ids; run the scene again.")
+        a, b = map(id_image, files)
         if a.shape != b.shape:
             raise InputError(f"{files[0]} and {files[1]} differ in size; diff compares runs of the same photos.")
         yield a, b

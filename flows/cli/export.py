@@ -21,7 +21,7 @@ from ss_flow.flows.results import FinishedRun
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.export.coco import coco
-from ss_flow.tasks.deliver.output import check_place, check_writable, replacing
+from ss_flow.tasks.deliver.output import check_file, check_place, replacing
 from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorted
 from ss_flow.tasks.geometry.images import suffix_of
 
@@ -191,7 +191,5 @@ def _check_place(out: Path, *, folder: bool) -> None:
     """Raises InputError unless the export can be written here: a new place, or that of an earlier export."""
     if folder:
         check_place(out, MANIFEST, "an earlier export")
-    elif out.is_dir():
-        raise InputError(f"{out} is a folder; this export is a file, so --out must name one.")
     else:
-        check_writable(out.parent)
+        check_file(out, "name another file with --out")

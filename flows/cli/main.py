@@ -57,6 +57,9 @@ def main(arguments: list[str]) -> int:
         return FAILED
     except BrokenPipeError:
         return 0
+    except PermissionError as error:
+        _complain(f"{error.filename or error}: permission denied; change who may read or write it, or name another.")
+        return BAD_INPUT
     except Exception as error:
         if os.environ.get("SS_FLOW_DEBUG"):
             raise

@@ -27,7 +27,7 @@ from ss_flow.flows.cli.context import (
 )
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.query import NEEDED, described_parts
-from ss_flow.flows.results import FinishedRun, read_run
+from ss_flow.flows.results import FinishedRun, id_image, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
 from ss_flow.tasks.deliver.output import check_place, replacing
 from ss_flow.tasks.semantics.describe import DescribeParams
@@ -176,7 +176,6 @@ def write_answer(
 
     document: what --json prints. parts: where the frames show the parts, when parts were searched.
     """
-    import cv2
     import numpy as np
 
     from ss_flow.tasks.deliver.ply import write_gaussians
@@ -193,7 +192,7 @@ def write_answer(
     masks: Iterator[Bool]
     if parts is None:
         ids = [row["id"] for row in matched]
-        masks = (np.isin(cv2.imread(str(photo), cv2.IMREAD_UNCHANGED), ids) for photo in photos)
+        masks = (np.isin(id_image(photo), ids) for photo in photos)
     else:
         shown = [part for part in parts if (part.instance_id, part.part_id) in wanted]
         masks = _on_photos(run, shown, [photo.stem for photo in photos])

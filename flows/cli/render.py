@@ -20,7 +20,7 @@ from ss_flow.flows.render import CameraPath, Shot, shoot
 from ss_flow.flows.results import FinishedRun
 from ss_flow.graph import stored
 from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
-from ss_flow.tasks.deliver.output import check_place, check_writable, replacing
+from ss_flow.tasks.deliver.output import check_file, check_place, replacing
 from ss_flow.tasks.deliver.pictures import What
 
 CAMERAS_FILE = "transforms.json"
@@ -171,11 +171,9 @@ def _write_pictures(
 
 def _check_place(out: Path, *, is_film: bool) -> None:
     """Raises InputError unless the pictures can be written here: a new place, or that of earlier ones."""
-    if not is_film and out.is_file():
+    if is_film:
+        check_file(out, "name another file with --out")
+    elif out.is_file():
         raise InputError(f"{out} is a file that does not end in .mp4; --out must name a film or a folder.")
-    if not is_film:
-        check_place(out, MANIFEST, "earlier pictures")
-    elif out.is_dir():
-        raise InputError(f"{out} is a folder; a film is a file, so --out must name one.")
     else:
-        check_writable(out.parent)
+        check_place(out, MANIFEST, "earlier pictures")

@@ -12,6 +12,7 @@ from rich.markup import escape
 from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, open_run
 from ss_flow.flows.cli.diff import changes, difference
 from ss_flow.flows.deliver import write_report
+from ss_flow.tasks.deliver.output import check_file
 from ss_flow.tasks.deliver.report import Comparison
 
 _SHOWN = ("ingest", "dense", "propagate", "hierarchy", "refine", "report_pictures", "thumbnails")
@@ -31,6 +32,7 @@ class WriteReport:
     def run(self) -> int:
         run = open_run(self.result, self.store, _SHOWN)
         file = self.result / "report.html"
+        check_file(file, "change who may write there")
         comparison = None if self.beside is None else _comparison(self.beside, self.result)
         write_report(file, run.results, run.document, run.instances, comparison)
         console(json=False).print(escape(str(file)))

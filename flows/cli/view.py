@@ -25,6 +25,7 @@ from ss_flow.flows.cli.context import (
 )
 from ss_flow.flows.cli.query import encoder_name, query_params
 from ss_flow.flows.results import FinishedRun, read_run
+from ss_flow.tasks.deliver.output import check_file
 
 if TYPE_CHECKING:
     from ss_flow.flows.view.search import Search
@@ -68,8 +69,10 @@ class View:
         if self.draw_at_most is not None and (self.draw_at_most < 1 or self.html or self.rerun):
             raise InputError("--draw-at-most takes a number above 0, and is for the viewer, not for --html or --rerun.")
         for option, file in (("--html", self.html), ("--rerun", self.rerun)):
-            if file and (file.is_dir() or not file.absolute().parent.is_dir()):
+            if file and not file.absolute().parent.is_dir():
                 raise InputError(f"{file} cannot be written; {option} must name a file in a folder that exists.")
+            if file:
+                check_file(file, f"name another file with {option}")
         folder = Path(self.what)
         if not folder.exists() and "/" not in self.what:
             return self._artifact()

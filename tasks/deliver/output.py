@@ -46,13 +46,21 @@ def check_writable(folder: Path) -> None:
     _check_nearest(folder, (place, *place.parents))
 
 
-def _check_nearest(folder: Path, places: Iterable[Path]) -> None:
+def check_file(file: Path, instead: str) -> None:
+    """Raises InputError unless a file can be written here, in a folder that need not be there yet.
+
+    instead: what the user may do where it cannot, in words.
+    """
+    if file.is_dir():
+        raise InputError(f"{file} cannot be written: it is a folder; {instead}.")
+    _check_nearest(file, file.absolute().parents, instead)
+
+
+def _check_nearest(what: Path, places: Iterable[Path], instead: str = "name another folder with --out") -> None:
     """Check the first of these places that is there."""
     place = next(p for p in places if p.exists())
     if not place.is_dir() or not os.access(place, os.W_OK):
-        raise InputError(
-            f"{folder} cannot be written: {place} is not a writable folder; name another folder with --out."
-        )
+        raise InputError(f"{what} cannot be written: {place} is not a writable folder; {instead}.")
 
 
 @contextmanager

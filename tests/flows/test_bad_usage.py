@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -324,6 +325,43 @@ def test_a_store_without_runs_says_how_to_make_one(tmp_path):
 def test_a_picture_that_cannot_be_written_is_refused_before_it_is_drawn(tiny, tmp_path):
     place = file(tmp_path / "f") / "x.png"
     assert_refused(ss_flow("cache", "show", "dense", "--png", place, "--cache", tiny.store), "x.png cannot be written")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["report", "OUT"],
+        ["view", "OUT", "--html", "OUT/x.html"],
+        ["view", "OUT", "--rerun", "OUT/x.rrd"],
+        ["status", "--otlp", "OUT/x.json"],
+        ["cache", "show", "scene", "--png", "OUT/x.png"],
+        ["export", "OUT", "--format", "ply", "--out", "OUT/x.ply"],
+    ],
+)
+def test_a_file_in_a_folder_that_may_not_be_written_is_refused(command, tiny, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda place, mode: Path(place) != tiny.out)
+    words = [word.replace("OUT", str(tiny.out)) for word in command]
+    assert_refused(ss_flow(*words, "--cache", tiny.store), f"cannot be written: {tiny.out} is not a writable folder")
+
+
+def test_what_may_not_be_read_is_named(room, tmp_path, monkeypatch):
+    from ss_flow.flows.cli import run
+
+    def refused(*_):
+        raise PermissionError(13, "Permission denied", "photos/a.jpg")
+
+    monkeypatch.setattr(run, "open_scene", refused)
+    called = ss_flow("run", room, "--cache", tmp_path / "store", "--out", tmp_path / "out")
+    assert_refused(called, "photos/a.jpg: permission denied; change who may")
+
+
+def test_masks_that_cannot_be_read_are_named(warm, tmp_path):
+    mask = sorted((warm.out / "masks").iterdir())[2]
+    file(mask)
+    for command in (["query", warm.out, "white", "--out", tmp_path / "found"], ["diff", warm.out, warm.out]):
+        more = ["--cache", warm.store] if command[0] == "query" else []
+        assert_refused(ss_flow(*command, *more), f"{mask.name} cannot be read or is damaged")
+    assert not (tmp_path / "found").exists()
 
 
 @pytest.fixture
