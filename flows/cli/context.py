@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import IO, Annotated
 
 import tyro
 from rich.console import Console
@@ -145,6 +145,19 @@ def open_run(folder: Path, options: StoreOptions, needed: Sequence[str]) -> Fini
     return finished_run(folder, document, chosen.existing_store(), needed)
 
 
+class _Words(Console):
+    """Where the reader has gone, as in `ss-flow cache ls | head -1`, it goes on in silence; Rich ends the program."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        silence(self.file)
+
+
+def silence(stream: IO[str]) -> None:
+    """Have what is written to a stream of the process go nowhere from now on."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def console(*, json: bool) -> Console:
     """Where words for people go: nowhere near a JSON document on stdout."""
-    return Console(stderr=json, highlight=False, soft_wrap=True)
+    return _Words(stderr=json, highlight=False, soft_wrap=True)

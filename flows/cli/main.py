@@ -13,9 +13,7 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Any
-
-import tyro
+from typing import Any, TextIO
 
 # Tasks run side by side, one a core: a library that starts threads of its own only gets in their way. To be set
 # before the first of them is imported.
@@ -24,7 +22,6 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 from ss_flow.cache.errors import Gone, StoreFailure  # noqa: E402
 from ss_flow.errors import ExecutorLost, InputError  # noqa: E402
-from ss_flow.flows.cli.commands import chosen  # noqa: E402
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -74,6 +71,10 @@ def main(arguments: list[str]) -> int:
 
 def _read(arguments: list[str]) -> Any:
     """The command that the arguments call. Raises InputError about a word that nobody knows."""
+    # Not above: an interrupt while these load, which takes longest, ends as any other.
+    import tyro
+
+    from ss_flow.flows.cli.commands import chosen
 
     def read(arguments: list[str], **more: Any) -> Any:
         return tyro.cli(
@@ -100,23 +101,39 @@ def _read(arguments: list[str]) -> Any:
 
 
 def _complain(problem: str, *more: str, style: str = "red") -> None:
-    from rich.console import Console
     from rich.markup import escape
 
-    errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    from ss_flow.flows.cli.context import console
+
+    errors = console(json=True)
     for line in (f"[{style}]ss-flow:[/] {escape(problem)}", *more):
         errors.print(line)
 
 
+def _written_out(stream: TextIO) -> None:
+    """Write what is left for a stream; where its reader has gone, it is for nobody."""
+    try:
+        stream.flush()
+    except BrokenPipeError:
+        from ss_flow.flows.cli.context import silence
+
+        silence(stream)
+
+
 def entry() -> None:
     """The console script."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who called; a file opened later must not get its place
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - it stays open
     # A cluster's queue stops a job with SIGTERM: the run then keeps what it has, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # Hardly anything here is in a cycle: search for cycles less often than after every 700 objects more.
     gc.set_threshold(20_000)
-    code = main(sys.argv[1:])
-    sys.stdout.flush()
-    sys.stderr.flush()
+    try:
+        code = main(sys.argv[1:])
+    finally:
+        _written_out(sys.stdout)
+        _written_out(sys.stderr)
     if code == INTERRUPTED:
         os._exit(code)  # a task in the middle of native code cannot be told to stop; the store is safe
     sys.exit(code)

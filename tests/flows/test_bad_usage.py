@@ -441,3 +441,57 @@ def test_alone_it_helps_and_it_tells_its_version_also_as_a_module():
     assert (told.code, told.out) == (0, f"ss-flow {version('ss-flow')}\n")
     module = subprocess.run([sys.executable, "-m", "ss_flow", "--version"], capture_output=True, text=True)
     assert (module.returncode, module.stdout) == (0, told.out)
+
+
+ENTRY = "from ss_flow.flows.cli.main import entry; entry()"
+
+
+def run_entry(arguments, before="", stdout=subprocess.PIPE):
+    words = [sys.executable, "-c", before + ENTRY, *map(str, arguments)]
+    return subprocess.run(words, text=True, stdout=stdout, stderr=subprocess.PIPE)
+
+
+@pytest.fixture
+def unread():
+    """The end of a pipe to write to, whose reader has gone."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    yield writer
+    os.close(writer)
+
+
+@pytest.mark.parametrize("arguments", [["cache", "ls"], ["cache", "ls", "--json"], ["graph"], ["--help"]])
+def test_a_reader_that_has_seen_enough_is_no_failure(arguments, tiny, unread):
+    more = [] if arguments == ["--help"] else ["--cache", tiny.store]
+    called = run_entry([*arguments, *more], stdout=unread)
+    assert (called.returncode, called.stderr) == (0, "")
+
+
+def test_a_run_whose_reader_has_gone_goes_on(warm, unread):
+    options = ["--cache", warm.store, "--out", warm.out, "--preset", "fast", *SHORT, "--undistorted"]
+    called = run_entry(["run", warm.scene, *options], stdout=unread)
+    assert (called.returncode, called.stderr) == (0, "")
+    assert (warm.out / "undistorted").is_dir()
+
+
+@pytest.mark.parametrize("closed", [1, 2])
+def test_a_stream_that_is_closed_is_no_failure(closed, tiny):
+    for arguments in (["cache", "ls"], ["graph"], ["--version"]):
+        more = [] if arguments == ["--version"] else ["--cache", tiny.store]
+        words = [sys.executable, "-c", ENTRY, *arguments, *map(str, more)]
+        called = subprocess.run(["sh", "-c", f'exec "$0" "$@" {closed}>&-', *words], capture_output=True, text=True)
+        assert (called.returncode, called.stderr) == (0, "")
+
+
+def test_an_interrupt_before_the_command_is_known_ends_as_any_other():
+    before = (
+        "import sys\n"
+        "class Interrupt:\n"
+        "    def find_spec(self, name, *more):\n"
+        "        if name == 'tyro':\n"
+        "            sys.meta_path.remove(self)\n"
+        "            raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupt())\n"
+    )
+    called = run_entry(["doctor"], before)
+    assert (called.returncode, called.stdout) == (130, "") and called.stderr.startswith("ss-flow: interrupted")
