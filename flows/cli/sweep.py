@@ -93,7 +93,8 @@ class Sweep:
         engine = options.engine()
         settings_of = self._variants(settings.preset(Params(), options.preset), options.texts)
         self._check()
-        scenes = [open_scene(path, self.masks, self.hints) for path in self.scenes]
+        once = {path.resolve(): path for path in self.scenes}.values()
+        scenes = [open_scene(path, self.masks, self.hints) for path in once]
         asked = self._asked(scenes, settings_of)
         out = self._place(scenes, asked)
         check_writable(out)
@@ -160,7 +161,8 @@ class Sweep:
         """The folder to write. Raises InputError when --out holds the files of another sweep."""
         if self.out is not None:
             if not self.execution.dry_run and holds_other(self.out, asked):
-                raise InputError(f"{self.out} holds another sweep; name another folder with --out.")
+                what = "another sweep, or something else under the names of its files"
+                raise InputError(f"{self.out} holds {what}; name another folder with --out.")
             return self.out
         name = f"{scenes[0].name}-sweep" if len(scenes) == 1 else "sweep"
         places = (Path("ss-flow-out") / (f"{name}-{n}" if n > 1 else name) for n in itertools.count(1))

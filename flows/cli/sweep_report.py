@@ -97,10 +97,15 @@ def tell_plan(labels: Sequence[str], rows: Sequence[Row], out: Console, *, scene
 
 
 def holds_other(folder: Path, asked: str) -> bool:
-    """Whether a folder holds the files of a sweep that asked something else. asked: what a row has as "sweep"."""
+    """Whether a folder holds the files of a sweep that asked something else, or of no sweep under a sweep's names.
+
+    asked: what a row has as "sweep".
+    """
     try:
         return any(row.get("sweep") != asked for row in json.loads((folder / "sweep.json").read_text(encoding="utf-8")))
-    except (FileNotFoundError, NotADirectoryError):
+    except FileNotFoundError:
+        return any((folder / name).exists() for name in ("sweep.csv", "sweep.png"))
+    except NotADirectoryError:
         return False
     except (OSError, ValueError, TypeError, AttributeError):
         return True

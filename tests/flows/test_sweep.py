@@ -213,6 +213,12 @@ def test_words_for_people_hold_a_table_and_where_the_files_are(warm, tmp_path):
     assert told.out.splitlines()[-1] == f"see {tmp_path / 'swept'}: sweep.json, sweep.csv, sweep.png"
 
 
+def test_a_scene_that_is_named_twice_is_swept_once(tiny):
+    options = ["--cache", tiny.store, "--preset", "fast", "--dry-run", "--json", "--set", "tau_label=0.7,0.8"]
+    rows = ss_flow("sweep", tiny.scene, f"{tiny.scene}/../{tiny.scene.name}", *options).document()
+    assert [row["scene"] for row in rows] == [str(tiny.scene)] * 2
+
+
 def test_no_sweep_takes_the_place_of_another(warm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = ["--cache", warm.store, "--preset", "fast", *SHORT, "--until", "propagate", "--json"]
@@ -231,7 +237,11 @@ def test_no_sweep_takes_the_place_of_another(warm, tmp_path, monkeypatch):
     again = swept("--set", "tau_label=0.7,0.8")  # the same once more: nothing is lost
     assert len(list((tmp_path / "ss-flow-out").iterdir())) == 3
     assert "see ss-flow-out/room-sweep:" in again.err
-    refused(swept("--set", "tau_label=0.6,0.8", "--out", "ss-flow-out/room-sweep"), "holds another sweep; name another")
+    refused(swept("--set", "tau_label=0.6,0.8", "--out", "ss-flow-out/room-sweep"), "holds another sweep, or")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/sweep.png").write_bytes(b"mine")
+    refused(swept("--set", "tau_label=0.6,0.8", "--out", "mine"), "something else under the names of its files")
+    assert [file.name for file in (tmp_path / "mine").iterdir()] == ["sweep.png"]
 
 
 def test_a_sweep_that_stops_before_all_figures_says_which_steps_give_some(warm, tmp_path):
