@@ -26,6 +26,8 @@ from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorte
 from ss_flow.tasks.geometry.images import suffix_of
 
 MANIFEST = "export.json"
+_ADDED = {"labelled-ply": "-labelled", "mesh-glb": "-mesh"}
+"""What the default names of formats have before a suffix that is another's too."""
 _ALSO_NEEDED = {"coco": ("ingest", "masks"), "colmap": ("ingest", "masks"), "nerfstudio": ("ingest",)}
 """Results of a run that only some formats are made of: an edited run has no masks."""
 
@@ -45,7 +47,8 @@ class Export:
     holes: Literal["open", "closed"] = "open"
     """For meshes: "closed" closes by a guess what no view shows."""
     out: OptionalPath = None
-    """The file or folder to write; by default ss-flow-export/NAME of the result, with the format's suffix."""
+    """The file or folder to write; by default in ss-flow-export: NAME of the result with the format's suffix, as in
+    NAME.ply; NAME-labelled.ply and NAME-mesh.glb; and NAME-FORMAT for a folder."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""
     json: bool = False
@@ -61,7 +64,8 @@ class Export:
         by_instance = several or self.format == "coco" or self.format in formats.SURFACES
         ids = run.ids(self.instance) if self.instance else run.all_ids() if by_instance else None
         folder = several or workspace
-        out = self.out or Path("ss-flow-export") / (run.name + ("" if folder else formats.suffix_of(self.format)))
+        ending = f"-{self.format}" if folder else _ADDED.get(self.format, "") + formats.suffix_of(self.format)
+        out = self.out or Path("ss-flow-export") / f"{run.name}{ending}"
         _check_place(out, folder=folder)
         self._check_suffix(out, folder=folder)
         if workspace:
@@ -100,7 +104,7 @@ class Export:
     def _check_suffix(self, out: Path, *, folder: bool) -> None:
         """Raises InputError for a file that would be taken for one of another format by its name."""
         own = formats.suffix_of(self.format)
-        others = {formats.suffix_of(name) for name in get_args(formats.Format)} - {""}
+        others = {formats.suffix_of(name) for name in get_args(formats.Format)} - {""} | {".gltf"}  # glTF's JSON form
         if not folder and out.suffix in others and not own.endswith(out.suffix):
             raise InputError(f"{out} is named like another format; a file of {self.format} ends in {own}.")
 

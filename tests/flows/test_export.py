@@ -112,6 +112,25 @@ def test_photos_and_cameras_come_out_as_a_capture_with_the_same_cameras(tiny, tm
     assert again.code == 0, again.err
 
 
+def test_without_a_place_no_format_replaces_the_export_of_another(tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    one = ("--instance", str(ids_of(tiny)[0]))
+    asked = [("ply",), ("labelled-ply",), ("gltf",), ("mesh-glb", *one), ("mesh-obj", *one), ("mesh-ply", *one)]
+    asked += [("colmap",), ("nerfstudio",), ("ply", "--each", *one)]
+    places = []
+    for format, *more in asked:
+        answer = export(tiny, "--format", format, *more, "--json")
+        assert answer.code == 0, answer.err
+        places.append(answer.document()["out"].removeprefix(f"ss-flow-export/{tiny.out.name}"))
+    assert places[:4] == [".ply", "-labelled.ply", ".glb", "-mesh.glb"]
+    assert places[4:] == ["-mesh-obj", "-mesh-ply", "-colmap", "-nerfstudio", "-ply"]
+
+
+def test_a_glb_is_not_written_under_the_name_of_gltfs_other_form(tiny, tmp_path):
+    answer = export(tiny, "--format", "gltf", "--out", tmp_path / "a.gltf")
+    assert answer.code == 2 and "a file of gltf ends in .glb" in answer.err
+
+
 def test_a_second_export_computes_nothing(tiny, tmp_path):
     one = str(ids_of(tiny)[0])
     export(tiny, "--format", "mesh-obj", "--instance", one, "--out", tmp_path / "a")
