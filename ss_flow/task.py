@@ -17,9 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
-from ss_flow.cache.canonical import digest_file
 from ss_flow.cache.files import stamp
-from ss_flow.closure import fix_sources
 from ss_flow.graph import current_flow
 
 P = ParamSpec("P")
@@ -63,6 +61,8 @@ class FileRef:
 
 @functools.lru_cache(maxsize=256)
 def _digest_of(path: Path, stamp: tuple[int, ...]) -> str:
+    from ss_flow.cache.canonical import digest_file
+
     return digest_file(path)
 
 
@@ -212,6 +212,8 @@ def task(
     """
 
     def declare(function: Callable[P, R]) -> Task[P, R]:
+        from ss_flow.closure import fix_sources  # not above: the bare `ss-flow` declares no task
+
         fix_sources(function.__module__.partition(".")[0])
         step = name or _default_name(function)
         declared: Any = Task(function, step, resources, uses, isolate, environment)
