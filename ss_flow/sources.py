@@ -77,7 +77,7 @@ def read_loaded(packages: tuple[str, ...]) -> bool:
     Returns whether any of them is not as it was when it was read last, before it was loaded, or loaded again.
     """
     changed = False
-    for name in [name for name in sys.modules if name.startswith(packages)]:
+    for name in _loaded(packages, len(sys.modules)):
         specification = _specification(name)
         if name in _known and _known[name][0] is specification:
             continue
@@ -88,6 +88,15 @@ def read_loaded(packages: tuple[str, ...]) -> bool:
         changed = changed or (name in _known and _known[name][1] != source)
         _known[name] = specification, source
     return changed
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(packages: tuple[str, ...], count: int) -> list[str]:
+    """The loaded modules of these packages; they are looked for again only where others are loaded, thousands in all.
+
+    count: of all that are loaded.
+    """
+    return [name for name in sys.modules if name.startswith(packages)]
 
 
 def forget_sources() -> None:
