@@ -37,7 +37,8 @@ class MappingParams:
     min_pose_matches: Count = 15
     """So many points must confirm a photo's pose (COLMAP's own default is 30)."""
     min_start_angle: Angle = 16.0
-    """Parallax of the two photos that the model starts from, in degrees; half of it where no two have that much."""
+    """Parallax of the two photos that a model starts from, in degrees; further models start from half and a quarter of
+    it, where photos have no place yet."""
     camera_model: Literal["SIMPLE_RADIAL", "SIMPLE_PINHOLE"] = "SIMPLE_RADIAL"
     """"SIMPLE_RADIAL" (one focal length, one radial coefficient) or "SIMPLE_PINHOLE", shared by photos of one size."""
     max_point_error: Positive = 2.0
@@ -79,9 +80,11 @@ def sfm(
     params: MappingParams = MappingParams(),
     seed: int = 0,
 ) -> Cameras:
-    """Cameras of those photos that COLMAP's largest model registers, in the photos' order (spec S2).
+    """Cameras of those photos that COLMAP's best model registers, in the photos' order (spec S2).
 
-    again: matches that count in the place of those of the same pairs before.
+    Of the models with at least half as many photos as the largest it is the one that most matches fit; one that too
+    many contradict comes after all others. again: guided matches, which count in the place of those of the same pairs
+    before, but not for what is best.
     The unit of length is arbitrary (`metric` is False). Photos without a pose are missing from the result, which may be
     all; `registered` drops them, and takes out the distortion that `Cameras.radial` states. Mapping runs on one thread
     with fixed seeds, so that two runs agree to the bit.
@@ -109,9 +112,10 @@ def sfm(
     pipeline.add_callback(int(step.value), told)
     pipeline.run()
     models = [manager.get(number) for number in range(manager.size())]
-    whole = [model for model in models if _plausible(model)]
-    best = max(whole, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-    return _cameras(best, [(photo.name, photo.width, photo.height) for photo in kept], params)
+    sizes = [(photo.name, photo.width, photo.height) for photo in kept]
+    whole = [_cameras(model, sizes, params) for model in models if _plausible(model)]
+    large = [model for model in whole if 2 * len(model) >= max(map(len, whole))]
+    return max(large, key=lambda model: _worth(model, kept, matches), default=_cameras(None, sizes, params))
 
 
 @task(name="capture.unregistered")
@@ -148,16 +152,15 @@ def accepted(
             f"only {most} of {missing.total} photos found their pose; photos that overlap by two thirds, sharp, of a "
             "scene with texture and taken from different places help, or give poses (COLMAP, nerfstudio)."
         )
-    fits = [matches_that_fit(tried, photos, matches) for tried in enough]
-    best = max(range(len(enough)), key=lambda row: (fits[row][0] >= _CONSISTENT * fits[row][1], fits[row][0]))
-    fit, total = fits[best]
+    best = max(enough, key=lambda tried: _worth(tried, photos, matches))
+    fit, total = matches_that_fit(best, photos, matches)
     if fit < _CONSISTENT * total:
         warn(
             f"The poses that were found are probably wrong: {1 - fit / total:.0%} of the matches between photos do not "
             "fit them, where 3 % is usual. Things that repeat or move, and photos from nearly one place, mislead; more "
             "photos from other places help, or give poses (COLMAP, nerfstudio)."
         )
-    return enough[best]
+    return best
 
 
 @task(name="capture.registered")
@@ -205,6 +208,13 @@ def _global_options(pycolmap: Any, seed: int) -> Any:
     options.random_seed = seed
     options.min_model_size = 3
     return options
+
+
+def _worth(model: Cameras, photos: Sequence[Features], matches: Sequence[Matches]) -> tuple[bool, int, int, int]:
+    """What tells the best of several models: that matches do not contradict it, then by how many fit it, and by its
+    photos and points."""
+    fit, total = matches_that_fit(model, photos, matches)
+    return fit >= _CONSISTENT * total, fit, len(model), len(model.sparse_points)
 
 
 def _plausible(model: Any) -> bool:
