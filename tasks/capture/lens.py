@@ -70,12 +70,19 @@ def photo_lens(frame: Frame, stated: Lens | None, cameras: Cameras) -> Lens | No
     """
     lens = stated
     if stated is None and cameras.radial.size:
-        row = cameras.names.index(frame.name)
-        fx, fy, cx, cy = cameras.intrinsics[row].tolist()
-        lens = Lens(frame.width, frame.height, fx, fy, cx, cy, (float(cameras.radial[row]), 0.0, 0.0, 0.0))
+        lens = found_lens(cameras, cameras.names.index(frame.name))
     if lens is None or lens.pinhole:
         return None
     return lens.scaled(frame.source_width, frame.source_height)
+
+
+def found_lens(cameras: Cameras, view: int) -> Lens:
+    """The lens of the photo that a camera was estimated from, for the size of its frame; a pinhole unless structure
+    from motion found a distortion."""
+    width, height = cameras.sizes[view].tolist()
+    fx, fy, cx, cy = cameras.intrinsics[view].tolist()
+    radial = (float(cameras.radial[view]), 0.0, 0.0, 0.0) if cameras.radial.size else ()
+    return Lens(width, height, fx, fy, cx, cy, radial)
 
 
 def distorted(points: Float64, lens: Lens) -> Float64:

@@ -13,8 +13,9 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Int32
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
 from ss_flow.tasks.capture.features import Features
+from ss_flow.tasks.capture.lens import found_lens, undistorted
 from ss_flow.tasks.capture.matches import MAX_ERROR, Matches
 from ss_flow.tasks.geometry.cameras import backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
@@ -156,9 +157,10 @@ def matches_that_fit(cameras: Cameras, photos: Sequence[Features], matches: Sequ
     """
     rows = {name: row for row, name in enumerate(cameras.names)}
     points = {}
-    for i in range(len(photos)):
-        if photos[i].name in rows:
-            points[photos[i].name] = _straight(cameras, rows[photos[i].name], photos[i].points)
+    for photo in photos:
+        if photo.name in rows:
+            lens, seen = found_lens(cameras, rows[photo.name]), photo.points.astype(np.float64)
+            points[photo.name] = seen if lens.pinhole else undistorted(seen, lens)
     fit, total = 0, 0
     for own in matches:
         for i, other in enumerate(own.others):
@@ -193,19 +195,6 @@ def _fundamental(cameras: Cameras, first: int, second: int) -> Float64:
     x, y, z = relative[:3, 3]
     across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.asarray(lens(second).T @ across @ relative[:3, :3] @ lens(first))
-
-
-def _straight(cameras: Cameras, view: int, points: Float32) -> Float32:
-    """[N, 2] where the points of a photo lie in that of a pinhole."""
-    import cv2
-
-    if not cameras.radial.size or not len(points):
-        return points
-    fx, fy, cx, cy = cameras.intrinsics[view]
-    lens = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    bend, until = np.array([cameras.radial[view], 0, 0, 0]), (cv2.TERM_CRITERIA_COUNT, 50, 0)
-    straight: Float32 = cv2.undistortPoints(points[:, None], lens, bend, P=lens, criteria=until)[:, 0]
-    return straight
 
 
 def _depth_difference(cameras: Cameras, views: tuple[int, int], depths: tuple[DepthMap, DepthMap]) -> float:

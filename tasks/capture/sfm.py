@@ -17,7 +17,7 @@ from ss_flow.tasks.capture.colmap import load_pycolmap
 from ss_flow.tasks.capture.colmap_database import fill_database
 from ss_flow.tasks.capture.features import FeatureParams, Features
 from ss_flow.tasks.capture.ingest import warn_of_skipped
-from ss_flow.tasks.capture.lens import Lens, without_distortion
+from ss_flow.tasks.capture.lens import found_lens, without_distortion
 from ss_flow.tasks.capture.matches import FIRST_FOCAL, Matches
 from ss_flow.tasks.capture.pairs import Look, PairParams
 from ss_flow.tasks.capture.pose_fit import matches_that_fit
@@ -152,15 +152,16 @@ def accepted(
             f"only {most} of {missing.total} photos found their pose; photos that overlap by two thirds, sharp, of a "
             "scene with texture and taken from different places help, or give poses (COLMAP, nerfstudio)."
         )
-    best = max(enough, key=lambda tried: _worth(tried, photos, matches))
-    fit, total = matches_that_fit(best, photos, matches)
-    if fit < _CONSISTENT * total:
+    worths = [_worth(tried, photos, matches) for tried in enough]
+    best = max(range(len(enough)), key=worths.__getitem__)
+    if not worths[best][0]:
+        fit, total = matches_that_fit(enough[best], photos, matches)
         warn(
             f"The poses that were found are probably wrong: {1 - fit / total:.0%} of the matches between photos do not "
             "fit them, where 3 % is usual. Things that repeat or move, and photos from nearly one place, mislead; more "
             "photos from other places help, or give poses (COLMAP, nerfstudio)."
         )
-    return best
+    return enough[best]
 
 
 @task(name="capture.registered")
@@ -175,9 +176,7 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
     result = []
     for i, name in enumerate(cameras.names):
         frame = frame_of[name]
-        if cameras.radial.size and cameras.radial[i] != 0:
-            fx, fy, cx, cy = (float(x) for x in cameras.intrinsics[i])
-            lens = Lens(frame.width, frame.height, fx, fy, cx, cy, (float(cameras.radial[i]), 0.0, 0.0, 0.0))
+        if not (lens := found_lens(cameras, i)).pinhole:
             image, keep = without_distortion(decode_rgb(frame), decode_valid(frame), lens)
             valid = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
             frame = replace(frame, encoded=encode_png(image), valid=valid)
