@@ -25,41 +25,30 @@ from ss_flow.flows.cli.context import file_digests, references
 from ss_flow.flows.params import CaptureParams, Params
 from ss_flow.flows.poses import matched, poses
 from ss_flow.graph import each
-from ss_flow.tasks.artifacts import Bool, Cameras, Float64
+from ss_flow.tasks.artifacts import Cameras, Float64
+from ss_flow.tasks.capture.colmap import load_pycolmap
 from ss_flow.tasks.capture.features import features
 from ss_flow.tasks.capture.ingest import cameras, frames
 from ss_flow.tasks.capture.pairs import look
 from ss_flow.tasks.capture.pose_fit import matches_that_fit
 from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.geometry.cameras import cameras_by_view
 
-SAMPLES = 2000
 RIGHT = 0.02
 
 
-def centers(found: Cameras) -> Float64:
+def places(found: Cameras) -> Float64:
     """[V, 3] where the cameras stand."""
-    return np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in found.world_to_camera])
-
-
-def moved(points: Float64, onto: Float64, by: Bool | np.ndarray) -> Float64:
-    """[N, 3] the points after the similarity that takes those of `by` nearest to theirs (Umeyama 1991)."""
-    mean, other = points[by].mean(axis=0), onto[by].mean(axis=0)
-    a, b = points[by] - mean, onto[by] - other
-    u, size, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    scale = (size * sign).sum() / max((a**2).sum(), 1e-12)
-    return scale * (points - mean) @ ((u * sign) @ vt).T + other
+    return np.stack([camera.center for camera in cameras_by_view(found)])
 
 
 def right_places(found: Float64, true: Float64) -> Float64:
     """Distances of those that lie right, as a share of the extent of the true ones."""
-    extent, random = np.linalg.norm(np.ptp(true, axis=0)), np.random.default_rng(0)
-    best = np.zeros(len(found), bool)
-    for _ in range(SAMPLES):
-        near = np.linalg.norm(moved(found, true, random.choice(len(found), 3, replace=False)) - true, axis=1)
-        if (near < RIGHT * extent).sum() > best.sum():
-            best = near < RIGHT * extent
-    off = np.linalg.norm(moved(found, true, best) - true, axis=1) / extent
+    pycolmap = load_pycolmap()
+    extent = np.linalg.norm(np.ptp(true, axis=0))
+    options = pycolmap.RANSACOptions(max_error=RIGHT * extent, random_seed=0)
+    onto = pycolmap.estimate_sim3d_robust(found, true, options)["tgt_from_src"]
+    off = np.linalg.norm(onto * found - true, axis=1) / extent
     return off[off < RIGHT]
 
 
@@ -95,7 +84,7 @@ def line(place: Path, params: CaptureParams, store: Store) -> str:
     placed, given = store.get(report.values["placed"]), store.get(report.values["given"])
     photos, matches = ([store.get(key) for key in report.values[name]] for name in ("features", "matches"))
     rows = [given.names.index(name) for name in placed.names]
-    off = right_places(centers(placed), centers(given)[rows])
+    off = right_places(places(placed), places(given)[rows])
     shares = [fit / max(total, 1) for fit, total in (matches_that_fit(c, photos, matches) for c in (placed, given))]
     seconds = defaultdict[str, float](float)
     for node in report.nodes:
