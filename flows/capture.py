@@ -8,7 +8,8 @@ from typing import Any
 from ss_flow.errors import InputError
 from ss_flow.flows.depths import Beside, all_of, completed_depth, depth_source, fitting_depth, measured, without_sensor
 from ss_flow.flows.params import CaptureParams
-from ss_flow.flows.poses import fitting_poses, poses, refined_poses
+from ss_flow.flows.poses import fitting_poses, poses, poses_by_depth, refined_poses
+from ss_flow.graph import expand, pick
 from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import (
     Cameras,
@@ -31,7 +32,7 @@ from ss_flow.tasks.capture.given_scene import given_scene
 from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.registration import registration
-from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.capture.scene_files import NO_POSE, SceneFiles
 from ss_flow.tasks.capture.sfm import registered
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.geometry.cameras import Camera
@@ -85,27 +86,8 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     reference: turns a path into a file reference (digests are remembered outside the flow).
     Raises InputError when the depth that the parameters ask for cannot be had.
     """
-    frames = _frames(scene, reference, params)
     source = depth_source(scene, params)
-    sensed = measured(scene, reference, frames) if source == "sensor" else None
-    if scene.poses is not None and scene.lenses is not None:
-        cameras = ingest.cameras(
-            frames,
-            names=scene.names,
-            lenses=scene.lenses,
-            poses=scene.poses,
-            metric=scene.metric,
-            sparse=reference(scene.sparse) if scene.sparse else None,
-        )
-        if params.refine_poses == "always":
-            cameras = refined_poses(frames, cameras, params)
-        elif params.refine_poses == "auto" and scene.given_scene is None:  # which lies where the given poses have it
-            cameras = fitting_poses(frames, cameras, sensed, params)
-    elif params.refine_poses == "always":
-        raise InputError(f"{scene.root} has no poses that could be refined; leave --refine-poses out.")
-    else:
-        cameras = poses(frames, params.sfm, scene.names or None)
-        frames = registered(frames, cameras)
+    frames, cameras, sensed = _placed(scene, reference, params, with_sensor=source == "sensor")
     names = _known_names(scene)
     known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
     masks = truth = pointed = corrected = None
@@ -160,6 +142,44 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         colours=evened,
         checks=checked,
         given=given,
+    )
+
+
+def _placed(
+    scene: SceneFiles, reference: Reference, params: CaptureParams, with_sensor: bool
+) -> tuple[tuple[Frame, ...], Cameras, tuple[DepthMap, ...] | None]:
+    """The frames that have a camera, their cameras, and what a sensor measured in them."""
+    frames = _frames(scene, reference, params)
+    sensed = measured(scene, reference, frames) if with_sensor else None
+    if scene.poses is None:
+        if params.refine_poses == "always":
+            raise InputError(f"{scene.root} has no poses that could be refined; leave --refine-poses out.")
+        if scene.lenses is None or sensed is None:
+            cameras = poses(frames, params.sfm, scene.names or None)
+            return registered(frames, cameras), cameras, sensed
+        unposed = replace(scene, poses=(NO_POSE,) * len(scene.names))
+        cameras = poses_by_depth(frames, _given_cameras(unposed, reference, frames), sensed, params, scene.names)
+        depths = sensed
+        rows = {name: row for row, name in enumerate(scene.names)}
+        sensed = expand(cameras, lambda placed: pick(depths, [rows[name] for name in placed.names]))
+        return registered(frames, cameras), cameras, sensed
+    cameras = _given_cameras(scene, reference, frames)
+    if params.refine_poses == "always":
+        cameras = refined_poses(frames, cameras, params)
+    elif params.refine_poses == "auto" and scene.given_scene is None:  # which lies where the given poses have it
+        cameras = fitting_poses(frames, cameras, sensed, params)
+    return frames, cameras, sensed
+
+
+def _given_cameras(scene: SceneFiles, reference: Reference, frames: tuple[Frame, ...]) -> Cameras:
+    assert scene.lenses is not None and scene.poses is not None
+    return ingest.cameras(
+        frames,
+        names=scene.names,
+        lenses=scene.lenses,
+        poses=scene.poses,
+        metric=scene.metric,
+        sparse=reference(scene.sparse) if scene.sparse else None,
     )
 
 

@@ -1,5 +1,5 @@
 """Photos without poses -> cameras: features a photo, matches with its partners, mapping, and once more for what is left
-out. Photos with poses that do not fit them -> better ones."""
+out; or, where a sensor measured depth, by that. Photos with poses that do not fit them -> better ones."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, cast
 from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import INDEX, each, expand, gather, pick
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
+from ss_flow.tasks.capture.depth_poses import placed_by_depth
 from ss_flow.tasks.capture.features import Features, features
 from ss_flow.tasks.capture.matches import Matches, match
 from ss_flow.tasks.capture.pairs import Look, look, partners
@@ -19,9 +20,7 @@ from ss_flow.tasks.capture.sfm import SfmParams, Unregistered, accepted, sfm, un
 
 def poses(frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] | None) -> Cameras:
     """Add the nodes of structure from motion; names: of the frames, where they are known beforehand."""
-    found = each(frames, names=names, build=lambda frame: features(frame, params=params.features))
-    looks = each(found, names=names, build=lambda photo: look(photo, count=params.pairs.look_features))
-    matches = matched(found, looks, params, names)
+    found, looks, matches = _compared(frames, params, names)
     first = sfm(found, matches, gather([]), params=params.mapping)
     missing = unregistered(looks, first)
 
@@ -38,12 +37,30 @@ def poses(frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] |
     return expand(missing, complete)
 
 
+def poses_by_depth(
+    frames: tuple[Frame, ...],
+    unposed: Cameras,
+    depths: tuple[DepthMap, ...],
+    params: CaptureParams,
+    names: tuple[str, ...],
+) -> Cameras:
+    """Add the nodes that find poses from what a sensor measured; unposed: the lenses of the frames."""
+    found, _, matches = _compared(frames, params.sfm, names)
+    return placed_by_depth(
+        found,
+        unposed,
+        depths,
+        matches,
+        min_matches=params.sfm.mapping.min_pose_matches,
+        min_registered=params.sfm.min_registered,
+        params=params.refine,
+    )
+
+
 def refined_poses(frames: tuple[Frame, ...], cameras: Cameras, params: CaptureParams) -> Cameras:
     """Add the nodes that refine the poses of the frames, which came with the capture."""
-    found = each(frames, build=lambda frame: features(frame, params=params.sfm.features))
-    looks = each(found, build=lambda photo: look(photo, count=params.sfm.pairs.look_features))
-    insist = params.refine_poses == "always"
-    return refined_cameras(found, cameras, matched(found, looks, params.sfm, None), params=params.refine, insist=insist)
+    found, _, matches = _compared(frames, params.sfm, None)
+    return refined_cameras(found, cameras, matches, params=params.refine, insist=params.refine_poses == "always")
 
 
 def fitting_poses(
@@ -81,6 +98,15 @@ def fitting_poses(
         return expand(before, decide)
 
     return expand(cast(Any, looks), lambda count: look(0, count))
+
+
+def _compared(
+    frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] | None
+) -> tuple[tuple[Features, ...], tuple[Look, ...], tuple[Matches, ...]]:
+    """Features, first looks and matches of photos."""
+    found = each(frames, names=names, build=lambda frame: features(frame, params=params.features))
+    looks = each(found, names=names, build=lambda photo: look(photo, count=params.pairs.look_features))
+    return found, looks, matched(found, looks, params, names)
 
 
 def matched(

@@ -18,7 +18,7 @@ Lenses = Callable[[Features, int], tuple[Hashable, Any]]
 def fill_database(photos: Sequence[Features], matches: Sequence[Matches], lens: Lenses) -> tuple[Any, list[Features]]:
     """The database, in which photo i is image and frame i + 1; and the photos without their descriptors.
 
-    matches: of pairs that stand here twice the last counts.
+    matches: of pairs that stand here twice the last counts; those with other photos do not count.
     """
     pycolmap = load_pycolmap()
     database = pycolmap.Database.open(":memory:")
@@ -59,6 +59,8 @@ def _geometries(pycolmap: Any, matches: Sequence[Matches], rows: dict[str, int])
     found = {}
     for own in matches:
         for i, other in enumerate(own.others):
+            if own.name not in rows or other not in rows:
+                continue
             geometry = pycolmap.TwoViewGeometry(
                 config=int(own.configuration[i]),
                 F=own.fundamental[i],

@@ -31,7 +31,8 @@ _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 def open_nerfstudio(path: Path) -> SceneFiles:
     """The capture that a `transforms.json` describes.
 
-    Its poses are camera-to-world with OpenGL's axes (y up, looking along -z). A unit of its depth files is
+    Its poses are camera-to-world with OpenGL's axes (y up, looking along -z); where all frames have depth, all may be
+    without. A unit of its depth files is
     `depth_unit_scale_factor` world units (0.001 unless said). The scene counts as metric exactly when it has depth
     maps: those of a sensor come in metres, while poses alone are mostly structure from motion's.
     Frames whose photo is not there are left out: such a file is often passed on with a part of its photos.
@@ -54,7 +55,8 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     if with_depth and len(with_depth) < len(frames):
         lacking = next(f["file_path"] for f in frames if not f.get("depth_file_path"))
         raise InputError(f"{path} gives no depth_file_path for {lacking}; give one for every frame, or for none.")
-    poses = tuple(_pose(frame, path) for frame in frames)
+    unposed = with_depth and not any("transform_matrix" in frame for frame in frames)
+    poses = None if unposed else tuple(_pose(frame, path) for frame in frames)
     return SceneFiles(
         kind="nerfstudio",
         root=root,

@@ -12,6 +12,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import (
+    NO_POSE,
     Pose,
     SceneFiles,
     by_stem,
@@ -28,7 +29,7 @@ def is_scannet(root: Path) -> bool:
 
 
 def open_scannet(root: Path) -> SceneFiles:
-    """A ScanNet export: `color/ pose/ intrinsic/`, `depth/` where there is one.
+    """A ScanNet export: `color/ intrinsic/`, and `pose/` and `depth/` or one of them.
 
     Poses are camera-to-world in metres; depth is in millimetres. The intrinsics assume integer pixel centres, hence
     half a pixel is added to cx and cy (spec 3.0). A pose that is infinite throughout marks a view whose tracking was
@@ -40,14 +41,12 @@ def open_scannet(root: Path) -> SceneFiles:
         raise InputError(f"{root / 'color'} holds no photo; ScanNet's colour frames (0.jpg, 1.jpg, ...) are expected.")
     lens = _intrinsics(root / "intrinsic" / "intrinsic_color.txt")
     depths = by_stem(files_in(root / "depth")) if (root / "depth").is_dir() else None
+    unposed = depths is not None and not (root / "pose").is_dir()
     poses: list[Pose] = []
     kept: list[tuple[str, Path]] = []
     skipped = []
     for stem, photo in photos:
-        pose_file = root / "pose" / f"{stem}.txt"
-        if not pose_file.is_file():
-            raise InputError(f"{pose_file} is missing; every photo in {root / 'color'} needs its pose.")
-        pose = _pose(read_matrix(pose_file), str(pose_file))
+        pose = NO_POSE if unposed else _read_pose(root, stem)
         if pose is None:
             skipped.append(stem)
             continue
@@ -66,11 +65,18 @@ def open_scannet(root: Path) -> SceneFiles:
         depth_scale=1e-3,
         depth_lens=_depth_lens(root / "intrinsic") if depths else None,
         lenses=(lens,) * len(kept),
-        poses=tuple(poses),
+        poses=None if unposed else tuple(poses),
         metric=True,
         skipped=tuple(skipped),
         all_names=tuple(stem for stem, _ in photos),
     )
+
+
+def _read_pose(root: Path, stem: str) -> Pose | None:
+    pose_file = root / "pose" / f"{stem}.txt"
+    if not pose_file.is_file():
+        raise InputError(f"{pose_file} is missing; every photo in {root / 'color'} needs its pose.")
+    return _pose(read_matrix(pose_file), str(pose_file))
 
 
 def _pose(camera_to_world: Float64, where: str) -> Pose | None:

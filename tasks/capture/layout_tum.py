@@ -17,7 +17,7 @@ MAX_TIME_APART = 0.02
 
 
 def open_tum(root: Path) -> SceneFiles:
-    """A TUM RGB-D sequence: `rgb.txt`, `groundtruth.txt`, and `depth.txt` where there is one.
+    """A TUM RGB-D sequence: `rgb.txt`, `groundtruth.txt` and `depth.txt`; one of these two may be absent.
 
     Depth and poses are taken from the entry nearest in time, at most 0.02 s away; photos without are skipped. Depth
     files count 5000 to the metre and are registered to the photos. Intrinsics are four numbers, fx fy cx cy with
@@ -27,11 +27,12 @@ def open_tum(root: Path) -> SceneFiles:
     """
     photos = _entries(root / "rgb.txt")
     depths = _entries(root / "depth.txt") if (root / "depth.txt").is_file() else None
-    tracks = _entries(root / "groundtruth.txt")
+    unposed = depths is not None and not (root / "groundtruth.txt").is_file()
+    tracks = None if unposed else _entries(root / "groundtruth.txt")
     kept, skipped = [], []
     for time, words in photos:
-        track, depth = _nearest(tracks, time), _nearest(depths, time) if depths is not None else None
-        if track is None or (depths is not None and depth is None):
+        track, depth = (None if entries is None else _nearest(entries, time) for entries in (tracks, depths))
+        if (tracks is not None and track is None) or (depths is not None and depth is None):
             skipped.append(Path(words[0]).stem)
         else:
             kept.append((words[0], track, depth))
@@ -49,7 +50,7 @@ def open_tum(root: Path) -> SceneFiles:
         depths=tuple(root / depth[0] for _, _, depth in kept if depth is not None) if depths is not None else None,
         depth_scale=1 / 5000,
         lenses=(_lens(root),) * len(kept),
-        poses=tuple(_pose(track, root / "groundtruth.txt", photo) for photo, track, _ in kept),
+        poses=None if unposed else tuple(_pose(t, root / "groundtruth.txt", photo) for photo, t, _ in kept if t),
         metric=True,
         skipped=tuple(skipped),
         all_names=tuple(Path(words[0]).stem for _, words in photos),

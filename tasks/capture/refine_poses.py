@@ -50,24 +50,59 @@ def refined_cameras(
     insist: bool = True,
     seed: int = 0,
 ) -> Cameras:
-    """The cameras with poses under which the photos' common points agree best.
+    """The cameras with poses under which the photos' common points agree best (`adjusted`).
 
-    Points are triangulated with the given poses; then poses and points are adjusted together, in rounds that let ever
-    smaller errors count. Photos tell neither the scale nor the place of the world: the result is brought onto the given
-    cameras by the best similarity. How far the poses moved, and the median reprojection error of the same points
-    before and after, is told as a warning. Sparse points are those of the last round.
+    How far the poses moved, and the median reprojection error of the same points before and after, is told as a
+    warning.
     insist: whether it is an error when the photos have too little in common; else the given cameras are returned.
     Raises InputError then.
     """
-    pycolmap = load_pycolmap()
-
-    def unrefined(why: str) -> Cameras:
+    try:
+        found = adjusted(photos, cameras, matches, params, seed)
+    except Unrefinable as error:
         if insist:
             raise InputError(
-                f"the poses cannot be refined: {why}; leave --refine-poses out, or give the photos without poses."
-            )
-        warn(f"The given poses were not refined: {why}.")
+                f"the poses cannot be refined: {error}; leave --refine-poses out, or give the photos without poses."
+            ) from None
+        warn(f"The given poses were not refined: {error}.")
         return cameras
+    _tell(cameras, found)
+    return found.cameras
+
+
+class Unrefinable(Exception):
+    """Photos do not tell better poses; its words say why."""
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What an adjustment made of cameras."""
+
+    cameras: Cameras
+    rows: list[int]
+    """Those that it moved."""
+    error_before: float
+    """Median distance of the points of the adjustment from where they are seen, under the cameras as they were ..."""
+    error_after: float
+    """... and as they are, pixels."""
+
+
+def adjusted(
+    photos: Sequence[Features],
+    cameras: Cameras,
+    matches: Sequence[Matches],
+    params: RefinePosesParams,
+    seed: int,
+) -> Adjusted:
+    """Cameras with poses under which the common points of their photos agree best.
+
+    Points are triangulated with the given poses; then poses and points are adjusted together, in rounds that let ever
+    smaller errors count. Photos tell neither the scale nor the place of the world: the result is brought onto the given
+    cameras by the best similarity. Sparse points are those of the last round.
+    photos: of the cameras, in their order. matches: those with other photos do not count.
+    Raises Unrefinable when the photos have too little in common.
+    """
+    pycolmap = load_pycolmap()
 
     def lens(photo: Features, row: int) -> tuple[tuple[float, ...], Any]:
         numbers = [*cameras.intrinsics[row].tolist()]
@@ -95,7 +130,7 @@ def refined_cameras(
         mapper.complete_and_merge_tracks(triangulating)
         mapper.filter_points(filtering)
         if model.num_points3D() < _LEAST_POINTS:
-            return unrefined(f"only {model.num_points3D()} points are seen in common as the given poses would have it")
+            raise Unrefinable(f"only {model.num_points3D()} points are seen in common as the given poses would have it")
         _adjust(pycolmap, model, poses=True, intrinsics=params.intrinsics)
         mapper.filter_points(filtering)
         if error <= params.last_error:
@@ -104,11 +139,11 @@ def refined_cameras(
     mapper.end_reconstruction(False)
     rows = [number - 1 for number in sorted(model.reg_image_ids()) if _points(model, number) >= params.min_points]
     if len(rows) < _LEAST_PHOTOS:
-        return unrefined(f"fewer than {_LEAST_PHOTOS} photos see {params.min_points} points in common with others")
+        raise Unrefinable(f"fewer than {_LEAST_PHOTOS} photos see {params.min_points} points in common with others")
     poses = np.stack([np.vstack([model.image(row + 1).cam_from_world().matrix(), (0, 0, 0, 1)]) for row in rows])
     onto_given = _similarity(poses, cameras.world_to_camera[rows])
     if onto_given is None:
-        return unrefined("the cameras stand in one place, which tells no scale")
+        raise Unrefinable("the cameras stand in one place, which tells no scale")
     return _result(pycolmap, model, cameras, rows, onto_given)
 
 
@@ -141,7 +176,7 @@ def _adjust(pycolmap: Any, model: Any, *, poses: bool, intrinsics: bool) -> None
     pycolmap.create_default_bundle_adjuster(options, scope, model).solve()
 
 
-def _result(pycolmap: Any, model: Any, given: Cameras, rows: list[int], onto_given: Float64) -> Cameras:
+def _result(pycolmap: Any, model: Any, given: Cameras, rows: list[int], onto_given: Float64) -> Adjusted:
     after = _median_error(model)
     model.transform(pycolmap.Sim3d(onto_given))
     world_to_camera, intrinsics = given.world_to_camera.copy(), given.intrinsics.copy()
@@ -152,13 +187,9 @@ def _result(pycolmap: Any, model: Any, given: Cameras, rows: list[int], onto_giv
     for number in model.reg_image_ids():
         model.frame(number).rig_from_world = pycolmap.Rigid3d(given.world_to_camera[number - 1][:3])
     _adjust(pycolmap, model, poses=False, intrinsics=False)
-    _tell(given, world_to_camera, rows, (_median_error(model), after))
-    return replace(
-        given,
-        world_to_camera=world_to_camera,
-        intrinsics=intrinsics,
-        sparse_points=np.array(points, np.float32).reshape(-1, 3),
-    )
+    sparse = np.array(points, np.float32).reshape(-1, 3)
+    cameras = replace(given, world_to_camera=world_to_camera, intrinsics=intrinsics, sparse_points=sparse)
+    return Adjusted(cameras, rows, error_before=_median_error(model), error_after=after)
 
 
 def _similarity(poses: Float64, given: Float64) -> Float64 | None:
@@ -175,15 +206,16 @@ def _similarity(poses: Float64, given: Float64) -> Float64 | None:
     return np.column_stack([scale * rotation, target.mean(axis=0) - scale * source.mean(axis=0)])
 
 
-def _tell(given: Cameras, refined: Float64, rows: list[int], errors: tuple[float, float]) -> None:
+def _tell(given: Cameras, found: Adjusted) -> None:
+    rows, refined = found.rows, found.cameras.world_to_camera
     moved = np.linalg.norm(_centers(refined) - _centers(given.world_to_camera), axis=1)[rows]
     turn = refined[rows, :3, :3] @ given.world_to_camera[rows, :3, :3].transpose(0, 2, 1)
     turned = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     warn(
         f"Bundle adjustment moves the given poses of {len(rows)} of {len(given)} views by {np.median(moved):.3g} "
         f"{'m' if given.metric else 'units'} (at most {moved.max():.3g}) and turns them by {np.median(turned):.2f} "
-        f"degrees (at most {turned.max():.2f}); points are seen {errors[1]:.2f} pixels off their place instead of "
-        f"{errors[0]:.2f} (medians)."
+        f"degrees (at most {turned.max():.2f}); points are seen {found.error_after:.2f} pixels off their place instead "
+        f"of {found.error_before:.2f} (medians)."
     )
 
 

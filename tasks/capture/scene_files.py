@@ -26,6 +26,8 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 
 Pose = tuple[float, ...]
 """World-to-camera, 16 numbers row by row (plain numbers, so that a step's key can hold it)."""
+NO_POSE: Pose = tuple(np.eye(4).ravel().tolist())
+"""In the place of one that is yet to be found."""
 Point = tuple[float, float]
 
 

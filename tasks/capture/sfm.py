@@ -24,6 +24,11 @@ from ss_flow.tasks.capture.pose_fit import matches_that_fit
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Positive
 
+_BENT = 0.1
+"""A found lens that moves the corners of its photos by more, as a share of their distance from the middle, is doubted:
+ordinary lenses bend by a few hundredths, and in few photos with little parallax distortion stands in for depth."""
+_MUCH = 1.02
+"""So many times the matches must fit such a lens for it to be believed."""
 _CONSISTENT = 0.94
 """The share of the matches that fit right poses: .96 to .98 did in seven captures, .65 to .92 under wrong ones."""
 
@@ -84,11 +89,37 @@ def sfm(
 
     Of the models with at least half as many photos as the largest it is the one that most matches fit; one that too
     many contradict comes after all others. again: guided matches, which count in the place of those of the same pairs
-    before, but not for what is best.
+    before, but not for what is best. A lens that bends photos much is believed only where clearly more matches fit it
+    than a straight one.
     The unit of length is arbitrary (`metric` is False). Photos without a pose are missing from the result, which may be
     all; `registered` drops them, and takes out the distortion that `Cameras.radial` states. Mapping runs on one thread
     with fixed seeds, so that two runs agree to the bit.
     """
+    best = _mapped(photos, matches, again, params, seed)
+    if _bend(best) <= _BENT:
+        return best
+    straight = _mapped(photos, matches, again, replace(params, camera_model="SIMPLE_PINHOLE"), seed)
+    without, bent = (matches_that_fit(model, photos, matches)[0] for model in (straight, best))
+    return best if bent > _MUCH * without else straight
+
+
+def _bend(cameras: Cameras) -> float:
+    """How far the lenses move the corners of their photos, as a share of their distance from the middle; the most."""
+    if not len(cameras.radial):
+        return 0.0
+    focal, middle = cameras.intrinsics[:, :2], cameras.intrinsics[:, 2:]
+    corner = np.maximum(middle, cameras.sizes - middle) / focal
+    return float(np.abs(cameras.radial * (corner**2).sum(axis=1)).max())
+
+
+def _mapped(
+    photos: Sequence[Features],
+    matches: tuple[Matches, ...],
+    again: tuple[Matches, ...],
+    params: MappingParams,
+    seed: int,
+) -> Cameras:
+    """What `sfm` returns, under one model of the lens."""
     pycolmap = load_pycolmap()
     model = getattr(pycolmap.CameraModelId, params.camera_model)
 

@@ -1,3 +1,5 @@
+import json
+import shutil
 import sys
 import time
 from dataclasses import replace
@@ -125,6 +127,23 @@ def test_tum_takes_what_is_nearest_in_time(tmp_path):
 def test_tum_without_intrinsics_has_those_of_the_benchmark(tmp_path):
     lens = open_scene(made.tum(tmp_path)).lenses[0]
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (525, 525, 320, 240)
+
+
+@pytest.mark.parametrize("layout", ["tum", "scannet", "nerfstudio"])
+def test_frames_of_a_depth_sensor_may_come_without_poses(tmp_path, layout):
+    posed = open_scene(getattr(made, layout)(tmp_path))
+    if layout == "tum":
+        (tmp_path / "groundtruth.txt").unlink()
+    elif layout == "scannet":
+        shutil.rmtree(tmp_path / "pose")
+    else:
+        document = json.loads((tmp_path / "transforms.json").read_text())
+        for frame in document["frames"]:
+            del frame["transform_matrix"]
+        (tmp_path / "transforms.json").write_text(json.dumps(document))
+    scene = open_scene(tmp_path)
+    assert scene == replace(posed, poses=None)
+    assert scene.depths is not None and scene.metric
 
 
 def test_a_sens_file_lists_the_views_that_have_a_pose(tmp_path):

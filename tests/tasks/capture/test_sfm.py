@@ -8,6 +8,7 @@ from generated_views import jittered, views
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, Frame
+from ss_flow.tasks.capture import sfm
 from ss_flow.tasks.capture.features import features
 from ss_flow.tasks.capture.matches import match
 from ss_flow.tasks.capture.sfm import MappingParams, SfmParams, Unregistered, accepted, registered
@@ -144,3 +145,24 @@ def test_frames_of_a_pinhole_keep_their_bytes_and_others_are_straightened(scene)
     assert (straight.width, straight.height) == (320, 240)
     assert decode_valid(straight)[120, 160]
     assert not decode_valid(straight)[0, 0]
+
+
+@pytest.mark.parametrize(("fit_bent", "believed"), [(1000, False), (1019, False), (1030, True)])
+def test_a_lens_that_bends_photos_much_is_believed_only_where_clearly_more_matches_fit_it(
+    found, monkeypatch, fit_bent, believed
+):
+    bent = replace(found, radial=np.full(len(found), 0.4))
+    straight = replace(found, radial=np.zeros(0))
+    models = {"SIMPLE_RADIAL": bent, "SIMPLE_PINHOLE": straight}
+    monkeypatch.setattr(sfm, "_mapped", lambda *given: models[given[3].camera_model])
+    monkeypatch.setattr(sfm, "matches_that_fit", lambda model, *_: (fit_bent if model is bent else 1000, 1100))
+    assert sfm.sfm([], (), ()) is (bent if believed else straight)
+
+
+def test_a_lens_that_bends_photos_little_is_not_doubted(found, monkeypatch):
+    slight = replace(found, radial=np.full(len(found), 0.1))
+    assert 0 < sfm._bend(slight) < 0.1
+    tried = []
+    monkeypatch.setattr(sfm, "_mapped", lambda *given: tried.append(given[3].camera_model) or slight)
+    assert sfm.sfm([], (), ()) is slight
+    assert tried == ["SIMPLE_RADIAL"]
