@@ -87,7 +87,8 @@ class _Seen:
     @classmethod
     def of(cls, photo: Features, depth: DepthMap, intrinsics: Float64) -> _Seen:
         light = replace(photo, descriptors=photo.descriptors[:0])
-        z = _depth_at(photo.points * np.divide(depth.depth.shape[::-1], (photo.width, photo.height)), depth.depth)
+        scale = np.divide(depth.depth.shape[::-1], (photo.width, photo.height), dtype=np.float64)
+        z = _depth_at(photo.points * scale, depth.depth)
         rays = (photo.points - intrinsics[2:]) / intrinsics[:2]
         return cls(light, intrinsics, np.column_stack([rays, np.ones(len(rays))]) * z[:, None])
 
