@@ -10,6 +10,7 @@ import ast
 import functools
 import importlib.util
 import itertools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from ss_flow.flows.params import Params
 PAGE = Path(__file__).with_name("parameters.md")
 BEGIN, END = "<!-- table of parameters: written by make_parameters.py -->", "<!-- end of the table -->"
 HEAD = ("| parameter | default | presets | what it is |", "|---|---|---|---|")
-PRESETS = ("paper", "reference", "fast", "thorough")
+PRESETS = {"paper": "default", "paper_lerf": "paper", "reference": "default", "fast": "default", "thorough": "default"}
+"""Those that have a place in the column of presets, each with the one that it is compared with."""
 HEADINGS = {
     "capture": "Capture: photos, poses, depth",
     "split": "Split: masks to view-consistent instances",
@@ -32,23 +34,21 @@ HEADINGS = {
 def table() -> str:
     """One table for each part of the DAG, in Markdown."""
     params = Params()
-    presets = {name: settings.flat(settings.preset(Params(), name)) for name in PRESETS}
+    presets = {name: settings.flat(settings.preset(Params(), name)) for name in ("default", *PRESETS)}
     blocks: list[str] = []
     part = ""
     for path, value in settings.leaves(params):
         if path[0] != part:
             part = path[0]
-            blocks += [
-                "",
-                f"### {HEADINGS[part]}",
-                "",
-                "| parameter | default | presets | what it is |",
-                "|---|---|---|---|",
-            ]
+            blocks += ["", f"### {HEADINGS[part]}", "", *HEAD]
         name = ".".join(path)
-        others = [f"{preset} {shown(flat[name])}" for preset, flat in presets.items() if flat[name] != value]
+        others = [
+            f"{preset} {shown(presets[preset][name])}"
+            for preset, base in PRESETS.items()
+            if presets[preset][name] != presets[base][name]
+        ]
         owner = type(functools.reduce(getattr, path[:-1], params))
-        said = first_sentence(docstrings_of(owner.__module__, owner.__name__)[path[-1]])
+        said = in_short(docstrings_of(owner.__module__, owner.__name__)[path[-1]])
         blocks.append(f"| `{name}` | {shown(value)} | {'<br>'.join(others)} | {said} |")
     return "\n".join(blocks).strip() + "\n"
 
@@ -71,10 +71,10 @@ def docstrings_of(module: str, name: str) -> dict[str, str]:
     }
 
 
-def first_sentence(text: str) -> str:
-    """Up to the first full stop that ends a sentence, ready for a cell of a table."""
-    sentence, stop, _ = text.partition(". ")
-    return (sentence + "." if stop else text).replace("|", "\\|")
+def in_short(text: str) -> str:
+    """The first sentence, and those that tell what 0 or 1 means, ready for a cell of a table."""
+    first, *others = re.split(r"(?<=\.) ", text)
+    return " ".join([first, *(one for one in others if re.match("[01] ", one))]).replace("|", "\\|")
 
 
 def with_table(page: str) -> str:

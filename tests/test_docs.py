@@ -61,6 +61,16 @@ def test_every_parameter_is_in_the_table_with_an_explanation(maker):
     assert [name for name, _, said in rows if len(said) < 10] == []
 
 
+def test_the_table_tells_what_0_and_1_mean_and_where_a_preset_differs(maker):
+    assert (
+        maker.in_short("Most points. More are thinned out. 0 = all. 1 in the paper.")
+        == "Most points. 0 = all. 1 in the paper."
+    )
+    row = next(line for line in maker.table().splitlines() if line.startswith("| `splat.reconstruct.max_iterations` |"))
+    assert "paper `1000`<br>paper_lerf `10000`<br>reference `1000`" in row
+    assert maker.table().count("paper_lerf") == 3
+
+
 def test_a_page_without_the_marks_is_refused(maker):
     with pytest.raises(ValueError, match=r"parameters\.md lacks"):
         maker.with_table("# Parameters\n")

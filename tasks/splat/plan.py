@@ -20,8 +20,8 @@ class PlanParams:
 
     max_rounds: Natural = 0
     """Rounds of merging pairs; then the last pass over the whole scene refines all that collide together. Pairs before
-    it took a fifth to a half of Splat's time and gained nothing (docs/splat.md), so there are none unless asked for;
-    the paper merges until nothing collides."""
+    it gained nothing, and took 273 of the 1,191 s of Splat on fifty photos (docs/measurements/splat.md), so there are
+    none unless asked for; the paper merges until nothing collides."""
     overlap: Literal["box", "voxel"] = "box"
     """What two groups must share: "box", as in the paper, or "voxel", cubes of space, which tells what touches a floor
     from what stands in the room."""

@@ -53,7 +53,7 @@ class RefineParams:
     cut_occluded: bool = True
     """Whether the rendered mask is cut where something is in front; False in the paper."""
     tau_iou: Fraction = 0.5
-    """IoU with the rendered mask from which a mask is added to a view that had none; 0.95 in the paper."""
+    """IoU with the rendered mask above which a mask is added to a view that had none; 0.95 in the paper."""
     pred_iou: Fraction = 0.8
     """IoU that the segmenter predicts for its mask, below which the mask is not taken; 0 = any, as in the paper."""
     margin: Fraction = 1.0

@@ -46,8 +46,9 @@ class RenderMasksParams:
     """Whose the thin strips are that the scene would take off a mask: "photo" - that one's of the two whose borders lie
     where the photo changes; or the "scene"'s, as in the paper."""
     most: Fraction = 0.4
-    """How much of a mask other instances may take in a view. Where they would take more, they take nothing: that is not
-    about borders but about which thing is there, and the mask has the votes of all views. 1 = all of it."""
+    """How much of a mask other instances may take in a view; of one under 1 % of the view, all. Where they would take
+    more, they take nothing: that is not about borders but about which thing is there, and the mask has the votes of all
+    views. 1 = all of it."""
 
 
 @task(

@@ -11,11 +11,20 @@ import pytest
 from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians.backends import NativeBackend
-from ss_flow.tasks.gaussians.densification import REFERENCE_ROWS, GradientRecord, Schedule, densify, rotations
+from ss_flow.tasks.gaussians.densification import (
+    REFERENCE_ROWS,
+    AdaptiveControl,
+    GradientRecord,
+    Schedule,
+    Seen,
+    densify,
+    rotations,
+)
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, laid_flat, select
 from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
+from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import PartView, TrainingDiverged, TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
@@ -248,6 +257,19 @@ def test_densification_ends_at_the_limit_with_the_largest_gradients_first():
         backend=NativeBackend(1),
     )  # fmt: skip
     assert source.tolist() == [0, 1, 2, 3, 4, 5, 1, 3]
+
+
+@pytest.mark.parametrize(("step", "kept"), [(20, [0, 1, 2]), (30, [0, 1])])
+def test_what_is_larger_than_a_tenth_of_the_scene_is_dropped_once_opacities_have_been_reset(step, kept):
+    given = initialise(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8), 1, 1.0)
+    given.log_scales[:] = np.log([[0.01], [0.19], [0.21]])
+    backend = NativeBackend(1)
+    control = AdaptiveControl(
+        GradientRecord(3, backend), Schedule(0, 100, 10, 20), threshold=1.0, extent=2.0, most=9, prune_opacity=0.0
+    )
+    parameters, nothing = Parameters(given, 0, backend), Seen(np.zeros((3, 2), np.float32), np.ones(3, np.float32), 1)
+    control.after(step, parameters, nothing, np.random.default_rng(0))
+    assert parameters.origin.tolist() == kept
 
 
 def test_a_limit_of_none_lets_densification_go_on():

@@ -95,6 +95,14 @@ def test_what_no_picture_shows_gets_its_neighbours_mean_and_is_flagged(monkeypat
     np.testing.assert_allclose(found.features[inside], found.features[nearest].mean(axis=0), atol=1e-6)
 
 
+@pytest.mark.parametrize(("opacity", "origin"), [(0.7, FROM_PICTURES), (0.3, NO_VECTOR)])
+def test_a_pixel_that_is_not_covered_by_half_shows_the_grey_around(monkeypatch, network, opacity, origin):
+    monkeypatch.setattr(step, "patch_encoder_of", lambda model: Colours())
+    logit = np.log(opacity / (1 - opacity))
+    alone = select(replace(block(), opacity_logits=np.full(len(block()), logit, np.float32)), [0])
+    assert dense_describe(alone, made_cameras(), network=network, params=FEW).origin.tolist() == [origin]
+
+
 def test_vectors_are_averaged_in_each_picture_and_then_over_pictures():
     """Two patches side by side; the Gaussian 0 wins the three pixels on the left, 1 the one on the right."""
     top = np.array([[0, 0, 0, 1]], np.int32)

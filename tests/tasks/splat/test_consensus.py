@@ -75,7 +75,8 @@ def test_without_depth_or_with_too_few_views_masks_stay(small):
     assert not any((channels == IGNORED).any() for channels in agreed(blind, wide, 0.5))
     two = small.instance(BALL, views=(0, 1))
     two = with_mask(two, 0, np.ones((HEIGHT, WIDTH), bool))
-    assert not any((channels == IGNORED).any() for channels in channels_of(small, two))
+    for share in (0.5, 0.9):
+        assert not any((channels == IGNORED).any() for channels in channels_of(small, two, share))
 
 
 def test_a_mask_without_pixels_is_no_error(small):

@@ -55,6 +55,11 @@ def test_a_photo_without_an_edge_prefers_short_borders():
     assert np.array_equal(settled_by_photo(photo_of((slice(0), slice(0))), masks, shown, REACH), masks)
 
 
+def test_where_the_borders_of_both_cost_the_same_the_scene_decides():
+    masks, shown = ids_of((slice(40), slice(10, 30))), ids_of((slice(40), slice(10, 34)))
+    assert np.array_equal(settled_by_photo(photo_of((slice(0), slice(0))), masks, shown, REACH), shown)
+
+
 @pytest.mark.parametrize("turn", [1, 2, 3])
 def test_a_turned_photo_is_settled_alike(turn):
     rng = np.random.default_rng(turn)

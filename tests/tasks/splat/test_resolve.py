@@ -111,6 +111,14 @@ def test_without_points_a_kept_mask_is_above_a_refined_one_and_of_two_refined_th
     assert (both == truth).all()
 
 
+def test_a_point_decides_about_the_pixels_near_it_alone(small):
+    """The ball has no points, and the box, which has, has grown over it."""
+    box, ball = small.instance(1), replace(small.instance(2), points=np.zeros((0, 3), np.float32))
+    truth = np.stack(small.ids)
+    ids = settled(small, grown_over(box, ball), ball)
+    assert (ids[truth == 1] == 1).all() and (ids[truth == 2] == 2).mean() > 0.9
+
+
 def test_masks_that_do_not_overlap_stay_as_they_are(small):
     instances = [small.instance(i) for i in range(3)]
     assert (settled(small, *instances) == np.stack(small.ids)).all()

@@ -90,6 +90,10 @@ def test_a_surface_is_what_a_good_part_of_the_pixels_there_shows(small):
     assert more < 0.4 * len(found[BALL])
 
 
+def test_a_cube_with_a_single_pixel_tells_nothing(small):
+    assert shown_surfaces(compared(small), small.maps, 1e-5) == {}
+
+
 def test_unknown_depth_shows_no_surface(small):
     blind = [replace(depth, depth=np.zeros_like(depth.depth)) for depth in small.depths]
     assert shown_surfaces(replace(compared(small), depths=blind), small.maps, 0.03) == {}

@@ -58,6 +58,13 @@ def test_halves_of_one_face_meet_in_no_edge():
     assert not edges(cloud, cameras, view, halves)[TOP - 1, 3]
 
 
+@pytest.mark.parametrize(("width", "meet"), [(3, False), (6, True)])
+def test_an_edge_that_is_short_beside_the_borders_of_both_says_nothing(width, meet):
+    cloud, cameras, view, label = scene()
+    strip = np.where((label == FRONT) & (cloud.points[:, 0] > width - 0.5), 4, label)  # the rest of the front is 4
+    assert edges(cloud, cameras, view, strip)[TOP - 1, FRONT - 1] == meet
+
+
 @pytest.mark.parametrize(
     ("together", "apart", "agreement"), [(2, 1, 0.8), (1, 2, None), (0, 0, None)], ids=["shown", "denied", "unseen"]
 )

@@ -18,8 +18,11 @@ SEAT = grid(1.2, 0.8)
 HOLE = (np.abs(SEAT[:, :2]) < 0.15).all(axis=1)
 
 
-def on_seat(height: float, color: tuple[int, int, int]) -> Mounds:
-    """A beige seat (label 1), seen from above, with something of this height and colour in the middle (label 2)."""
+def on_seat(height: float, color: tuple[int, int, int], asked: float = 0.09) -> Mounds:
+    """A beige seat (label 1), seen from above, with something of this height and colour in the middle (label 2).
+
+    asked: share of its extent from which it stands there.
+    """
     top = grid(0.3, 0.3) + np.array([0, 0, height])
     steps = np.arange(STEP, height, STEP)
     rim = top[(np.abs(top[:, :2]) > 0.13).any(axis=1)]
@@ -37,7 +40,7 @@ def on_seat(height: float, color: tuple[int, int, int]) -> Mounds:
     colors = np.array([BEIGE, color], np.uint8)[label - 1]
     cloud = PointCloud(places, colors, 1.0, STEP)
     ends = borders(labels.label, cloud, TouchingParams())
-    return find_mounds(cloud, cameras, labels, [seen], ends, around=0.8, height=0.09)
+    return find_mounds(cloud, cameras, labels, [seen], ends, around=0.8, height=asked)
 
 
 @pytest.mark.parametrize(
@@ -46,6 +49,11 @@ def on_seat(height: float, color: tuple[int, int, int]) -> Mounds:
 )
 def test_a_bag_on_a_seat_stands_on_it_and_a_patch_sewn_on_or_a_fold_of_it_does_not(height, color, stands):
     assert on_seat(height, color).standing([0, 1]).tolist() == [False, stands]
+
+
+@pytest.mark.parametrize(("height", "stands"), [(0.1, False), (0.14, True)])
+def test_what_has_other_colours_still_rises_by_two_thirds_of_what_is_asked(height, stands):
+    assert on_seat(height, RED, asked=0.3).standing([0, 1]).tolist() == [False, stands]
 
 
 def test_nothing_stands_on_something_smaller_or_on_what_does_not_surround_it():

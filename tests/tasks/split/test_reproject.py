@@ -115,6 +115,14 @@ def test_two_masks_of_an_object_cut_in_two_are_united():
     assert not found[2].views
 
 
+@pytest.mark.parametrize(("every", "end"), [(2, 10), (10, 5)])
+def test_a_mask_joins_another_one_only_with_points_about_as_dense(every, end):
+    pixels = np.concatenate([np.flatnonzero(columns(0, 5)), np.flatnonzero(columns(5, 10))[::every]])
+    painted = PaintedView.of(np.sort(pixels).astype(np.int32), np.ones(len(pixels), np.int32))
+    shown = select_masks(painted, mask_set(np.stack([columns(0, 5), columns(5, 10)])), SelectionParams())
+    assert (shown[1] == columns(0, end)).all()
+
+
 def test_a_mask_that_agrees_too_little_shows_nothing():
     found = run([columns(4, 10)], halves(right=1))
     assert not found[1].views or (found[1].dense()[0] == columns(4, 10)).all()

@@ -85,6 +85,12 @@ def test_what_lies_in_the_page_does_not_stand_on_it():
     assert not on_table(mug=0.01).standing([(PAGE,), (MUG,)]).any()
 
 
+@pytest.mark.parametrize(("mug", "stands"), [(0.028, False), (0.032, True)])
+def test_what_stands_on_a_page_rises_from_it_by_more_than_the_noise_of_points(mug, stands):
+    sheets = replace(on_table(mug=mug), height=0.0)
+    assert sheets.standing([(PAGE,), (MUG,)]).tolist() == [False, stands]
+
+
 def test_a_page_lies_in_nothing_smaller():
     assert not on_table(table=0.26).standing([(PAGE,), (MUG,)]).any()
 

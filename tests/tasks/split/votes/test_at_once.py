@@ -145,3 +145,11 @@ def test_points_at_a_border_count_less_and_strays_not_at_all():
         assert against.tolist() == [0] * 10 + [0.5] * 10
     leader, share = vote_at_once(20, [view(LEFT)], [np.array([7], np.int32)], params)[0].leaders()
     assert leader.tolist() == [7] * 10 + [0] * 10 and share.tolist() == [1] * 10 + [0] * 10
+
+
+def test_a_view_without_masks_says_nothing_against_labels_that_others_give():
+    params = MaskClusteringParams(background_vote=0.5)
+    views, seven, none = [view(LEFT), view(), view(LEFT)], np.array([7], np.int32), np.zeros(0, np.int32)
+    votes, against = vote_at_once(20, views, [seven, none, seven], params)
+    assert votes.weight().tolist() == [2] * 10 + [0] * 10
+    assert against.tolist() == [0] * 10 + [2 * 0.5] * 10
