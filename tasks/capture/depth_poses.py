@@ -88,7 +88,7 @@ class _Seen:
     def of(cls, photo: Features, depth: DepthMap, intrinsics: Float64) -> _Seen:
         light = replace(photo, descriptors=photo.descriptors[:0])
         scale = np.divide(depth.depth.shape[::-1], (photo.width, photo.height), dtype=np.float64)
-        z = _depth_at(photo.points * scale, depth.depth)
+        z = _depth_at(photo.points.astype(np.float64) * scale, depth.depth)
         rays = (photo.points - intrinsics[2:]) / intrinsics[:2]
         return cls(light, intrinsics, np.column_stack([rays, np.ones(len(rays))]) * z[:, None])
 
