@@ -137,7 +137,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     propagating, granularity = params.propagate, params.granularity
     if capture.clicks is not None:  # what was clicked as two objects stays two, and what was clicked as one, one
         propagating, granularity = replace(propagating, touching_merge=False, apart=False), 1.0
-    pieces = propagate(points, seen, observed, params=propagating)
+    pieces = propagate(points, seen, observed, params=propagating.in_use())
     counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
     tree = hierarchy(points, capture.cameras, seen, pieces, counted, params=params.hierarchy)
     labels = cut(pieces, tree, granularity=granularity)

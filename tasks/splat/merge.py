@@ -33,6 +33,29 @@ from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonN
 from ss_flow.tasks.splat.collisions import group_box
 
 
+_OF_PAIRS = (
+    "iterations_per_view",
+    "min_iterations",
+    "max_iterations",
+    "objective",
+    "reset_opacity",
+    "ignore_occluded",
+    "local",
+    "collision_margin",
+)
+"""What the last pass never reads."""
+_OF_LAST_PASS = (
+    "global_iterations",
+    "global_objective",
+    "global_mask_weight",
+    "side_weight",
+    "side_views",
+    "relabel_after",
+    "sh_every",
+)
+"""What the merging of a pair never reads."""
+
+
 @dataclass(frozen=True)
 class MergeParams:
     """How merged Gaussians are refined together, without densification."""
@@ -110,6 +133,18 @@ class MergeParams:
     def iterations(self, num_views: int) -> int:
         """Training steps of a pair that so many views see (spec row 34)."""
         return int(np.clip(self.iterations_per_view * num_views, self.min_iterations, self.max_iterations))
+
+    def of_pairs(self) -> MergeParams:
+        """For `merge_pair`: what only the last pass reads is as by default, so that it does not enter the key."""
+        return self._by_default(_OF_LAST_PASS)
+
+    def of_last_pass(self) -> MergeParams:
+        """For `global_pass`: what only pairs read is as by default, so that it does not enter the key."""
+        return replace(self._by_default(_OF_PAIRS), crop=CropParams(max_side=self.crop.max_side))
+
+    def _by_default(self, names: Sequence[str]) -> MergeParams:
+        default = MergeParams()
+        return replace(self, **{name: getattr(default, name) for name in names})
 
 
 @dataclass(frozen=True)
