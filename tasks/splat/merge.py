@@ -32,7 +32,6 @@ from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import group_box
 
-
 _OF_PAIRS = (
     "iterations_per_view",
     "min_iterations",
