@@ -29,6 +29,8 @@ _DARKER = 0.5
 """A fringe has less than this share of that tone."""
 _NEEDLE = 10.0
 """A needle is longer than so many times its second axis."""
+_ASTRAY = 3.0
+"""Spacings of an instance's points from which a Gaussian is away from all of them."""
 _DIRECTIONS = 4000
 """Directions that new views are chosen from: 3 degrees from one to the next."""
 
@@ -58,8 +60,8 @@ def fringe_share(gaussians: Gaussians, camera: Camera) -> tuple[int, int]:
     return int(dark_fringe(rendering.rgb, rendering.alpha).sum()), int((rendering.alpha >= _FAINTEST).sum())
 
 
-def floaters(gaussians: Gaussians, points: Float32, spacings: float = 3.0) -> Bool:
-    """[N] which Gaussians lie farther than so many spacings from all labelled points of their instance.
+def floaters(gaussians: Gaussians, points: Float32) -> Bool:
+    """[N] which Gaussians lie farther than three spacings from all labelled points of their instance.
 
     points: [M, 3] world; their spacing is the median distance to the nearest other. Without two points none is a
     floater.
@@ -69,7 +71,7 @@ def floaters(gaussians: Gaussians, points: Float32, spacings: float = 3.0) -> Bo
     if len(points) < 2 or not len(gaussians):
         return np.zeros(len(gaussians), bool)
     distance, _ = cKDTree(points).query(gaussians.means, workers=1)
-    return np.asarray(distance > spacings * nearest_spacing(points))
+    return np.asarray(distance > _ASTRAY * nearest_spacing(points))
 
 
 def change_elsewhere(scene: Gaussians, instance_id: int, camera: Camera, mask: Bool) -> float:
