@@ -30,7 +30,7 @@ from ss_flow.tasks.gaussians.views import (
 from ss_flow.tasks.geometry.cameras import camera_extent, pixels_in_view
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
-from ss_flow.tasks.splat.collisions import group_box
+from ss_flow.tasks.splat.collisions import SOLID_OPACITY, TRIMMED, group_box
 
 _OF_PAIRS = (
     "iterations_per_view",
@@ -230,14 +230,14 @@ def extent(gaussians: Gaussians, seen: Sequence[TrainView], params: MergeParams)
 
 def collision_box(group: Gaussians, margin: float) -> Float64:
     """The box of a group's solid centres, widened on every side by `margin` of its diagonal: [2, 3], world."""
-    low, high = group_box(group, min_opacity=0.1, quantile=0.005)
+    low, high = group_box(group, min_opacity=SOLID_OPACITY, quantile=TRIMMED)
     wider = margin * float(np.linalg.norm(high - low))
     return np.array([low - wider, high + wider])
 
 
 def _solid_centres(gaussians: Gaussians) -> Float32:
     """Centres of the Gaussians that are not faint; of all where hardly any is left."""
-    solid = gaussians.means[gaussians.opacity_logits >= np.log(0.1 / 0.9)]
+    solid = gaussians.means[gaussians.opacities >= SOLID_OPACITY]
     return solid if len(solid) > 1 else gaussians.means
 
 
