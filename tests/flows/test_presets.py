@@ -236,6 +236,8 @@ TABLE = {
     "semantics.describe.min_area": (0.01, 0.01, 0.002),
     "semantics.describe.max_views": (ALL, ALL, 10),
     "semantics.describe.erosion.diagonal": (0.0, 0.0, 800.0),
+    "semantics.describe.erosion.keep_share": (0.0, 0.0, 0.25),
+    "semantics.describe.erosion.keep_pixels": (0, 0, 30),
     # 40
     "semantics.describe.weighted": (False, False, True),
     # 41; neither text nor code knows a test of relevancy.
