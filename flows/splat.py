@@ -85,7 +85,8 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
         shown = shown_in(masks_refined)
     merged = merge_rounds(views, of_each(retrained), masks_refined, shown, params, 0)
     assembled = assemble(merged)
-    finished = global_pass(views, assembled, masks_refined, params=settings.merge, visibility=visibility)
+    last = settings.merge.of_last_pass()
+    finished = global_pass(views, assembled, masks_refined, params=last, visibility=visibility)
     scene = otherwise(finished, lambda: assembled)
     return {
         "reconstruct": of_each(reconstructed),
@@ -164,7 +165,7 @@ def merge_rounds(
                     some(views, seen),
                     *pair,
                     pick(masks, seen),
-                    params=params.splat.merge,
+                    params=params.splat.merge.of_pairs(),
                     w_mask=planned.mask_weight,
                     visibility=params.split.visibility,
                 )

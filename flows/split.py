@@ -80,54 +80,19 @@ class Split:
 
 def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     """Photos and depth -> view-consistent instances (Split&Splat, Sec. 3.1)."""
-    views = (capture.frames, capture.cameras)
-    if params.dense_source == "splatting":
-        points = dense_splatting(
-            *views, capture.depths, capture.unit, capture.colours, params=params.dense, splatting=params.splatting
-        )
-    else:
-        sources = capture.presumed if params.dense_presumed else capture.depths
-        points = dense(*views, sources, capture.unit, params=params.dense)
+    points = _dense_points(capture, params)
     segmenter = networks.segmenter
     embeddings: tuple[Embedding, ...] = ()
     if segmenter is not None:
         embeddings = each(capture.frames, names=capture.names, build=lambda frame: embed(frame, model=segmenter))
-    seen = each(
-        capture.by_view,
-        capture.presumed,
-        names=capture.names,
-        build=lambda camera, depth: visibility(points, camera, depth, params=params.visibility),
-    )
-    if params.visible_color:
-        seen = each(
-            capture.by_view,
-            capture.presumed,
-            capture.frames,
-            seen,
-            names=capture.names,
-            build=lambda camera, depth, frame, visible: visible_by_color(
-                points, camera, depth, frame, visible, color=params.visible_color
-            ),
-        )
+    seen = _seen(capture, points, params)
     hinted: PointLabels | None = None
     if capture.masks is not None:
         masks = capture.masks
     elif capture.clicks is not None:
         masks, hinted = _masks_of_hints(capture, capture.clicks, embeddings, points, seen, segmenter, params)
-    elif segmenter is not None:
-        masks = each(
-            capture.frames,
-            embeddings,
-            names=capture.names,
-            build=lambda frame, embedding: segment(frame, embedding, params=params.segment, model=segmenter),
-        )
     else:
-        masks = each(
-            capture.frames,
-            capture.depths,
-            names=capture.names,
-            build=lambda frame, depth: segment_rgbd(frame, depth, capture.cameras, params=params.rgbd),
-        )
+        masks = _masks_of_views(capture, embeddings, segmenter, params)
     observed = each(
         seen,
         masks,
@@ -137,7 +102,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     propagating, granularity = params.propagate, params.granularity
     if capture.clicks is not None:  # what was clicked as two objects stays two, and what was clicked as one, one
         propagating, granularity = replace(propagating, touching_merge=False, apart=False), 1.0
-    pieces = propagate(points, seen, observed, params=propagating)
+    pieces = propagate(points, seen, observed, params=propagating.in_use())
     counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
     tree = hierarchy(points, capture.cameras, seen, pieces, counted, params=params.hierarchy)
     labels = cut(pieces, tree, granularity=granularity)
@@ -160,25 +125,62 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     parts = cut_parts(pieces, nested, labels)
     prompted: tuple[PromptedMasks, ...] = ()
     if segmenter is not None and capture.masks is None:
-        prompted = each(
-            capture.frames,
-            embeddings,
-            seen,
-            shown,
-            names=capture.names,
-            build=lambda frame, embedding, visible, pool: reprompt(
-                EmbeddedPhoto(frame, embedding),
-                visible,
-                pool,
-                labels,
-                model=segmenter,
-                params=params.reprompt,
-                selection=params.reproject.selection,
-            ),
-        )
+        prompted = _prompted(capture, embeddings, seen, shown, labels, segmenter, params)
     instances = reproject(points, seen, shown, labels, parts, prompted, params=params.reproject)
     seen_in = appearances(labels, seen)
     return Split(points, seen, masks, pieces, tree, labels, parts, instances, seen_in, embeddings, hinted)
+
+
+def _dense_points(capture: Capture, params: SplitParams) -> PointCloud:
+    """The points that labels are given to."""
+    views = (capture.frames, capture.cameras)
+    if params.dense_source == "splatting":
+        return dense_splatting(
+            *views, capture.depths, capture.unit, capture.colours, params=params.dense, splatting=params.splatting
+        )
+    sources = capture.presumed if params.dense_presumed else capture.depths
+    return dense(*views, sources, capture.unit, params=params.dense)
+
+
+def _seen(capture: Capture, points: PointCloud, params: SplitParams) -> tuple[Visibility, ...]:
+    """Which points each view sees: by depth, and with `visible_color` by their colour where it has none."""
+    seen = each(
+        capture.by_view,
+        capture.presumed,
+        names=capture.names,
+        build=lambda camera, depth: visibility(points, camera, depth, params=params.visibility),
+    )
+    if not params.visible_color:
+        return seen
+    return each(
+        capture.by_view,
+        capture.presumed,
+        capture.frames,
+        seen,
+        names=capture.names,
+        build=lambda camera, depth, frame, visible: visible_by_color(
+            points, camera, depth, frame, visible, color=params.visible_color
+        ),
+    )
+
+
+def _masks_of_views(
+    capture: Capture, embeddings: tuple[Embedding, ...], segmenter: Model | None, params: SplitParams
+) -> tuple[MaskSet, ...]:
+    """The masks of all views, from the segmenter, or without one from colour, depth and normals."""
+    if segmenter is None:
+        return each(
+            capture.frames,
+            capture.depths,
+            names=capture.names,
+            build=lambda frame, depth: segment_rgbd(frame, depth, capture.cameras, params=params.rgbd),
+        )
+    return each(
+        capture.frames,
+        embeddings,
+        names=capture.names,
+        build=lambda frame, embedding: segment(frame, embedding, params=params.segment, model=segmenter),
+    )
 
 
 def _masks_of_hints(
@@ -233,6 +235,34 @@ def _clicked(
         names=capture.names,
         build=lambda frame, embedding, own: hints.clicked(
             EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter, apart=apart
+        ),
+    )
+
+
+def _prompted(
+    capture: Capture,
+    embeddings: tuple[Embedding, ...],
+    seen: tuple[Visibility, ...],
+    shown: tuple[MaskSet, ...],
+    labels: PointLabels,
+    segmenter: Model,
+    params: SplitParams,
+) -> tuple[PromptedMasks, ...]:
+    """The segmenter's masks of the instances in all views, prompted with their points."""
+    return each(
+        capture.frames,
+        embeddings,
+        seen,
+        shown,
+        names=capture.names,
+        build=lambda frame, embedding, visible, pool: reprompt(
+            EmbeddedPhoto(frame, embedding),
+            visible,
+            pool,
+            labels,
+            model=segmenter,
+            params=params.reprompt,
+            selection=params.reproject.selection,
         ),
     )
 

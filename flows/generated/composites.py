@@ -25,6 +25,8 @@ from ss_flow.flows.generated.prints import (
 from ss_flow.flows.generated.shapes import Mesh, ball, box, joined, turned_profile
 from ss_flow.tasks.artifacts import Float64
 
+_AROUND = 12
+"""Corners of a bar's cross-section."""
 PAINTS = {
     **COLORS,
     "white": (240, 238, 230),
@@ -131,18 +133,18 @@ def brick(color: str, ends: str, rng: np.random.Generator) -> Composite:
     return Composite(f"{color} brick", tuple(pieces))
 
 
-def tube(path: Float64, radius: float, segments: int = 12) -> Mesh:
+def tube(path: Float64, radius: float) -> Mesh:
     """A round bar along a path. path: [n, 3], all in one plane y = constant."""
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.cross(along, (0.0, 1.0, 0.0))
-    angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)
+    angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     normals = np.cos(angle)[None, :, None] * across[:, None] + np.sin(angle)[None, :, None] * np.array([0.0, 1.0, 0.0])
     vertices = (path[:, None] + radius * normals).reshape(-1, 3)
-    here = np.arange((len(path) - 1) * segments)
-    beside = here // segments * segments + (here + 1) % segments
+    here = np.arange((len(path) - 1) * _AROUND)
+    beside = here // _AROUND * _AROUND + (here + 1) % _AROUND
     triangles = np.concatenate(
-        [np.stack([here, beside + segments, beside], 1), np.stack([here, here + segments, beside + segments], 1)]
+        [np.stack([here, beside + _AROUND, beside], 1), np.stack([here, here + _AROUND, beside + _AROUND], 1)]
     )
     return Mesh(vertices, normals.reshape(-1, 3), vertices, triangles.astype(np.int32))
 

@@ -155,7 +155,6 @@ def write_scene(
     room: Room,
     folder: Path,
     masks: Literal["truth", "degraded"] | None = None,
-    degradation: DegradeParams = DegradeParams(),
     seed: int = 0,
 ) -> None:
     """Write a room as a capture in the ScanNet export layout, the way a user's own would lie on disk.
@@ -164,7 +163,7 @@ def write_scene(
     integer pixel centres), `instance/NNNN.png` (uint16 ground truth) and `instances.json` (id -> name, whose first
     word is the colour; also of 0, the structure, since every pixel is annotated); the same in `held_out/` for the views
     kept back. With `masks`, also `instance_masks/NNNN.png` (uint16, 0 = no mask): the true masks, or masks degraded
-    with `degradation` and `seed`. Where things have parts, also `part/NNNN.png` (uint8, ids within the instance) and
+    with `seed`. Where things have parts, also `part/NNNN.png` (uint8, ids within the instance) and
     `parts.json` (instance id -> name, kind "thing" or "stuff", parts by id; the structure is 0); where something stands
     before the lens, `valid/NNNN.png` (0 = ignore).
 
@@ -184,7 +183,7 @@ def write_scene(
         }
         (folder / "parts.json").write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
     if masks is not None:
-        ids = room.ids if masks == "truth" else degrade(room.ids, degradation, seed=seed)
+        ids = room.ids if masks == "truth" else degrade(room.ids, DegradeParams(), seed=seed)
         for name, image in zip(room.cameras.names, ids, strict=True):
             _write_bytes(folder / "instance_masks" / f"{name}.png", encode_png(image))
 

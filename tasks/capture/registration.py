@@ -28,6 +28,8 @@ _REACH = 12
 _LEAST_EDGE, _LEAST_OUTLINE = 10, 50
 """Connected pixels of an outline below which it is noise, and points of all outlines that a view needs to count."""
 _LEAST_VIEWS = 4
+_BLIND = 4
+"""How far from an edge a sensor may see nothing."""
 _APART = 3.0
 """How far apart, at the photo's border, two halves of the views may place the depth and still mean the same."""
 _IDENTITY = (1.0, 0.0, 0.0)
@@ -166,13 +168,13 @@ def _view(frame: Frame, intrinsics: Float64, depth: DepthMap, jump: float) -> _V
     return _View(edges.astype(np.float32), _outline(values, jump) * scale - center, center)
 
 
-def _outline(depth: Float32, jump: float, reach: int = 4) -> Float64:
+def _outline(depth: Float32, jump: float) -> Float64:
     """[N, 2] x, y where surfaces end before something farther: the borders of known pixels to pixels that are farther
-    or unknown, with something farther known within `reach` pixels, since sensors see nothing right beside an edge."""
+    or unknown, with something farther known within 4 pixels, since sensors see nothing right beside an edge."""
     import cv2
 
     known = depth > 0
-    farther = cv2.dilate(depth, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > (1 + jump) * depth
+    farther = cv2.dilate(depth, np.ones((2 * _BLIND + 1, 2 * _BLIND + 1), np.uint8)) > (1 + jump) * depth
     around = np.pad(np.where(known, depth, np.float32(np.inf)), 1, mode="edge")
     height, width = depth.shape
     steps = ((0, 1), (0, -1), (1, 0), (-1, 0))

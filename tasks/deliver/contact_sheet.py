@@ -21,6 +21,8 @@ _DPI = 100
 _CAPTION = 26
 _GAP = 10
 _MOST_ROWS = 40
+_OF_TABLE = 800
+"""Width of a table's picture, pixels."""
 
 
 def contact_sheet(
@@ -82,14 +84,14 @@ def as_picture(figure: Figure) -> UInt8:
     return np.frombuffer(raw.getvalue(), np.uint8).reshape(height, width, 4)[..., :3].copy()
 
 
-def table_picture(title: str, rows: Sequence[tuple[str, ...]], width: int = 800) -> UInt8:
-    """A table as a picture: the first column as names, the others right-aligned: [H, width, 3]."""
+def table_picture(title: str, rows: Sequence[tuple[str, ...]]) -> UInt8:
+    """A table as a picture: the first column as names, the others right-aligned: [H, 800, 3]."""
     line, top = 28, 64
     if len(rows) > _MOST_ROWS:
         rows = [*rows[: _MOST_ROWS - 1], (f"… and {len(rows) - _MOST_ROWS + 1} more rows",)]
     height = top + line * max(1, len(rows)) + 16
-    figure = blank(width, height)
-    margin = 24 / width
+    figure = blank(_OF_TABLE, height)
+    margin = 24 / _OF_TABLE
     figure.text(margin, 1 - 34 / height, title, fontsize=13, weight="bold", color=INK, va="center", parse_math=False)
     columns = max((len(row) for row in rows), default=1)
     for i, row in enumerate(rows):

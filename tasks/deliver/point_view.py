@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, UInt8
-from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, up_of
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
+_WIDTH, _HEIGHT = 960, 720
+"""Size of an orbit's pictures, pixels."""
 _SKY = (244, 245, 247)
 _WIDEST = 4
 """Largest half-width of a point's square, pixels: more would hide what lies behind a near point."""
@@ -22,8 +24,6 @@ def orbit_camera(
     *,
     azimuth_deg: float = 40.0,
     elevation_deg: float = 32.0,
-    width: int = 960,
-    height: int = 720,
 ) -> Camera:
     """A camera outside the points, a little above, that sees nearly all of them.
 
@@ -40,8 +40,8 @@ def orbit_camera(
     outward = np.cos(elevation) * around + np.sin(elevation) * up
     half_fov = np.radians(22.0)
     eye = center + outward * radius / np.sin(half_fov) * 0.9
-    focal = height / 2 / np.tan(half_fov)
-    return Camera(width, height, focal, focal, width / 2, height / 2, looking(eye, -outward, up))
+    focal = _HEIGHT / 2 / np.tan(half_fov)
+    return Camera(_WIDTH, _HEIGHT, focal, focal, _WIDTH / 2, _HEIGHT / 2, looking(eye, -outward, up))
 
 
 def _side(up: Float64, cameras: Cameras | None) -> Float64:
@@ -57,9 +57,7 @@ def _side(up: Float64, cameras: Cameras | None) -> Float64:
 
 def _up(centred: Float64, cameras: Cameras | None) -> Float64:
     if cameras is not None and len(cameras):
-        mean = -cameras.world_to_camera[:, 1, :3].mean(axis=0)
-        if np.linalg.norm(mean) > 0.1:
-            return mean / np.linalg.norm(mean)
+        return up_of(cameras.world_to_camera)
     axis = np.linalg.eigh(centred.T @ centred)[1][:, 0]
     along = centred @ axis
     low, high = np.percentile(along, (2, 98))

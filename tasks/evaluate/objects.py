@@ -14,7 +14,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.geometry.cameras import Camera, looking
+from ss_flow.tasks.geometry.cameras import Camera, looking, up_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.sampling import sphere
 
@@ -29,6 +29,8 @@ _DARKER = 0.5
 """A fringe has less than this share of that tone."""
 _NEEDLE = 10.0
 """A needle is longer than so many times its second axis."""
+_ASTRAY = 3.0
+"""Spacings of an instance's points from which a Gaussian is away from all of them."""
 _DIRECTIONS = 4000
 """Directions that new views are chosen from: 3 degrees from one to the next."""
 
@@ -58,8 +60,8 @@ def fringe_share(gaussians: Gaussians, camera: Camera) -> tuple[int, int]:
     return int(dark_fringe(rendering.rgb, rendering.alpha).sum()), int((rendering.alpha >= _FAINTEST).sum())
 
 
-def floaters(gaussians: Gaussians, points: Float32, spacings: float = 3.0) -> Bool:
-    """[N] which Gaussians lie farther than so many spacings from all labelled points of their instance.
+def floaters(gaussians: Gaussians, points: Float32) -> Bool:
+    """[N] which Gaussians lie farther than three spacings from all labelled points of their instance.
 
     points: [M, 3] world; their spacing is the median distance to the nearest other. Without two points none is a
     floater.
@@ -69,7 +71,7 @@ def floaters(gaussians: Gaussians, points: Float32, spacings: float = 3.0) -> Bo
     if len(points) < 2 or not len(gaussians):
         return np.zeros(len(gaussians), bool)
     distance, _ = cKDTree(points).query(gaussians.means, workers=1)
-    return np.asarray(distance > spacings * nearest_spacing(points))
+    return np.asarray(distance > _ASTRAY * nearest_spacing(points))
 
 
 def change_elsewhere(scene: Gaussians, instance_id: int, camera: Camera, mask: Bool) -> float:
@@ -112,7 +114,7 @@ def cameras_beside(
     chosen = [int((ring @ seen.mean(axis=0)).argmax())]
     while len(chosen) < min(count, len(ring)):
         chosen.append(int((ring @ ring[chosen].T).max(axis=1).argmin()))
-    up = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+    up = up_of([camera.world_to_camera for camera in cameras])
     distance = max(float(np.median(distances)), 1.5 * radius)
     focal = float(np.median([camera.fx for camera in cameras]))
     return [_looking(centre, distance * ring[i], up, radius, focal) for i in chosen]

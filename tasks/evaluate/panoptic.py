@@ -15,7 +15,8 @@ from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.evaluate.contingency import Contingency, Counts
 
 _MATCH = 0.5
-_COVER = 0.1
+_PARTS = 10
+"""One in so many parts of an instance is the least that counts as covered, and of a prediction as made up of it."""
 
 
 class PanopticQuality(NamedTuple):
@@ -84,23 +85,22 @@ def hungarian_miou(table: Contingency) -> float:
 
 
 def over_segmentation(table: Contingency) -> float:
-    """Share of the instances of which more than one prediction covers at least 10 % each."""
-    covered = table.intersection >= _COVER * table.truth_area[:, None]
-    return float((covered.sum(axis=1) > 1).mean()) if covered.size else 0.0
+    """Share of the instances in more than one of the `pieces`."""
+    return float((pieces(table) > 1).mean()) if len(table.truth_ids) else 0.0
 
 
 def under_segmentation(table: Contingency) -> float:
     """Share of the predictions of which more than one instance makes up at least 10 % each."""
-    made_of = table.intersection >= _COVER * table.predicted_area[None, :]
+    made_of = table.intersection >= table.predicted_area[None, :] / _PARTS
     return float((made_of.sum(axis=0) > 1).mean()) if made_of.size else 0.0
 
 
 def pieces(table: Contingency) -> Counts:
-    """[G] of how many predictions each covers more than a tenth of the instance."""
-    return (table.intersection > _COVER * table.truth_area[:, None]).sum(axis=1)
+    """[G] of how many predictions each covers at least a tenth of the instance."""
+    return (table.intersection >= table.truth_area[:, None] / _PARTS).sum(axis=1)
 
 
 def whole(table: Contingency) -> NDArray[np.bool_]:
-    """[G] which instances are exactly one prediction: one has an IoU of at least 0.5, and no second covers more than
-    a tenth of the instance."""
+    """[G] which instances are exactly one prediction: one has an IoU of at least 0.5, and no second covers a tenth
+    of the instance."""
     return (table.best_iou() >= _MATCH) & (pieces(table) == 1)

@@ -13,6 +13,8 @@ from ss_flow.tasks.geometry.shape import box_diagonal
 
 SH_ZERO = 0.28209479177387814
 """The constant basis function, sqrt(1 / (4 pi))."""
+_NEIGHBOURS = 12
+"""Centres that tell a surface's normal, the Gaussian's own among them."""
 
 NO_GAUSSIANS = Gaussians(
     means=np.zeros((0, 3), np.float32),
@@ -72,7 +74,7 @@ def neighbour_spread(points: Float32) -> Float64:
     return np.asarray(np.sqrt(np.square(np.asarray(near)[:, 1:]).mean(axis=1)))
 
 
-def laid_flat(gaussians: Gaussians, thickness: float, neighbours: int = 12) -> Gaussians:
+def laid_flat(gaussians: Gaussians, thickness: float) -> Gaussians:
     """Round Gaussians on a surface as discs that lie in it.
 
     The surface's normal at a centre is the direction in which its nearest other centres spread least (Hoppe et al.
@@ -84,7 +86,7 @@ def laid_flat(gaussians: Gaussians, thickness: float, neighbours: int = 12) -> G
     if len(gaussians) < 4:
         return gaussians
     points = gaussians.means.astype(np.float64)
-    _, near = cKDTree(points).query(points, k=min(neighbours, len(points)), workers=1)
+    _, near = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)), workers=1)
     around = points[near] - points[near].mean(axis=1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     normal = axes[:, :, 0] * np.where(axes[:, 2:, 0] < 0, -1, 1)

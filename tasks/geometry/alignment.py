@@ -6,13 +6,14 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Float64
 
+_TRIALS = 500
+"""Pairs of points that are tried."""
+
 
 def fit_scale_shift(
     relative: Float32 | Float64,
     inverse_depth: Float32 | Float64,
     max_relative: float = 0.05,
-    trials: int = 500,
-    seed: int = 0,
 ) -> tuple[float, float, float] | None:
     """Scale a > 0 and shift b such that a * relative + b = inverse depth, for most of the points.
 
@@ -25,7 +26,7 @@ def fit_scale_shift(
     x, y = np.asarray(relative, np.float64), np.asarray(inverse_depth, np.float64)
     if len(x) < 2:
         return None
-    pairs = np.random.default_rng(seed).integers(0, len(x), (trials, 2))
+    pairs = np.random.default_rng(0).integers(0, len(x), (_TRIALS, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = (y[pairs[:, 1]] - y[pairs[:, 0]]) / (x[pairs[:, 1]] - x[pairs[:, 0]])
     shift = y[pairs[:, 0]] - scale * x[pairs[:, 0]]

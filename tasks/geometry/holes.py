@@ -6,14 +6,17 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Float32
 
+_STEP = 0.05
+"""Share by which depths on both sides of a hole may differ; an edge may run between others."""
 
-def close_holes(depth: Float32, step: float = 0.05) -> Float32:
+
+def close_holes(depth: Float32) -> Float32:
     """A depth map without its unknown pixels and lines of at most two pixels across.
 
     depth: [H, W] float32, 0 where unknown. A map that was moved pixel by pixel into another camera has them wherever
     neighbours moved apart. A hole is closed by the mean inverse depth of the known pixels beside it, unless the largest
-    and the smallest known depth within two pixels differ by more than `step` of the smaller: an edge may run through
-    it. Wider holes stay as they are, and so does every known pixel.
+    and the smallest known depth within two pixels differ by more than a twentieth of the smaller: an edge may run
+    through it. Wider holes stay as they are, and so does every known pixel.
     """
     import cv2
 
@@ -25,7 +28,7 @@ def close_holes(depth: Float32, step: float = 0.05) -> Float32:
     near = np.ones((5, 5), np.uint8)  # reaches both sides of a line of two pixels
     largest = cv2.dilate(depth, near)
     smallest = cv2.erode(np.where(known, depth, np.float32(np.inf)), near)
-    hole = thin & ~known & (largest / smallest <= 1 + step)
+    hole = thin & ~known & (largest / smallest <= 1 + _STEP)
     inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
     count, total = (cv2.boxFilter(image, -1, (3, 3), normalize=False) for image in (known.astype(np.float32), inverse))
     return np.where(hole, count / np.where(hole, total, 1), depth).astype(np.float32)

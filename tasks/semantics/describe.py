@@ -56,7 +56,7 @@ def describe(
     """An instance's pictures, or a part's, as unit vectors, and their mean, brought back to unit length.
 
     frames: at least those with a mask of the instance. encoder: None for colour words.
-    Returns zeros and no views when no mask covers `min_area` of its image.
+    Returns zeros and no views when no mask covers `min_area` of its image, or erosion leaves nothing of those that do.
     Raises InputError when a frame's size is not that of the masks.
     """
     model = encoder_of(encoder)
@@ -66,7 +66,7 @@ def describe(
     large = np.argsort(-area, kind="stable")[: params.max_views]
     least = np.maximum(1, params.min_area * instance.sizes.prod(axis=1))
     chosen = np.sort(large[(area >= least)[large]])
-    vectors = []
+    vectors, used = [], []
     for done, row in enumerate(chosen):
         frame = frames[by_name[instance.views[row]]]
         width, height = instance.sizes[row]
@@ -76,6 +76,9 @@ def describe(
                 f"{instance.instance_id} has {width} x {height}; both must have one size."
             )
         mask = erode(masks[row], params.erosion)
+        if not mask.any():
+            continue
+        used.append(row)
         image = shared_rgb(frame)
         if model.sees_masks:
             x0, y0, x1, y1 = bounds(mask)
@@ -83,10 +86,10 @@ def describe(
         else:
             vectors.append(model.encode_images([crop(image, mask, params)])[0])
         progress(done + 1, len(chosen), frame.name)
-    of_views = np.array(vectors, np.float32).reshape(len(chosen), model.dimension)
-    weights = (area[chosen] if params.weighted else np.ones(len(chosen))).astype(np.float32)
+    of_views = np.array(vectors, np.float32).reshape(len(used), model.dimension)
+    weights = (area[used] if params.weighted else np.ones(len(used))).astype(np.float32)
     embedding = mean_direction(of_views, weights)
-    views = tuple(instance.views[row] for row in chosen)
+    views = tuple(instance.views[row] for row in used)
     return Descriptors(instance.instance_id, embedding, views, weights, model.name, of_views)
 
 

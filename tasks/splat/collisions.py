@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, ViewLists
 
+SOLID_OPACITY = 0.1
+"""Fainter Gaussians say nothing of where a group is."""
+TRIMMED = 0.005
+"""Share of the centres that is trimmed off at both ends of each axis of a group's box."""
 NOWHERE = ((np.inf,) * 3, (-np.inf,) * 3)
 """A box that holds nothing."""
 _AROUND = np.array(list(itertools.product((-1, 0, 1), repeat=3)))

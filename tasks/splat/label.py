@@ -46,7 +46,7 @@ class LabelParams:
 
 
 @dataclass(frozen=True)
-class Votes:
+class ViewVotes:
     """What one view says about the Gaussians that it shows."""
 
     name: str
@@ -59,7 +59,7 @@ class Votes:
 
 
 @task(name="splat.vote", resources=Resources(cores=1, memory_mb=1000, gpus=0.1), environment=backend_identity)
-def vote(scene: Gaussians, frame: Frame, camera: Camera, shown: LabelMap) -> Votes:
+def vote(scene: Gaussians, frame: Frame, camera: Camera, shown: LabelMap) -> ViewVotes:
     """What a view's masks say about a scene: each pixel has one vote for its instance, and every Gaussian in it gets as
     much of this vote as it makes up of the pixel.
 
@@ -74,7 +74,7 @@ def vote(scene: Gaussians, frame: Frame, camera: Camera, shown: LabelMap) -> Vot
         labels.append(np.full(len(own), one, np.int32))
         weights.append(weight[own])
     nothing = np.zeros(0, np.int32)
-    return Votes(
+    return ViewVotes(
         frame.name,
         np.concatenate([nothing, *rows]),
         np.concatenate([nothing, *labels]),
@@ -85,7 +85,7 @@ def vote(scene: Gaussians, frame: Frame, camera: Camera, shown: LabelMap) -> Vot
 @task(name="splat.label")
 def label(
     scene: Gaussians,
-    votes: Sequence[Votes],
+    votes: Sequence[ViewVotes],
     points: PointCloud,
     labels: PointLabels,
     parts: PointParts,
@@ -115,7 +115,7 @@ def own_gaussians(scene: Gaussians, instance: InstanceMasks) -> Gaussians:
     return select(scene, scene.instance_id == instance.instance_id)
 
 
-def _elected(votes: Sequence[Votes], count: int) -> tuple[Int32, Float32]:
+def _elected(votes: Sequence[ViewVotes], count: int) -> tuple[Int32, Float32]:
     """Each Gaussian's instance and its share of the votes; 0 and 0 without votes."""
     rows, labels = (
         np.concatenate([getattr(view, name) for view in votes]).astype(np.int64) for name in ("gaussian", "label")

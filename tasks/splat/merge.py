@@ -30,7 +30,29 @@ from ss_flow.tasks.gaussians.views import (
 from ss_flow.tasks.geometry.cameras import camera_extent, pixels_in_view
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
-from ss_flow.tasks.splat.collisions import group_box
+from ss_flow.tasks.splat.collisions import SOLID_OPACITY, TRIMMED, group_box
+
+_OF_PAIRS = (
+    "iterations_per_view",
+    "min_iterations",
+    "max_iterations",
+    "objective",
+    "reset_opacity",
+    "ignore_occluded",
+    "local",
+    "collision_margin",
+)
+"""What the last pass never reads."""
+_OF_LAST_PASS = (
+    "global_iterations",
+    "global_objective",
+    "global_mask_weight",
+    "side_weight",
+    "side_views",
+    "relabel_after",
+    "sh_every",
+)
+"""What the merging of a pair never reads."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +132,18 @@ class MergeParams:
     def iterations(self, num_views: int) -> int:
         """Training steps of a pair that so many views see (spec row 34)."""
         return int(np.clip(self.iterations_per_view * num_views, self.min_iterations, self.max_iterations))
+
+    def of_pairs(self) -> MergeParams:
+        """For `merge_pair`: what only the last pass reads is as by default, so that it does not enter the key."""
+        return self._by_default(_OF_LAST_PASS)
+
+    def of_last_pass(self) -> MergeParams:
+        """For `global_pass`: what only pairs read is as by default, so that it does not enter the key."""
+        return replace(self._by_default(_OF_PAIRS), crop=CropParams(max_side=self.crop.max_side))
+
+    def _by_default(self, names: Sequence[str]) -> MergeParams:
+        default = MergeParams()
+        return replace(self, **{name: getattr(default, name) for name in names})
 
 
 @dataclass(frozen=True)
@@ -196,14 +230,14 @@ def extent(gaussians: Gaussians, seen: Sequence[TrainView], params: MergeParams)
 
 def collision_box(group: Gaussians, margin: float) -> Float64:
     """The box of a group's solid centres, widened on every side by `margin` of its diagonal: [2, 3], world."""
-    low, high = group_box(group, min_opacity=0.1, quantile=0.005)
+    low, high = group_box(group, min_opacity=SOLID_OPACITY, quantile=TRIMMED)
     wider = margin * float(np.linalg.norm(high - low))
     return np.array([low - wider, high + wider])
 
 
 def _solid_centres(gaussians: Gaussians) -> Float32:
     """Centres of the Gaussians that are not faint; of all where hardly any is left."""
-    solid = gaussians.means[gaussians.opacity_logits >= np.log(0.1 / 0.9)]
+    solid = gaussians.means[gaussians.opacities >= SOLID_OPACITY]
     return solid if len(solid) > 1 else gaussians.means
 
 

@@ -11,7 +11,15 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Appearances, Float64, Gaussians
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.ranges import Fraction, Natural, NonNegative, Positive, Range
-from ss_flow.tasks.splat.collisions import MergePlan, collision_matrix, group_box, match_pairs, voxel_collisions
+from ss_flow.tasks.splat.collisions import (
+    SOLID_OPACITY,
+    TRIMMED,
+    MergePlan,
+    collision_matrix,
+    group_box,
+    match_pairs,
+    voxel_collisions,
+)
 
 
 @dataclass(frozen=True)
@@ -30,9 +38,9 @@ class PlanParams:
     pairing: Literal["disjoint", "collision_free"] = "disjoint"
     """Which pairs are merged side by side: "disjoint" ones, or only those no groups of which collide ("collision_free",
     the paper's words taken literally; a floor then lets one pair through at a time)."""
-    min_opacity: Fraction = 0.1
+    min_opacity: Fraction = SOLID_OPACITY
     """Fainter Gaussians do not widen the box of their group."""
-    bbox_quantile: Annotated[float, Range(0.0, 0.5, open_above=True)] = 0.005
+    bbox_quantile: Annotated[float, Range(0.0, 0.5, open_above=True)] = TRIMMED
     """Share of the centres trimmed off at both ends of each axis of the box; 0 in the paper."""
     min_score: Fraction = 0.0
     """Pairs that overlap by no more than this are left apart."""

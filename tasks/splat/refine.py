@@ -193,7 +193,6 @@ def render_mask(
     view: int,
     alpha_threshold: float = 0.5,
     *,
-    margin_px: int = 16,
     cut_occluded: bool = True,
 ) -> RenderedMask:
     """M^gs of one view: the Gaussians rendered alone with full opacity, cut where something is in front (spec P2).
@@ -204,7 +203,7 @@ def render_mask(
     """
     full = scene.cameras[view]
     nothing = np.zeros((full.height, full.width), bool)
-    whole = CropParams(margin_px=margin_px, max_side=max(full.width, full.height))
+    whole = CropParams(max_side=max(full.width, full.height))
     camera = crop_camera(full, nothing, gaussians.means, whole)
     outline, surface = (render(gaussians, camera, opaque=opaque, winners=False) for opaque in (True, False))
     solid = outline.alpha >= alpha_threshold

@@ -23,8 +23,8 @@ _SMALL = 0.5
 """What stands on something is smaller than this share of it, in points: the body of a mug does not stand on its rim."""
 _TRIM = 0.02
 """Share of the points, on every side, that an extent leaves out."""
-_MOST = 2000
-"""So many points of a label tell."""
+_ENOUGH = 2000
+"""At least so many points of a label, and less than twice as many, tell."""
 _LEAST = 2 / 3
 """Share of the height that is asked for at least, however much the colours differ: what is printed on a far wall rises
 from it by half as much, in the noise of the depth."""
@@ -84,7 +84,7 @@ def find_mounds(
     spread = TouchingParams().color_spread
     for row in np.flatnonzero((size >= _FEW) & apart & (share > _BESIDE).any(axis=1)):
         inside = rows_of[int(names[row])]
-        own = thinned(points.points[inside], _MOST)
+        own = thinned(points.points[inside], _ENOUGH)
         rest = np.sort(np.concatenate([rows_of[name] for name in names[share[row] > _BESIDE].tolist()]))
         distance, _ = cKDTree(points.points[rest]).query(own)
         centre, normal = plane_through(own[distance <= np.quantile(distance, _FOOT)])

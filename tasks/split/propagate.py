@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -72,6 +72,13 @@ class PropagateParams:
     min_label_share: Fraction = 1 / 3
     """A label that this share of the views that see it show is kept all the same: where two or three views look, one of
     them is a third or more."""
+
+    def in_use(self) -> PropagateParams:
+        """With the groups that are not read as by default, so that they do not enter the key."""
+        touching = self.touching if self.touching_merge else TouchingParams()
+        if self.views == "at_once":
+            return replace(self, touching=touching, in_turn=SequentialParams())
+        return replace(self, touching=touching, at_once=MaskClusteringParams(rate=self.at_once.rate))
 
 
 @task()

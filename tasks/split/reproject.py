@@ -87,18 +87,7 @@ def reproject(
     for k, (view, pool) in enumerate(zip(visibility, masks, strict=True)):
         progress(k, len(masks), view.name)
         painted = paint_for_selection(view, labels.label, params.selection)
-        shown = select_masks(painted, pool, params.selection)
-        origin = dict.fromkeys(shown, FOUND)
-        if view.name in by_name:
-            extra = by_name[view.name]
-            for label, mask in zip(extra.label.tolist(), extra.dense(), strict=True):
-                agrees = agreement(painted, mask, label)
-                own = agreement(painted, shown[label], label) if label in shown else 0.0
-                if agrees >= params.selection.min_iou and agrees > own:
-                    shown[label], origin[label] = mask, PROMPTED
-        if params.draw_missing:
-            for label, mask in _drawn(painted, view, shown, params).items():
-                shown[label], origin[label] = mask, DRAWN
+        shown, origin = _masks_of_view(painted, view, pool, by_name.get(view.name), params)
         ids = stack_exclusive(shown, view.height, view.width)
         views.append({int(i): (np.packbits(ids == i), origin.get(int(i), FOUND)) for i in np.unique(ids)})
         for total, part in zip((held, against), contradicted(painted, ids, num_labels), strict=True):
@@ -132,6 +121,24 @@ def reproject(
             "reconstructed: give more photos, or lower it."
         )
     return tuple(found)
+
+
+def _masks_of_view(
+    painted: PaintedView, view: Visibility, pool: MaskSet, prompted: PromptedMasks | None, params: ReprojectParams
+) -> tuple[dict[int, Bool], dict[int, int]]:
+    """A mask of each label that a view shows, not yet exclusive, and where it comes from."""
+    shown = select_masks(painted, pool, params.selection)
+    origin = dict.fromkeys(shown, FOUND)
+    if prompted is not None:
+        for label, mask in zip(prompted.label.tolist(), prompted.dense(), strict=True):
+            agrees = agreement(painted, mask, label)
+            own = agreement(painted, shown[label], label) if label in shown else 0.0
+            if agrees >= params.selection.min_iou and agrees > own:
+                shown[label], origin[label] = mask, PROMPTED
+    if params.draw_missing:
+        for label, mask in _drawn(painted, view, shown, params).items():
+            shown[label], origin[label] = mask, DRAWN
+    return shown, origin
 
 
 def _drawn(painted: PaintedView, view: Visibility, shown: dict[int, Bool], params: ReprojectParams) -> dict[int, Bool]:

@@ -28,8 +28,8 @@ _RISES = 3.0
 """Distance, in the same, that what stands on a sheet rises from it at least."""
 _TRIM = 0.02
 """Share of the points, on every side, that an extent leaves out."""
-_MOST = 2000
-"""So many points of a piece tell."""
+_ENOUGH = 2000
+"""At least so many points of a piece, and less than twice as many, tell."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Sheets:
         return (outside - inside) * border / (border + _FEW)
 
     def _places(self, labels: tuple[int, ...]) -> Float64:
-        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])], _MOST)
+        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])], _ENOUGH)
 
 
 def find_sheets(points: PointCloud, labels: PointLabels, ends: Borders, *, flush: float, height: float) -> Sheets:

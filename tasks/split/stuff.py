@@ -16,8 +16,8 @@ _TRIM = 0.02
 """Share of the points, on every side, that an extent leaves out."""
 _FEW = 10
 """Points below which a label has no plane."""
-_MOST = 4000
-"""So many points of a label, and ten times as many of the scene, tell."""
+_ENOUGH = 4000
+"""At least so many points of a label, ten times as many of the scene, and less than twice of either, tell."""
 _PATCHES = 50
 """So many places of a label are looked at for a plane, each with as large a share of the points round it."""
 
@@ -46,12 +46,12 @@ def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params
     table that the capture never looks beyond. A poster on a wall is a thing. Two walls that meet are stuff, too.
     """
     names = np.unique(labels.label[labels.label > 0])
-    scene, eye = thinned(points.points, 10 * _MOST), middle_of(cameras)
+    scene, eye = thinned(points.points, 10 * _ENOUGH), middle_of(cameras)
     least = params.extent * box_diagonal(scene, _TRIM) if len(scene) else 0.0
     rows_of = rows_by_label(labels.label)
     stuff = np.zeros(len(names), bool)
     for row, name in enumerate(names.tolist()):
-        own = thinned(points.points[rows_of[name]], _MOST)
+        own = thinned(points.points[rows_of[name]], _ENOUGH)
         if (extent := box_diagonal(own, _TRIM)) < least or len(own) < _FEW:
             continue
         thickness = params.thickness * extent

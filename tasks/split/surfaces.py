@@ -25,8 +25,8 @@ _ACROSS = 2
 """How many points beside one carry another label where its own label ends, as in `votes.touching`."""
 _TRIM = 0.02
 """Share of the points, on every side, that an extent leaves out."""
-_MOST = 2000
-"""So many points of a label tell its plane."""
+_ENOUGH = 2000
+"""At least so many points of a label, and less than twice as many, tell its plane."""
 _ROUNDS = 8
 _FILLED = 30
 """How often points without a label take that of their neighbours, to tell which labels touch."""
@@ -130,7 +130,7 @@ def _meeting(touches: Touches, surface: Int32, label: Int32, params: ShadowParam
 
 def _in_one_plane(cloud: PointCloud, a: NDArray[np.intp], b: NDArray[np.intp], params: ShadowParams) -> bool:
     """Whether most of two sets of points (rows) lies on the plane of the larger one."""
-    larger, smaller = (thinned(cloud.points[part], _MOST) for part in sorted((a, b), key=len, reverse=True))
+    larger, smaller = (thinned(cloud.points[part], _ENOUGH) for part in sorted((a, b), key=len, reverse=True))
     thickness = max(params.thickness * box_diagonal(smaller, _TRIM), cloud.spacing)
     centre, normal = plane_of_most(larger, thickness, _ROUNDS)
     return all((np.abs((part - centre) @ normal) <= thickness).mean() >= params.flat for part in (larger, smaller))

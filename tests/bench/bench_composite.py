@@ -6,7 +6,7 @@
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
 whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
 a tenth), mIoU, PQ, over- and under-segmentation, in per cent; the predicted ids, the true things, seconds. Then for
-each thing its best IoU, and of how many predicted ids each covers more than a tenth of it. With --store, rooms and
+each thing its best IoU, and of how many predicted ids each covers at least a tenth of it. With --store, rooms and
 results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
 shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
 of small things on a table, in few near views of a depth sensor.
@@ -91,7 +91,7 @@ def outcome(folder: Path, params: Params, store: Store) -> Outcome:
 
 
 def things(folder: Path, table: Contingency) -> list[str]:
-    """A line for each thing: best IoU, predicted ids on more than a tenth of it, whether it is whole."""
+    """A line for each thing: best IoU, predicted ids on at least a tenth of it, whether it is whole."""
     names = json.loads((folder / "instances.json").read_text())
     columns = zip(table.truth_ids, table.best_iou(), pieces(table), whole(table), strict=True)
     return [

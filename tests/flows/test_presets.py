@@ -236,6 +236,8 @@ TABLE = {
     "semantics.describe.min_area": (0.01, 0.01, 0.002),
     "semantics.describe.max_views": (ALL, ALL, 10),
     "semantics.describe.erosion.diagonal": (0.0, 0.0, 800.0),
+    "semantics.describe.erosion.keep_share": (0.0, 0.0, 0.25),
+    "semantics.describe.erosion.keep_pixels": (0, 0, 30),
     # 40
     "semantics.describe.weighted": (False, False, True),
     # 41; neither text nor code knows a test of relevancy.
@@ -269,7 +271,7 @@ def test_a_machine_with_time_gets_the_training_that_the_table_calls_our_default(
     params = settings.preset(Params(), "thorough").splat
     first = params.reconstruct
     assert (first.iterations_per_view, first.min_iterations, first.max_iterations) == (40, 600, 10_000)
-    assert (params.merge.max_iterations, params.merge.global_iterations) == (1000, 7000)
+    assert params.merge.global_iterations == 7000
     assert Params().splat.merge.global_iterations == 1500
 
 

@@ -91,8 +91,27 @@ def test_a_changed_threshold_of_propagation_computes_it_and_nothing_before_it(wa
     assert not [step for step in again.computed() if step.startswith("capture.")]
 
 
+@pytest.mark.parametrize(
+    ("change", "steps"),
+    [
+        # No two objects of this room collide, so that no pair is merged.
+        ("merge.iterations_per_view=3", set()),
+        ("merge.max_iterations=7", set()),
+        ("merge.objective.alpha_weight=0.25", set()),
+        ("merge.collision_margin=0.1", set()),
+        ("merge.crop.margin_px=8", set()),
+        ("merge.global_mask_weight=0.5", {"splat.global_pass"}),
+        ("propagate.in_turn.passes=2", set()),  # the votes are counted at once
+        ("propagate.at_once.rate=0.5", {"split.propagate"}),
+    ],
+)
+def test_a_parameter_that_no_step_of_a_run_reads_computes_nothing(warm, change, steps):
+    told = run_tiny(warm.scene, warm.store, "--dry-run", "--set", change)
+    assert told.code == 0 and {entry["label"] for entry in told.document()["would_run"]} == steps
+
+
 def test_a_change_that_gives_an_equal_result_stops_there(warm):
-    again = run_tiny(warm.scene, warm.store, "--set", "propagate.min_new_points=11", out=warm.out)
+    again = run_tiny(warm.scene, warm.store, "--set", "propagate.at_once.min_points=6", out=warm.out)
     assert again.computed() == {"split.propagate": 1}
     assert again.results() == warm.called.results()
 

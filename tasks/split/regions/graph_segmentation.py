@@ -16,6 +16,13 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, UInt8
 from ss_flow.tasks.geometry.cameras import Camera
 
+_OF_SLOPE = 3
+"""Pixels over which a slope is taken."""
+_OF_CREASE = 4
+"""How far from a pair of pixels normals are taken, in pixels, since smoothing rounds creases off."""
+_MOST_PLANES = 6
+"""So many are looked for in a view."""
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -85,24 +92,23 @@ def surface_of(depth: Float32, camera: Camera) -> Surface:
     return Surface(smooth, slope.astype(np.float32), points, normals)
 
 
-def _slope(image: Float32, known: Bool, axis: int, reach: int = 3) -> Float32:
-    """Change a pixel along an axis over `reach` pixels, to the side where it is smaller; NaN where neither is known."""
-    ahead = (np.roll(image, -reach, axis) - image) / reach
-    ahead[~(known & np.roll(known, -reach, axis))] = np.nan
+def _slope(image: Float32, known: Bool, axis: int) -> Float32:
+    """Change a pixel along an axis, to the side where it is smaller; NaN where neither is known."""
+    ahead = (np.roll(image, -_OF_SLOPE, axis) - image) / _OF_SLOPE
+    ahead[~(known & np.roll(known, -_OF_SLOPE, axis))] = np.nan
     edge: list[slice] = [slice(None), slice(None)]
-    edge[axis] = slice(-reach, None)
+    edge[axis] = slice(-_OF_SLOPE, None)
     ahead[tuple(edge)] = np.nan
-    behind = np.roll(ahead, reach, axis)
+    behind = np.roll(ahead, _OF_SLOPE, axis)
     smaller = np.where(np.abs(behind) < np.abs(ahead), behind, ahead)
     return np.where(np.isnan(smaller), np.where(np.isnan(ahead), behind, ahead), smaller)
 
 
-def boundaries(surface: Surface, valid: Bool, jump: float, crease: float, reach: int = 4) -> Boundary:
+def boundaries(surface: Surface, valid: Bool, jump: float, crease: float) -> Boundary:
     """What geometry says between each pixel and its right and lower neighbour.
 
     valid: [H, W]. jump: relative step in depth, beyond what the slope explains, at which a surface ends. crease: angle
     in degrees between the normals at which a concave crease ends an object; a convex one (a box's own edge) ends none.
-    reach: how far from the pair, in pixels, normals are taken, since smoothing rounds creases off.
     """
     height, width = valid.shape
     index = np.arange(height * width, dtype=np.int32).reshape(height, width)
@@ -118,15 +124,15 @@ def boundaries(surface: Surface, valid: Bool, jump: float, crease: float, reach:
         relative = np.minimum(step0, step1) / np.maximum(np.minimum(d0, d1), 1e-9)
         ended = np.clip(relative / jump - 0.5, 0, 1)
 
-        before = _shift(index, reach - 1, axis)[first]
-        after = _shift(index, -(reach - 1), axis)[second]
+        before = _shift(index, _OF_CREASE - 1, axis)[first]
+        after = _shift(index, -(_OF_CREASE - 1), axis)[second]
         n0, n1 = (surface.normals.reshape(-1, 3)[i] for i in (before, after))
         x0, x1 = (surface.points.reshape(-1, 3)[i] for i in (before, after))
         both = n0.any(axis=2) & n1.any(axis=2) & known
         angle = np.degrees(np.arccos(np.clip((n0 * n1).sum(axis=2), -1, 1)))
         concave = ((n0 - n1) * (x0 - x1)).sum(axis=2) < 0
         bend = np.where(both & concave, angle, 0).astype(np.float32)
-        folded = np.clip(_ridge(bend, axis, reach) / crease - 0.5, 0, 1)
+        folded = np.clip(_ridge(bend, axis, _OF_CREASE) / crease - 0.5, 0, 1)
         strength = np.where(known, np.maximum(ended, folded), 0).astype(np.float32)
         parts.append((index[first][pairs], index[second][pairs], strength[pairs], known[pairs]))
     return Boundary(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -261,7 +267,7 @@ class RegionGraph:
         return result
 
 
-def find_planes(surface: Surface, valid: Bool, min_share: float, tolerance: float, rounds: int = 6) -> list[Bool]:
+def find_planes(surface: Surface, valid: Bool, min_share: float, tolerance: float) -> list[Bool]:
     """The large planes of a view (walls, floor, table tops), largest first: a list of [H, W].
 
     min_share: least share of the valid pixels. tolerance: distance from the plane, relative to depth. Random sampling
@@ -272,7 +278,7 @@ def find_planes(surface: Surface, valid: Bool, min_share: float, tolerance: floa
     points, normals = (array.reshape(-1, 3)[rows] for array in (surface.points, surface.normals))
     least = min_share * valid.sum()
     planes: list[Bool] = []
-    while len(planes) < rounds and len(rows) >= max(least, 1):
+    while len(planes) < _MOST_PLANES and len(rows) >= max(least, 1):
         sample = rng.choice(len(rows), size=min(len(rows), 2000), replace=False)
         some, tried = points[sample], slice(100)
         sides = normals[sample]

@@ -67,14 +67,17 @@ def test_over_and_under_segmentation_count_shares_of_a_tenth_and_more() -> None:
     assert over_segmentation(_table(truth, [3] * 19 + [4] + [5] * 20)) == 0, "a twentieth does not count"
     assert under_segmentation(_table(truth, split)) == 0
     assert under_segmentation(_table(truth, [3] * 40)) == 1
+    thirty = _table([1] * 30, [3] * 27 + [4] * 3)  # 0.1 * 30 is more than 3 in floating point
+    assert over_segmentation(thirty) == 1 and pieces(thirty).tolist() == [2] and not whole(thirty).any()
 
 
-def test_a_thing_is_whole_when_one_prediction_fits_it_and_no_second_covers_more_than_a_tenth() -> None:
-    truth = np.repeat([1, 2, 3, 4, 5, 0], 10)
-    predicted = [5] * 9 + [6] + [7] * 8 + [8] * 2 + [9] * 4 + [0] * 6 + [10] * 20 + [11] * 10
+def test_a_thing_is_whole_when_one_prediction_fits_it_and_no_second_covers_a_tenth() -> None:
+    truth = np.repeat([1, 2, 3, 4, 5, 0], 20)
+    predicted = [5] * 19 + [6] + [7] * 18 + [8] * 2 + [9] * 8 + [0] * 12 + [10] * 40 + [11] * 20
     table = _table(truth, predicted)
-    assert pieces(table).tolist() == [1, 2, 1, 1, 1], "exactly a tenth is not yet a piece"
-    # 1: IoU 0.9; 2: 0.8, but a fifth of it is another id; 3: IoU 0.4; 4 and 5: one id on both, IoU 0.5 each.
+    assert pieces(table).tolist() == [1, 2, 1, 1, 1], "a twentieth is no piece, exactly a tenth is one"
+    assert over_segmentation(table) == 0.2
+    # 1: IoU 0.95; 2: 0.9, but a tenth of it is another id; 3: IoU 0.4; 4 and 5: one id on both, IoU 0.5 each.
     assert whole(table).tolist() == [True, False, False, True, True]
     assert whole(_table([1] * 10 + [0], [5] * 11)).tolist() == [True], "10/11"
     assert whole(_table([1] * 9 + [2] * 11, [5] * 20)).tolist() == [False, True], "what is merged into more is not"

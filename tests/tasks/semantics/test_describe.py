@@ -6,6 +6,7 @@ from view_masks import sizes_and_bits
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, InstanceMasks, PartMasks
 from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.masks.erosion import ErosionParams
 from ss_flow.tasks.models.colour_words import TERMS
 from ss_flow.tasks.semantics.describe import DescribeParams, crop, describe, describe_part
 
@@ -101,6 +102,17 @@ def test_the_border_of_a_mask_does_not_count():
     frames_loose, instance_loose = scene((loose, RED))
     assert describe(frames, instance_loose).embedding[TERMS.index("grey")] < 0.05
     np.testing.assert_allclose(describe(frames_loose, instance).embedding, describe(frames, instance).embedding)
+
+
+def test_a_view_of_whose_mask_erosion_leaves_nothing_stays_out():
+    thin = np.zeros((H, W), bool)
+    thin[40:46, 10:150] = True
+    unsparing = DescribeParams(erosion=ErosionParams(diagonal=0.0, keep_share=0.0, keep_pixels=0))
+    found = describe(*scene((thin, BLUE), (square(10, 10, 40), RED)), params=unsparing)
+    assert found.views == ("view1",) and found.weights.tolist() == [1600] and found.vectors.shape == (1, len(TERMS))
+    assert TERMS[found.embedding.argmax()] == "red"
+    nothing = describe(*scene((thin, BLUE)), params=unsparing)
+    assert not nothing.views and not nothing.embedding.any()
 
 
 def test_a_mask_belongs_to_the_frame_of_its_name():

@@ -16,7 +16,7 @@ from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.render import render, weights_by_id
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.splat.label import LabelParams, Votes, label, own_gaussians, vote
+from ss_flow.tasks.splat.label import LabelParams, ViewVotes, label, own_gaussians, vote
 
 CAMERAS = [camera_of(box_scene.cameras(), view) for view in range(box_scene.VIEWS)]
 FRAMES = box_scene.frames()
@@ -46,9 +46,9 @@ def labelled(scene: Gaussians, maps=TRUE, params: LabelParams = LabelParams(), c
     return label.function(scene, votes, *cloud, params=params)
 
 
-def votes_of(*rows: tuple[int, int, int]) -> Votes:
+def votes_of(*rows: tuple[int, int, int]) -> ViewVotes:
     gaussian, of_label, weight = np.array(sorted(rows), np.int32).reshape(-1, 3).T
-    return Votes("0", gaussian, of_label, weight.astype(np.float32))
+    return ViewVotes("0", gaussian, of_label, weight.astype(np.float32))
 
 
 def line(count: int, gap: float = 0.01) -> Gaussians:

@@ -104,6 +104,23 @@ def test_training_twice_gives_the_same_bytes_and_the_order_of_a_pair_does_not_ma
     assert same(merge_pair(built.views, built.ball, built.box, built.scene.maps, params=MERGE, w_mask=0.05), merged)
 
 
+def test_no_training_reads_a_parameter_that_is_kept_out_of_its_key(built):
+    read: set[str] = set()
+
+    class Noted(MergeParams):
+        def __getattribute__(self, name):
+            read.add(name)
+            return super().__getattribute__(name)
+
+    params = Noted(min_iterations=2, max_iterations=2, global_iterations=4, relabel_after=2, reset_opacity=True)
+    merge_pair(built.views, built.box, built.ball, built.scene.maps, params=params, w_mask=0.05)
+    assert set(module._OF_PAIRS) <= read and not read & set(module._OF_LAST_PASS)
+    read.clear()
+    scene = assemble((built.box, built.ball, built.background))
+    global_pass(built.views, scene, built.scene.maps, params=params)
+    assert set(module._OF_LAST_PASS) <= read and not read & set(module._OF_PAIRS)
+
+
 def test_touching_instances_collide_and_are_planned_as_a_pair(built):
     shown = Appearances(np.array([0, 1, 2], np.int32), **Appearances.arrays([[0, 1, 2], [0], [0, 2]]))
     made = plan((built.ball, built.box), shown, params=PlanParams(max_rounds=1), round=0)
