@@ -16,7 +16,8 @@ from ss_flow.tasks.evaluate.contingency import Contingency, Counts
 
 _MATCH = 0.5
 _PARTS = 10
-"""One in so many parts of an instance is the least that counts as covered, and of a prediction as made up of it."""
+"""A prediction that has a tenth of an instance covers it, and is made up of one that has a tenth of it (a whole number,
+since 0.1 * 30 > 3 in floating point)."""
 
 
 class PanopticQuality(NamedTuple):

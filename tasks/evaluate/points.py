@@ -155,7 +155,7 @@ def _all_metrics(
 def quality_by_kind(truth: Labels, predicted: Labels, stuff: Int32) -> dict[str, float]:
     """The panoptic quality of things and of stuff apart, each class-agnostic.
 
-    truth: [N] instance of each point, negative = not annotated. predicted: [N], 0 = 0. stuff: the true
+    truth: [N] instance of each point, negative = not annotated. predicted: [N], 0 = unlabelled. stuff: the true
     instances that are stuff. A prediction of which more than half lies on the other kind is no false positive here, but
     one there. Returns pq_things and pq_stuff, without the one that no instance is of.
     """
@@ -183,7 +183,7 @@ def point_metrics(
 ) -> dict[str, float]:
     """All measures on points.
 
-    truth: [N] instance of each point, negative = not annotated. predicted: [N], 0 = 0. score: how sure each
+    truth: [N] instance of each point, negative = not annotated. predicted: [N], 0 = unlabelled. score: how sure each
     predicted instance is. compat_gap_bug: see `ig_metrics`.
     Returns those of `ig_metrics`, ap, ap50, ap25, those of `segmentation_metrics` on the annotated points, annotated
     (the share of the points that are), and id_gaps, 1 where the ids of the ground truth have gaps and so the published
