@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ss_flow.running import progress, warn
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     DRAWN,
     FOUND,
@@ -60,7 +60,7 @@ class ReprojectParams:
     """Views with a mask below which an instance is weak: kept as points, not reconstructed."""
 
 
-@task()
+@task(resources=Resources(cores=1, memory_mb=1500))
 def reproject(
     points: PointCloud,
     visibility: Sequence[Visibility],
@@ -110,6 +110,8 @@ def reproject(
     for label in np.union1d([0], labels.label).tolist():
         rows = labels.label == label
         shown_in = [k for k, view in enumerate(views) if label in view]
+        # Taken out of `views`, so that no more than one label's masks are held twice.
+        taken = [views[k].pop(label) for k in shown_in]
         share = labels.confidence[rows]
         found.append(
             InstanceMasks(
@@ -121,8 +123,8 @@ def reproject(
                 confidence=float(share.mean(dtype=np.float64)) * float(agreed[label]) if share.size else 0.0,
                 views=tuple(names[k] for k in shown_in),
                 sizes=sizes[shown_in],
-                packed=np.concatenate([np.zeros(0, np.uint8), *(views[k][label][0] for k in shown_in)]),
-                origin=np.array([views[k][label][1] for k in shown_in], np.uint8),
+                packed=np.concatenate([np.zeros(0, np.uint8), *(mask for mask, _ in taken)]),
+                origin=np.array([kind for _, kind in taken], np.uint8),
                 weak=label > 0 and len(shown_in) < params.min_views,
             )
         )
