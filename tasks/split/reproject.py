@@ -78,7 +78,7 @@ def reproject(
     label's points do (`draw_missing`). The masks of one view do not overlap: smaller ones are on top. The first
     instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id. An
     instance's confidence is its points' mean share of votes, less the share of its painted pixels that other labels
-    contradict. Warns where every instance is weak.
+    contradict. Warns where there is none but the background, and where every other one is weak.
     """
     by_name = {extra.name: extra for extra in prompted}
     num_labels = int(labels.label.max(initial=0))
@@ -128,7 +128,12 @@ def reproject(
                 weak=label > 0 and len(shown_in) < params.min_views,
             )
         )
-    if len(found) > 1 and all(instance.weak for instance in found[1:]):
+    if len(found) == 1:
+        warn(
+            "No instance was found: no mask gave any point its label, so the whole scene is background. Look whether "
+            "the views' masks show the things: if so, give photos that overlap more; if not, use another segmenter."
+        )
+    elif all(instance.weak for instance in found[1:]):
         warn(
             f"No instance has masks in as many views as split.reproject.min_views ({params.min_views}), so none is "
             "reconstructed: give more photos, or lower it."

@@ -188,9 +188,14 @@ def test_instances_that_are_all_weak_are_warned_of(recwarn):
     assert "as many views as split.reproject.min_views (2), so none is reconstructed" in str(told.message)
 
 
-def test_where_one_instance_is_not_weak_or_there_is_none_nothing_is_warned_of(recwarn):
-    run([columns(0, 5), columns(5, 8)], halves(), replace(FOUND_ONLY, min_views=1))
+def test_a_scene_without_any_instance_is_warned_of(recwarn):
     run([columns(0, 5)], np.zeros((H, W)))
+    (told,) = recwarn.list
+    assert str(told.message).startswith("No instance was found")
+
+
+def test_where_one_instance_is_not_weak_nothing_is_warned_of(recwarn):
+    run([columns(0, 5), columns(5, 8)], halves(), replace(FOUND_ONLY, min_views=1))
     cloud, labels = labelled(halves())
     masks = (mask_set(columns(0, 5)[None], "a"), mask_set(np.stack([columns(0, 5), columns(5, 8)]), "b"))
     reproject(cloud, (view("a"), view("b")), masks, labels, WHOLE, (), params=FOUND_ONLY)
