@@ -147,12 +147,12 @@ class PackedMasks:
     def dense(self) -> Bool:
         """The masks as [N, H, W] booleans."""
         bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
-        return bits.reshape(-1, self.height, self.width).astype(bool)
+        return bits.reshape(-1, self.height, self.width).view(bool)
 
     def mask(self, row: int) -> Bool:
         """One of the masks: [H, W]."""
         bits = np.unpackbits(self.packed[row], count=self.height * self.width)
-        return bits.reshape(self.height, self.width).astype(bool)
+        return bits.reshape(self.height, self.width).view(bool)
 
 
 class ViewMasks:
@@ -174,7 +174,7 @@ class ViewMasks:
     def mask(self, row: int) -> Bool:
         """One of the masks: [H, W]."""
         width, height = self.sizes[row].tolist()
-        return np.unpackbits(self.bits(row), count=height * width).reshape(height, width).astype(bool)
+        return np.unpackbits(self.bits(row), count=height * width).reshape(height, width).view(bool)
 
     def dense(self) -> list[Bool]:
         """The masks, [H, W] each."""

@@ -47,6 +47,9 @@ _TIED = 1 / 3
 Slow changes are told as less than they are."""
 _OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """Between a camera's axes in OpenGL and in OpenCV."""
+_COARSEST = 1e-3
+"""A step between two float32 numbers at the cameras, as a share of the median depth, above which pictures suffer: a
+generated room, moved away, is drawn with a PSNR of 56 dB to what it was at steps of 1 mm, and of 36 dB at 8 mm."""
 _SAME_PICTURE = 1.0
 """Mean difference of grey values, of 255, below which two photos are the same."""
 
@@ -75,10 +78,10 @@ def checks(
 ) -> CaptureChecks:
     """Compare each view with its two nearest neighbours, and warn of what does not fit.
 
-    Neighbours are the views whose cameras are nearest and look the same way. Told of are duplicates, principal points
-    far from the middle, depth of another scale, poses that disagree with depth (all, or single ones), and, by the scale
-    that fits, photos that show something else than their neighbours, and exposures that change. All lists are in the
-    order of the frames.
+    Neighbours are the views whose cameras are nearest and look the same way. Told of are a scene so far from
+    the world's origin that numbers are coarse, duplicates, principal points far from the middle, depth of another
+    scale, poses that disagree with depth (all, or single ones), and, by the scale that fits, photos that show something
+    else than their neighbours, and exposures that change. All lists are in the order of the frames.
     """
     views = [_view(frame, camera_of(cameras, row), depths[row]) for row, frame in enumerate(frames)]
     pairs: list[tuple[int, int]] = []
@@ -108,9 +111,22 @@ def checks(
     known = error[np.isfinite(error)]
     misfit = bool(pairs) and scale == 1 and not (len(known) and np.median(known) <= params.max_depth_error)
     exchanged = _exchanged(views, cameras, params) if misfit else ""
-    for text in _told(result, cameras, params, compared=bool(pairs), exchanged=exchanged):
+    for text in (*_coarse(views), *_told(result, cameras, params, compared=bool(pairs), exchanged=exchanged)):
         warn(text)
     return result
+
+
+def _coarse(views: Sequence[_View]) -> Iterable[str]:
+    """What is to be said of cameras that stand far from the origin: points and Gaussians are float32."""
+    depth = np.concatenate([np.zeros(0, np.float32), *(view.depth[view.depth > 0] for view in views)])
+    farthest = max((float(np.abs(view.camera.center).max()) for view in views), default=0.0)
+    step = float(np.spacing(np.float32(farthest)))
+    if len(depth) and step > _COARSEST * np.median(depth):
+        yield (
+            f"The cameras stand up to {farthest:,.0f} world units from the origin along an axis, where numbers have "
+            f"steps of {step:.2g}, too coarse for depth of {np.median(depth):.3g} (median): subtract one offset from "
+            "all poses, as the mean of the cameras' places, and from given points."
+        )
 
 
 def _told(

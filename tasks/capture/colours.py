@@ -18,7 +18,7 @@ from ss_flow.running import progress, warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Float32, Float64, Frame, Int32, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, size_within
+from ss_flow.tasks.geometry.images import averaged_valid, decode_rgb, decode_valid, size_within
 from ss_flow.tasks.geometry.visibility import VisibilityParams, surface_points
 from ss_flow.tasks.ranges import Count, Fraction, Positive
 
@@ -210,7 +210,7 @@ def _observations(
         progress(view, len(frames), frame.name)
         size = size_within(_SIDE, frame.width, frame.height)
         photo = cv2.resize(decode_rgb(frame), size, interpolation=cv2.INTER_AREA).astype(np.float64) / 255
-        valid = cv2.resize(decode_valid(frame).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+        valid = averaged_valid(decode_valid(frame), *size)
         row, x, y, _ = surface_points(points, camera_of(cameras, view).scaled(*size), depth, _SAME_SURFACE, unit.length)
         color = photo[y, x]
         counts = valid[y, x] & (color > _UNCLIPPED[0]).all(axis=1) & (color < _UNCLIPPED[1]).all(axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import DepthMap, Float32, Frame
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import averaged_valid, decode_rgb, decode_valid
 from ss_flow.tasks.geometry.plane_sweep import (
     SweepView,
     agreeing_depth,
@@ -127,11 +127,11 @@ def photo_at_size(frame: Frame, camera: Camera, max_side: int) -> SweepView:
     scale = min(1.0, max_side / max(camera.width, camera.height))
     size = (round(camera.width * scale), round(camera.height * scale))
     gray = cv2.cvtColor(decode_rgb(frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
-    valid = decode_valid(frame).astype(np.float32)
+    valid = decode_valid(frame)
     if scale < 1:
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-        valid = cv2.resize(valid, size, interpolation=cv2.INTER_AREA)
-    return SweepView(gray, valid > 0.999, camera.scaled(*size))
+        valid = averaged_valid(valid, *size)
+    return SweepView(gray, valid, camera.scaled(*size))
 
 
 def source_views(cameras: Sequence[Camera], depth: float | Float32, count: int) -> list[int]:

@@ -15,7 +15,7 @@ from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.read_ply import read_gaussians
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, size_within
+from ss_flow.tasks.geometry.images import averaged_valid, decode_rgb, decode_valid, size_within
 from ss_flow.tasks.ranges import Count, Fraction
 
 _COMPARED_SIDE = 160
@@ -115,7 +115,7 @@ def _likeness(scene: Gaussians, frame: Frame, camera: Camera) -> float | None:
     size = size_within(_COMPARED_SIDE, frame.width, frame.height)
     drawn = render(scene, camera.scaled(*size))
     photo = cv2.resize(decode_rgb(frame), size, interpolation=cv2.INTER_AREA)
-    valid = cv2.resize(decode_valid(frame).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    valid = averaged_valid(decode_valid(frame), *size)
     covered = valid & (drawn.alpha >= 0.5)
     if covered.sum() <= _LEAST_SEEN * covered.size:
         return None

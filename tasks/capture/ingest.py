@@ -19,7 +19,7 @@ from ss_flow.tasks.capture.layout_colmap import read_points
 from ss_flow.tasks.capture.lens import Lens, without_distortion
 from ss_flow.tasks.capture.photo_files import Photo, decode, read_gray, read_photo
 from ss_flow.tasks.capture.scene_files import Pose
-from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.geometry.images import averaged_valid, encode_png
 from ss_flow.tasks.ranges import Count, JpegQuality
 
 _NAMED = 10
@@ -112,8 +112,7 @@ def frame_of(
     w, h = (max(1, round(width * scale)), max(1, round(height * scale)))
     if scale < 1:
         image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
-        # A pixel counts only where all that it averages does.
-        keep = cv2.resize(keep.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.999
+        keep = averaged_valid(keep, w, h)
     if turn or distorted or scale < 1 or photo.format not in ("jpeg", "png"):
         if params.jpeg_quality:
             encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()

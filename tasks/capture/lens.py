@@ -8,6 +8,8 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, UInt8
 
+_NOWHERE = -1e4
+"""Where a map points for what no photo shows, pixels."""
 _NEWTON_STEPS = 40
 _NEWTON_CLOSE = 1e-6
 """Pixels of the photo."""
@@ -48,7 +50,8 @@ def undistortion_map(lens: Lens) -> Float32:
     """Where each pixel of the undistorted image lies in the photo.
 
     The undistorted image is a pinhole's with the lens's own fx, fy, cx, cy and size, so that intrinsics stay as stated.
-    Returns [H, W, 2] integer-centred (u, v), as `cv2.remap` takes them.
+    Returns [H, W, 2] integer-centred (u, v), as `cv2.remap` takes them; far outside where the model has turned round,
+    and shows once more, mirrored, what it showed nearer to the axis.
     """
     import cv2
 
@@ -59,7 +62,29 @@ def undistortion_map(lens: Lens) -> Float32:
         u, v = cv2.fisheye.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
     else:
         u, v = cv2.initUndistortRectifyMap(matrix, coefficients, None, matrix, (lens.width, lens.height), cv2.CV_32FC1)
-    return np.stack([u, v], axis=-1).astype(np.float32)
+    found = np.stack([u, v], axis=-1).astype(np.float32)
+    x, y = (
+        (np.arange(n) + 0.5 - c) / f for n, c, f in ((lens.width, lens.cx, lens.fx), (lens.height, lens.cy, lens.fy))
+    )
+    found[np.hypot(x, y[:, None]) >= _turning(lens)] = _NOWHERE
+    return found
+
+
+def _turning(lens: Lens) -> float:
+    """The slope to the axis of the rays at which a lens's radial polynomial turns round or, divided by another, has its
+    pole; infinite where it does not. Tangential distortion is left out, which is small."""
+    if lens.fisheye:
+        powers = np.arange(2 * len(lens.distortion) + 1, 0, -2)
+        roots = np.roots([*reversed(lens.distortion), 1.0] * powers)
+    else:
+        k1, k2, _, _, k3, k4, k5, k6 = (*lens.distortion, *(0.0,) * (8 - len(lens.distortion)))
+        above, below, twice = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([k6, k5, k4, 1.0]), np.poly1d([2.0, 0.0])
+        slope = (above + twice * above.deriv()) * below - twice * above * below.deriv()
+        roots = np.append(slope.roots, below.roots)
+    square = np.min(roots.real[(roots.imag == 0) & (roots.real > 0)], initial=np.inf)
+    if not lens.fisheye:
+        return float(np.sqrt(square))
+    return float(np.tan(np.sqrt(square))) if square < (np.pi / 2) ** 2 else np.inf
 
 
 def photo_lens(frame: Frame, stated: Lens | None, cameras: Cameras) -> Lens | None:

@@ -72,6 +72,16 @@ def decode_valid(frame: Frame) -> Bool:
     return gray > 0
 
 
+def averaged_valid(valid: Bool, width: int, height: int) -> Bool:
+    """[height, width] which pixels of a photo count once it is scaled down (INTER_AREA): where all they average does.
+
+    valid: [H, W], of the photo.
+    """
+    import cv2
+
+    return np.asarray(cv2.resize(valid.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.999)
+
+
 def encode_png(image: np.ndarray) -> UInt8:
     """The bytes of a PNG file: image is [H, W] uint8 or uint16, or [H, W, 3] uint8 RGB."""
     import cv2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -30,7 +30,7 @@ from ss_flow.tasks.geometry.cameras import camera_extent
 from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.masks.packing import dilated
+from ss_flow.tasks.masks.packing import dilated, joined
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive, Range
 from ss_flow.tasks.splat.consensus import agreed, completed
 
@@ -116,8 +116,9 @@ def reconstruct(
     """Gaussians of one instance, or of the background (id 0), from its own pixels alone (spec P1, A28).
 
     Training starts from the labelled points and sees, in the views that have a mask, the three kinds of pixels that
-    `group_view` tells apart. A weak instance, and one without masks or points, gives no Gaussians: it is kept as
-    points alone (spec row 21), and the last pass over the whole scene lets the background fill its place.
+    `group_view` tells apart; where there are more views than steps, in as many of them, evenly spread. A weak instance,
+    and one without masks or points, gives no Gaussians: it is kept as points alone (spec row 21), and the last pass
+    over the whole scene lets the background fill its place.
 
     views: at least those that have a mask. visibility: when one surface is in front of another.
     Raises InputError when a frame's size is not that of the masks.
@@ -193,6 +194,7 @@ def thin(points: Float32, limit: int) -> Int32:
 def _trained(
     scene: SceneViews, instance: InstanceMasks, initial: Gaussians, params: ReconstructParams, iterations: int
 ) -> Gaussians:
+    instance = _evenly(instance, params.iterations(instance))
     surface = PointSurface.of(instance.points)
     build = background_view if instance.instance_id == 0 else group_view
     row = {frame.name: i for i, frame in enumerate(scene.frames)}
@@ -221,12 +223,23 @@ def _trained(
     return result.gaussians
 
 
+def _evenly(instance: InstanceMasks, most: int) -> InstanceMasks:
+    """The instance with no more than so many of its views, evenly spread: a training shows one view a step, and holds
+    those in memory that it never shows, too."""
+    if len(instance.views) <= most:
+        return instance
+    rows = np.linspace(0, len(instance.views) - 1, most).round().astype(int)
+    sizes, packed = joined(instance.sizes[rows], [instance.bits(row) for row in rows.tolist()])
+    views = tuple(instance.views[row] for row in rows)
+    return replace(instance, views=views, sizes=sizes, packed=packed, origin=instance.origin[rows])
+
+
 def _channels(scene: SceneViews, instance: InstanceMasks, params: ReconstructParams) -> Iterable[Int32]:
     """[H, W] of each view with a mask: 0 inside, NONE_OF_MINE outside, IGNORED where the pixel says nothing."""
     # What is background is what is left over: there is no mask of it to doubt.
     if params.tau_agree and instance.instance_id:
         return agreed(scene, instance, params.tau_agree)
-    return (np.where(mask, 0, NONE_OF_MINE).astype(np.int32) for mask in instance.dense())
+    return (np.where(mask, 0, NONE_OF_MINE).astype(np.int32) for mask in map(instance.mask, range(len(instance.views))))
 
 
 def _settings(params: ReconstructParams, iterations: int, scale: float) -> TrainParams:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     REFINED,
     Cameras,
@@ -39,7 +39,7 @@ class ResolveParams:
     one's, as in the paper."""
 
 
-@task()
+@task(resources=Resources(cores=1, memory_mb=1000))
 def resolve(cameras: Cameras, instances: tuple[InstanceMasks, ...]) -> tuple[LabelMap, ...]:
     """The instance ids of every view, painted from large to small, so that the smaller is on top (spec S1, P4).
 
@@ -50,7 +50,7 @@ def resolve(cameras: Cameras, instances: tuple[InstanceMasks, ...]) -> tuple[Lab
     return _painted(sizes, instances, kept_on_top=False)
 
 
-@task()
+@task(resources=Resources(cores=1, memory_mb=1000))
 def resolve_refined(
     views: Views,
     instances: tuple[InstanceMasks, ...],

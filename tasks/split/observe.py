@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     BORDER,
     INSIDE,
@@ -63,7 +63,7 @@ class ObserveParams:
     """Which points inside a mask are kept."""
 
 
-@task()
+@task(resources=Resources(cores=1, memory_mb=400))
 def observe(
     points: PointCloud, visibility: Visibility, masks: MaskSet | PromptedMasks, *, params: ObserveParams
 ) -> Observation:

@@ -36,6 +36,10 @@ from ss_flow.tasks.split.votes.smoothing import smooth
 from ss_flow.tasks.split.votes.touching import TouchingParams, merge_touching
 from ss_flow.tasks.split.votes.votes import Votes
 
+MOST_LABELS = np.iinfo(np.uint16).max // 2
+"""Label maps have 16 bits: above this id, those that no point carries are left out, and the others move up. Half of the
+numbers are left to the nodes of the tree over the labels, which are fewer than these."""
+
 
 @dataclass(frozen=True)
 class PropagateParams:
@@ -94,7 +98,7 @@ def propagate(
     visibility, observations: one of each per view, in the order of the views. The masks vote for the labels of the
     points under them; in the end a point keeps the label that got a share of tau_label of its votes. The order of the
     masks of a view does not matter, nor does the scale of the world; nor, with views=at_once, the order of the views,
-    up to `at_once.max_views` of them.
+    up to `at_once.max_views` of them. Ids that are dropped stay unused, unless the highest is above `MOST_LABELS`.
     """
     if params.views == "in_turn":
         votes, matched = vote_in_turn(len(points.points), visibility, observations, params.tau_label, params.in_turn)
@@ -128,6 +132,10 @@ def propagate(
         )
         num_labels = max(num_labels, int(settled.max(initial=0)))
         match_label = _most_held(match_label, matched, observations, whole, settled)
+    if num_labels > MOST_LABELS:
+        given = np.unique(np.concatenate([[0], settled, match_label]))
+        settled, match_label = (np.searchsorted(given, ids).astype(np.int32) for ids in (settled, match_label))
+        num_labels = len(given) - 1
     return PointLabels(
         label=settled,
         confidence=share.astype(np.float32),

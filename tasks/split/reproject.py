@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ss_flow.running import progress, warn
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     DRAWN,
     FOUND,
@@ -60,7 +60,7 @@ class ReprojectParams:
     """Views with a mask below which an instance is weak: kept as points, not reconstructed."""
 
 
-@task()
+@task(resources=Resources(cores=1, memory_mb=1500))
 def reproject(
     points: PointCloud,
     visibility: Sequence[Visibility],
@@ -78,7 +78,7 @@ def reproject(
     label's points do (`draw_missing`). The masks of one view do not overlap: smaller ones are on top. The first
     instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id. An
     instance's confidence is its points' mean share of votes, less the share of its painted pixels that other labels
-    contradict. Warns where every instance is weak.
+    contradict. Warns where there is none but the background, and where every other one is weak.
     """
     by_name = {extra.name: extra for extra in prompted}
     num_labels = int(labels.label.max(initial=0))
@@ -99,6 +99,8 @@ def reproject(
     for label in np.union1d([0], labels.label).tolist():
         rows = labels.label == label
         shown_in = [k for k, view in enumerate(views) if label in view]
+        # Taken out of `views`, so that no more than one label's masks are held twice.
+        taken = [views[k].pop(label) for k in shown_in]
         share = labels.confidence[rows]
         found.append(
             InstanceMasks(
@@ -110,12 +112,17 @@ def reproject(
                 confidence=float(share.mean(dtype=np.float64)) * float(agreed[label]) if share.size else 0.0,
                 views=tuple(names[k] for k in shown_in),
                 sizes=sizes[shown_in],
-                packed=np.concatenate([np.zeros(0, np.uint8), *(views[k][label][0] for k in shown_in)]),
-                origin=np.array([views[k][label][1] for k in shown_in], np.uint8),
+                packed=np.concatenate([np.zeros(0, np.uint8), *(mask for mask, _ in taken)]),
+                origin=np.array([kind for _, kind in taken], np.uint8),
                 weak=label > 0 and len(shown_in) < params.min_views,
             )
         )
-    if len(found) > 1 and all(instance.weak for instance in found[1:]):
+    if len(found) == 1:
+        warn(
+            "No instance was found: no mask gave any point its label, so the whole scene is background. Look whether "
+            "the views' masks show the things: if so, give photos that overlap more; if not, use another segmenter."
+        )
+    elif all(instance.weak for instance in found[1:]):
         warn(
             f"No instance has masks in as many views as split.reproject.min_views ({params.min_views}), so none is "
             "reconstructed: give more photos, or lower it."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Int32, MaskSet, PointLabels, Tally, Visibility
 from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.masks.painting import nearest_labels, paint_labels
@@ -13,7 +13,7 @@ _REACH = 5.0
 """How far a label's area reaches round its points, in pixels of an image with a diagonal of 800."""
 
 
-@task(name="split.tally")
+@task(name="split.tally", resources=Resources(cores=1, memory_mb=400))
 def tally(visibility: Visibility, masks: MaskSet, labels: PointLabels) -> Tally:
     """How many of each label's points lie under each mask of a view.
 

@@ -2,8 +2,8 @@
 
 Every view that sees two masks says how far their points lie under one mask of its own. Masks are united as long as
 what speaks for it outweighs what speaks against it (Bansal, Blum, Chawla: "Correlation Clustering", 2004, with real
-weights). Up to `max_views` views, no order of views enters, and a second copy of a view says nothing new. A mask that
-holds two objects is outvoted by those that part them. Beyond Split&Splat, whose labels can only grow together.
+weights). Up to `max_views` views, no order of views enters, nor does a second copy of all of them. A mask that holds
+two objects is outvoted by those that part them. Beyond Split&Splat, whose labels can only grow together.
 """
 
 from __future__ import annotations

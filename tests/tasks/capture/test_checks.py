@@ -57,6 +57,20 @@ def test_nothing_is_said_of_a_clean_room(room: Room) -> None:
     assert found.exposure == pytest.approx(np.ones(len(room)), abs=0.1) and found.depth_scale == 1
 
 
+def _moved(room: Room, by: float) -> Cameras:
+    """The room's cameras after the whole world was moved."""
+    poses = room.cameras.world_to_camera.copy()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ np.array([by, 0.0, 0.0])
+    return replace(room.cameras, world_to_camera=poses)
+
+
+def test_a_world_too_far_from_its_origin_for_float32_is_told(room: Room) -> None:
+    heard, _ = _checked(room, cameras=_moved(room, 500_000))
+    assert len(heard) == 1
+    assert "stand up to 500,00" in heard[0] and "steps of 0.031," in heard[0]
+    assert _checked(room, cameras=_moved(room, 5_000))[0] == []
+
+
 def test_jitter_of_all_poses_is_told_with_its_size(room: Room) -> None:
     (said,), found = _checked(room, cameras=_jittered(room, 2.0, 0.06, range(len(room))))
     assert "poses, intrinsics and depth disagree" in said and f"{np.nanmedian(found.depth_error):.1%}" in said

@@ -23,7 +23,7 @@ from ss_flow.tasks.gaussians.views import (
     whole_view,
 )
 from ss_flow.tasks.geometry.cameras import camera_of, project
-from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 
 
@@ -122,6 +122,22 @@ def test_masked_out_pixels_are_neither_inside_nor_free(small):
     left = whole(small, 0, made.inside | made.free, made.camera)[:, : WIDTH // 2]
     assert not left.any()
     assert made.inside.any()
+
+
+def test_where_a_photo_is_scaled_down_the_colour_of_masked_out_pixels_reaches_none_that_count(small):
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[HEIGHT // 3 : HEIGHT // 2, WIDTH // 3 : WIDTH // 2] = 0
+
+    def filled(color: int):
+        photo = decode_rgb(small.frames[0]).copy()
+        photo[valid == 0] = color
+        frame = replace(small.frames[0], encoded=encode_png(photo), valid=encode_png(valid))
+        scene = views_of(small, frames=(frame, *small.frames[1:]))
+        return whole_view(scene, 0, np.zeros((HEIGHT, WIDTH), np.int32), WIDTH * 3 // 7)
+
+    dark, bright = filled(0), filled(255)
+    assert (dark.image != bright.image).any() and 0.5 < dark.inside.mean() < 1
+    np.testing.assert_array_equal(dark.image[dark.inside], bright.image[bright.inside])
 
 
 def test_without_known_depth_nothing_outside_the_mask_is_called_free_near_the_surface(small):

@@ -14,12 +14,14 @@ from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import REFINED, Appearances, Gaussians
 from ss_flow.tasks.gaussians.initialise import concatenate, extents, initialise, select
 from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.trainer import TrainResult
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.splat import merge as module
+from ss_flow.tasks.splat import reconstruct as reconstruct_module
 from ss_flow.tasks.splat.global_pass import assemble, global_pass
 from ss_flow.tasks.splat.merge import MergeParams, Quality, acceptable, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
@@ -150,6 +152,20 @@ def test_a_merge_leaves_what_is_far_from_the_smaller_group_as_it_was(built):
     )
     assert same(select(merged, merged.instance_id == 3), far)
     assert not same(select(merged, merged.instance_id == 1), built.box)
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(3, [0, 4, 7]), (8, range(8)), (30, range(8))])
+def test_of_more_views_than_steps_as_many_are_trained_on_evenly_spread(built, monkeypatch, steps, expected):
+    heard = []
+
+    def listening(initial, views, **_):
+        heard.extend(view.camera.world_to_camera for view in views)
+        return TrainResult(initial, 0, np.zeros(0, np.float32))
+
+    monkeypatch.setattr(reconstruct_module, "train", listening)
+    params = replace(TRAIN, min_iterations=1, max_iterations=steps)
+    reconstruct(built.views, built.scene.instance(1), params=params)
+    np.testing.assert_array_equal(heard, built.scene.cameras.world_to_camera[list(expected)])
 
 
 def test_retraining_happens_only_where_refinement_changed_a_mask(built):

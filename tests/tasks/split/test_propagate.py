@@ -12,6 +12,7 @@ from ss_flow.tasks.artifacts import BORDER, INSIDE, Observation, PointCloud
 from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.visibility import VisibilityParams
+from ss_flow.tasks.split import propagate as module
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.observe import ClusterParams, ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
@@ -113,6 +114,16 @@ def test_labels_of_few_points_are_dropped_in_the_end():
     result = run(points(8), visible, masks, replace(BARE, min_label_points=3))
     assert set(result.label) == {0, 1}
     assert result.num_labels == 2
+
+
+@pytest.mark.parametrize(("most", "ids"), [(2, (0, 1, 2)), (3, (0, 2, 3))])
+def test_ids_move_up_over_those_that_were_dropped_only_where_the_highest_would_not_fit(monkeypatch, most, ids):
+    monkeypatch.setattr(module, "MOST_LABELS", most)
+    visible, masks = views_of([[1]], [[2, 3], [4, 5]])
+    result = run(points(7), visible, masks, replace(BARE, min_label_points=2))
+    assert result.label.tolist() == np.array(ids)[[0, 0, 1, 1, 2, 2, 0]].tolist()
+    assert result.num_labels == ids[-1]
+    assert result.match_label.tolist() == np.array(ids)[[0, 1, 2]].tolist()
 
 
 def test_a_mask_that_hardly_touches_a_label_is_a_new_object():
