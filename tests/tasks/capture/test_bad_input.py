@@ -377,6 +377,19 @@ def colmap_images_missing(root):
     return root
 
 
+@case("cameras.bin", "is missing")
+def colmap_cameras_missing(root):
+    (made.colmap(root) / "sparse" / "1" / "cameras.bin").unlink()
+    return root
+
+
+@case("cameras.txt", "is missing")
+def colmap_points_alone(root):
+    made.write(root / "images" / "1.png", made.photo())
+    (root / "points3D.txt").write_text("")
+    return root
+
+
 @case("cameras.bin", "has a camera of model EUCM; undistort the images first")
 def colmap_lens_of_a_newer_version(root):
     made.colmap(root, binary=True)

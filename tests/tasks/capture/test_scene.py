@@ -91,6 +91,20 @@ def test_photos_that_a_colmap_model_lacks_or_that_are_not_read_are_skipped(tmp_p
     assert open_scene(loose).skipped == ("IMG_3.DNG",)
 
 
+def test_a_colmap_model_may_lie_in_a_folder_colmap_as_nerfstudio_leaves_it(tmp_path):
+    made.colmap(tmp_path)
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "sparse").rename(tmp_path / "colmap" / "sparse")
+    scene = open_scene(tmp_path)
+    assert scene.kind == "colmap" and scene.names == ("2", "10", "11")
+    assert_cameras(scene)
+
+
+def test_a_list_of_photos_named_images_txt_makes_no_colmap_model(tmp_path):
+    (made.photos(tmp_path) / "images.txt").write_text("2.jpg\n10.jpg\n")
+    assert open_scene(tmp_path).kind == "photos"
+
+
 def test_a_colmap_model_that_pycolmap_wrote_reads_the_same(tmp_path):
     import zlib  # noqa: F401
 
