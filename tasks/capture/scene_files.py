@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -174,7 +175,8 @@ def files_in(folder: Path, suffixes: frozenset[str] = PHOTO_SUFFIXES) -> list[Pa
     """The files of a folder that carry one of these suffixes, naturally sorted; hidden files do not count."""
     if not folder.is_dir():
         return []
-    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    named = [folder / entry.name for entry in os.scandir(folder) if not entry.is_dir()]
+    found = [p for p in named if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     return sorted(found, key=lambda p: (natural_key(p.name), p.name))
 
 

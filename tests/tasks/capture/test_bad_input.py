@@ -174,6 +174,23 @@ def two_photos_of_one_stem(root):
     return root
 
 
+@case("10.jpg", "links to /nowhere/10.jpg, which is no file")
+def photo_that_is_a_dead_link(root):
+    (made.photos(root) / "10.jpg").unlink()
+    (root / "10.jpg").symlink_to("/nowhere/10.jpg")
+    return root
+
+
+@case("10.png", "links to away.png, which is no file")
+def ready_mask_that_is_a_dead_link(root):
+    made.photos(root)
+    for name in made.NAMES:
+        made.write(root / "instance_masks" / f"{name}.png", np.zeros((24, 32), np.uint16))
+    (root / "instance_masks" / "10.png").unlink()
+    (root / "instance_masks" / "10.png").symlink_to("away.png")
+    return root
+
+
 @case("transforms.json", "not valid JSON")
 def transforms_that_is_no_json(root):
     (made.nerfstudio(root) / "transforms.json").write_text("{")

@@ -34,6 +34,14 @@ def test_a_folder_of_photos_is_sorted_as_people_count(tmp_path):
     assert scene.valid == (None, None, None)
 
 
+def test_a_folder_named_like_a_photo_is_none_and_links_to_photos_are(tmp_path):
+    made.photos(tmp_path / "away")
+    (tmp_path / "scene/album.jpg").mkdir(parents=True)
+    for name in made.NAMES:
+        (tmp_path / f"scene/{name}.jpg").symlink_to(tmp_path / f"away/{name}.jpg")
+    assert open_scene(tmp_path / "scene").names == ("2", "10", "11")
+
+
 def test_photos_may_lie_in_a_folder_images(tmp_path):
     made.photos(tmp_path / "images")
     assert open_scene(tmp_path).names == ("2", "10", "11")
