@@ -233,13 +233,20 @@ def _views_text(path: Path) -> list[_View]:
 
 def _pose(values: tuple[float, ...] | list[float], path: Path, name: str) -> Pose:
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation_of(np.array(values[:4]))
+    where = f"{path} for {name}"
+    matrix[:3, :3] = rotation_of(np.array(values[:4]), where)
     matrix[:3, 3] = values[4:]
-    return tuple(float(x) for x in check_rigid(matrix, f"{path} for {name}").ravel())
+    return tuple(float(x) for x in check_rigid(matrix, where).ravel())
 
 
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """[3, 3] the rotation of a quaternion w x y z of any length but zero (zero gives NaN)."""
+def rotation_of(quaternion: np.ndarray, where: str) -> np.ndarray:
+    """[3, 3] the rotation of a quaternion w x y z of any length but zero; where one is not finite, NaN.
+
+    where: what to name in a message.
+    Raises InputError when its length is zero.
+    """
+    if not quaternion.any():
+        raise InputError(f"the pose in {where} has a quaternion of length 0; a rotation has one of length 1.")
     with np.errstate(invalid="ignore"):
         w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array(

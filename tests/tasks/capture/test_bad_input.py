@@ -315,6 +315,34 @@ def depth_without_a_known_pixel(root):
     return root
 
 
+@case("depth", "the valid masks (0 = ignored) leave out every one")
+def valid_masks_that_leave_out_everything(root):
+    made.scannet(root)
+    for name in made.NAMES:
+        made.write(root / "valid" / f"{name}.png", np.zeros((24, 32), np.uint8))
+    return root
+
+
+@case("transforms.json", "`depth_unit_scale_factor` -0.001; world units per unit")
+def depth_in_a_negative_unit(root):
+    return made.nerfstudio(root, depth_unit_scale_factor=-0.001)
+
+
+@case("transforms.json", "`depth_unit_scale_factor` 0; world units per unit")
+def depth_in_no_unit(root):
+    return made.nerfstudio(root, depth_unit_scale_factor=0)
+
+
+@case("transforms.json", "`depth_unit_scale_factor` inf; a finite number is expected")
+def depth_in_an_endless_unit(root):
+    return made.nerfstudio(root, depth_unit_scale_factor=np.inf)
+
+
+@case("transforms.json", "`w` nan; a finite number is expected")
+def transforms_of_a_width_that_is_no_number(root):
+    return made.nerfstudio(root, w=np.nan)
+
+
 @case("2.png", "median depth of 2000 m")
 def depth_in_the_wrong_unit(root):
     return made.nerfstudio(root, depth_unit_scale_factor=1.0)
@@ -453,6 +481,15 @@ def tum_with_a_short_pose(root):
     return root
 
 
+@case("groundtruth.txt for rgb/10.png", "has a quaternion of length 0")
+def tum_with_a_quaternion_of_zeros(root):
+    track = made.tum(root) / "groundtruth.txt"
+    lines = track.read_text().splitlines()
+    lines[2] = "101.005 1 0.5 -1 0 0 0 0"
+    track.write_text("\n".join(lines))
+    return root
+
+
 @case("camera.txt", "four numbers")
 def tum_with_bad_intrinsics(root):
     (made.tum(root) / "camera.txt").write_text("525 525")
@@ -490,6 +527,13 @@ def test_the_captures_that_the_cases_spoil_are_sound(make, tmp_path):
     if make is made.tum:
         (tmp_path / "camera.txt").write_text("30 30 15.5 11.5")
     read_all(make(tmp_path))
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_infinite_pose_is_refused_without_a_warning_before(tmp_path):
+    edit_json(made.nerfstudio(tmp_path), lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(3, np.inf))
+    with pytest.raises(InputError, match=r"transforms\.json for images/10\.png holds NaN or infinite numbers"):
+        open_scene(tmp_path)
 
 
 def test_opencv_alone_would_read_a_cut_jpeg(tmp_path):
