@@ -90,7 +90,7 @@ def _count_frames(video: Path) -> int:
 
     reader = cv2.VideoCapture(str(video))
     if not reader.isOpened():
-        raise InputError(f"{video} cannot be opened as a video; an MP4, MOV, AVI, MKV or WebM file is expected.")
+        raise InputError(f"{video} cannot be opened as a video; an MP4, MOV, AVI, MKV, WebM or MPEG file is expected.")
     # The container's own count is often wrong, too low mostly: only one that is far too high tells of a damage.
     announced = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     total = 0

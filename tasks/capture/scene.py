@@ -16,6 +16,7 @@ from ss_flow.tasks.capture.layout_tum import open_tum
 from ss_flow.tasks.capture.scene_files import (
     HEIC_SUFFIXES,
     PHOTO_SUFFIXES,
+    PNM_SUFFIXES,
     UNREAD_SUFFIXES,
     VIDEO_SUFFIXES,
     SceneFiles,
@@ -144,11 +145,23 @@ def _open_loose(path: Path) -> SceneFiles:
         raise InputError(f"{path} holds {len(recordings)} recordings; give the path of one of them.")
     if recordings:
         return _open_layout(recordings[0])
-    raise InputError(f"{path} holds no photo and no capture that is known; give {ACCEPTED}.")
+    suffixes = " ".join(sorted(PHOTO_SUFFIXES))
+    raise InputError(f"{path} holds no photo ({suffixes}) and no capture that is known; {_what_to_give(path)}.")
+
+
+def _what_to_give(path: Path) -> str:
+    """What to give in the place of a folder without a photo: its only folder that has some, or any capture."""
+    within = [(folder, photos) for folder in sorted(path.glob("*/")) if (photos := files_in(folder))]
+    if len(within) == 1:
+        folder, photos = within[0]
+        return f"its folder {folder.name}/ holds {len(photos)} of them, so give that"
+    return f"give {ACCEPTED}"
 
 
 def _one_of_each(photos: list[Path]) -> list[Path]:
-    """Photos without those in HEIC that lie beside a copy in another format, as phones export them."""
+    """Photos without those in HEIC that lie beside a copy in another format, as phones export them, and without PGM and
+    its kin beside other formats: there they hold depth, as in recordings of RGB-D cameras."""
+    photos = [photo for photo in photos if photo.suffix.lower() not in PNM_SUFFIXES] or photos
     copied = {photo.stem for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES}
     return [photo for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES or photo.stem not in copied]
 

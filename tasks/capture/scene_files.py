@@ -20,10 +20,11 @@ from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.lens import Lens
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}) | HEIC_SUFFIXES
+PNM_SUFFIXES = frozenset({".pgm", ".ppm", ".pnm"})
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}) | HEIC_SUFFIXES | PNM_SUFFIXES
 UNREAD_SUFFIXES = frozenset({".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raw"})
 """Photos of cameras and phones that are not read."""
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
 
 Pose = tuple[float, ...]
 """World-to-camera, 16 numbers row by row (plain numbers, so that a step's key can hold it)."""

@@ -83,6 +83,22 @@ def empty_folder(root):
     return root
 
 
+@case("scene", "its folder walk/ holds 3 of them, so give that.")
+def folder_of_a_folder_of_photos(root):
+    made.photos(root / "walk")
+    (root / "notes").mkdir()
+    return root
+
+
+@case(
+    "scene", "(.bmp .heic .heif .jpeg .jpg .pgm .png .pnm .ppm .tif .tiff .webp) and no capture that is known; give a"
+)
+def folder_of_two_folders_of_photos(root):
+    made.photos(root / "walk")
+    made.photos(root / "talk")
+    return root
+
+
 @case("notes.txt", "is no scene")
 def file_of_another_kind(root):
     (root / "notes.txt").write_text("hello")
@@ -267,6 +283,14 @@ def photo_that_is_a_cut_heic(root):
 @case("10.png", "cut short or damaged")
 def photo_that_is_a_cut_png(root):
     cut(made.nerfstudio(root) / "images" / "10.png")
+    return root
+
+
+@case("10.pgm", "no image that can be read")
+def photo_that_is_a_cut_pgm(root):
+    for name in made.NAMES:
+        made.write(root / f"{name}.pgm", made.photo()[..., 0])
+    cut(root / "10.pgm")
     return root
 
 

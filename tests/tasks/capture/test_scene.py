@@ -47,6 +47,19 @@ def test_photos_may_lie_in_a_folder_images(tmp_path):
     assert open_scene(tmp_path).names == ("2", "10", "11")
 
 
+def test_pgm_and_its_kin_are_photos_unless_they_lie_beside_other_formats(tmp_path):
+    for suffix in ("pgm", "ppm", "pnm"):
+        for i, name in enumerate(made.NAMES):
+            made.write(tmp_path / suffix / f"{name}.{suffix}", made.photo(i)[..., : 1 if suffix == "pgm" else 3])
+        scene = open_scene(tmp_path / suffix)
+        assert (scene.kind, scene.names, scene.skipped) == ("photos", ("2", "10", "11"), ())
+        views = ingest.frames(names=scene.names, photos=made.refs(scene.photos))
+        assert [(view.width, view.height) for view in views] == [(32, 24)] * 3
+    made.photos(tmp_path / "rgbd")
+    made.write(tmp_path / "rgbd/2.depth.pgm", made.depth_image())
+    assert open_scene(tmp_path / "rgbd").names == ("2", "10", "11")
+
+
 def test_scannet_has_metric_poses_and_half_a_pixel_is_added_to_its_centres(tmp_path):
     scene = open_scene(made.scannet(tmp_path))
     assert scene.kind == "scannet" and scene.metric and scene.depth_scale == 0.001
@@ -162,6 +175,9 @@ def test_a_video_is_known_by_its_name_alone(tmp_path):
     (tmp_path / "walk.MP4").write_bytes(b"")
     assert open_scene(tmp_path / "walk.MP4").kind == "video"
     assert open_scene(tmp_path).recording == tmp_path / "walk.MP4"
+    for name in ("walk.mpg", "walk.mpeg"):
+        (tmp_path / name).write_bytes(b"")
+        assert open_scene(tmp_path / name).kind == "video"
 
 
 def test_ready_masks_are_found_beside_any_layout_or_where_they_are_said_to_be(tmp_path):
