@@ -96,7 +96,8 @@ def _loaded(packages: tuple[str, ...], count: int) -> list[str]:
 
     count: of all that are loaded.
     """
-    return [name for name in sys.modules if name.startswith(packages)]
+    # A list first, made at one stroke: other threads load modules meanwhile.
+    return [name for name in list(sys.modules) if name.startswith(packages)]
 
 
 def forget_sources() -> None:

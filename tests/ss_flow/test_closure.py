@@ -7,6 +7,7 @@ import textwrap
 import pytest
 
 from ss_flow import closure
+from ss_flow.sources import read_loaded
 
 
 @pytest.fixture
@@ -263,3 +264,14 @@ def test_the_branches_of_single_dispatch_belong_to_the_function(package):
     assert "probe.maths.twice" in found
     edited = package(step=step.replace("return 3", "return 4"), maths=MATHS)
     assert {name for name in found if found[name] != edited[name]} == {"probe.step.told"}
+
+
+def test_modules_that_another_thread_loads_meanwhile_do_no_harm(monkeypatch):
+    class Name(str):
+        def startswith(self, *packages):
+            monkeypatch.setitem(sys.modules, "loaded_meanwhile", None)
+            return False
+
+    monkeypatch.setitem(sys.modules, Name("asked"), None)
+    assert not read_loaded(("no_such_package",))
+    assert "loaded_meanwhile" in sys.modules
