@@ -20,6 +20,8 @@ from ss_flow.tasks.deliver.compressed import Thumbnail
 from ss_flow.tasks.deliver.output import RUN_FILE
 
 BACKGROUND = 0
+_KNOWN = 8
+"""Instances that a message names; those whose names hold the word come first."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +119,11 @@ class FinishedRun:
                 continue
             entry = by_id.get(word) or by_name.get(word)
             if entry is None:
-                known = ", ".join(f"{entry['id']} ({entry['name']})" for entry in entries[:8])
+                like = sorted(entries, key=lambda entry: word.lower() not in entry["name"].lower())
+                known = ", ".join(f"{entry['id']} ({entry['name']})" for entry in like[:_KNOWN])
+                more = f" and {len(like) - _KNOWN} more (instances.json)" if len(like) > _KNOWN else ""
                 raise InputError(
-                    f"--instance {word!r} is no instance of {self.folder}; there are 0 (background), {known}."
+                    f"--instance {word!r} is no instance of {self.folder}; there are 0 (background), {known}{more}."
                 )
             if not entry["num_gaussians"]:
                 raise InputError(f"instance {entry['id']} ({entry['name']}) of {self.folder} has no Gaussians.")

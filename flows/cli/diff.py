@@ -139,7 +139,9 @@ def _tell(document: dict[str, Any], out: Console) -> None:
     print_table(table, out)
     found = document["instances"]
     if found is None:
-        out.print("objects: not compared; the two results have no view of the same name.")
+        unmasked = [run for run in document["runs"] if not (Path(run) / "masks").is_dir()]
+        why = f"{unmasked[0]} has no masks" if unmasked else "the two results have no view of the same name"
+        out.print(escape(f"objects: not compared; {why}."))
         return
     what = f"mean IoU over {found['views']} views; an object without a partner counts 0"
     out.print(f"objects: agreement {found['agreement']:.3f} ({what})")

@@ -19,6 +19,8 @@ from typing import Any, TextIO
 # before the first of them is imported.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
+# Of a damaged video FFmpeg writes thousands of lines; -8 = none. Read by OpenCV when it opens its first video.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 from ss_flow.cache.errors import Gone, StoreFailure  # noqa: E402
 from ss_flow.errors import ExecutorLost, InputError  # noqa: E402

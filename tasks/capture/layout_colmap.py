@@ -117,15 +117,24 @@ def read_points(path: Path) -> Float32:
 
 
 def _models(root: Path) -> list[Path]:
-    candidates = [root, root / "sparse", *sorted((root / "sparse").glob("*/"), key=lambda p: natural_key(p.name))]
-    return [c for c in candidates if any((c / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))]
+    """The folders that hold models, or parts of one, so that a file that is missing is told."""
+    places = [root / "sparse", root / "colmap" / "sparse"]
+    folders = [f for place in places for f in (place, *sorted(place.glob("*/"), key=lambda p: natural_key(p.name)))]
+    # Of the scene's own folder, images.txt may be any list of its photos.
+    alone = [root] if _holds_any(root, "cameras", "points3D") else []
+    return alone + [folder for folder in folders if _holds_any(folder, "cameras", "images", "points3D")]
+
+
+def _holds_any(folder: Path, *stems: str) -> bool:
+    return any((folder / f"{stem}{suffix}").is_file() for stem in stems for suffix in (".bin", ".txt"))
 
 
 def _read_model(folder: Path) -> tuple[dict[int, Lens], list[_View]]:
-    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    suffix = ".bin" if any((folder / f"{stem}.bin").is_file() for stem in ("cameras", "images")) else ".txt"
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
-    if not images.is_file():
-        raise InputError(f"{images} is missing; a COLMAP model consists of cameras, images and points3D.")
+    for file in (cameras, images):
+        if not file.is_file():
+            raise InputError(f"{file} is missing; a COLMAP model consists of cameras, images and points3D.")
     if suffix == ".bin":
         return _cameras_binary(cameras), _views_binary(images)
     return _cameras_text(cameras), _views_text(images)
@@ -224,13 +233,20 @@ def _views_text(path: Path) -> list[_View]:
 
 def _pose(values: tuple[float, ...] | list[float], path: Path, name: str) -> Pose:
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation_of(np.array(values[:4]))
+    where = f"{path} for {name}"
+    matrix[:3, :3] = rotation_of(np.array(values[:4]), where)
     matrix[:3, 3] = values[4:]
-    return tuple(float(x) for x in check_rigid(matrix, f"{path} for {name}").ravel())
+    return tuple(float(x) for x in check_rigid(matrix, where).ravel())
 
 
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """[3, 3] the rotation of a quaternion w x y z of any length but zero (zero gives NaN)."""
+def rotation_of(quaternion: np.ndarray, where: str) -> np.ndarray:
+    """[3, 3] the rotation of a quaternion w x y z of any length but zero; where one is not finite, NaN.
+
+    where: what to name in a message.
+    Raises InputError when its length is zero.
+    """
+    if not quaternion.any():
+        raise InputError(f"the pose in {where} has a quaternion of length 0; a rotation has one of length 1.")
     with np.errstate(invalid="ignore"):
         w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array(

@@ -64,7 +64,7 @@ def open_nerfstudio(path: Path) -> SceneFiles:
         photos=photos,
         valid=tuple(_listed(root, f.get("mask_path"), path) for f in frames),
         depths=tuple(root / f["depth_file_path"] for f in frames) if with_depth else None,
-        depth_scale=_number(document.get("depth_unit_scale_factor", 1e-3), "depth_unit_scale_factor", path),
+        depth_scale=_depth_scale(document, path),
         lenses=tuple(_lens({**document, **f}, p, path) for f, p in zip(frames, photos, strict=True)),
         poses=poses,
         metric=bool(with_depth),
@@ -107,7 +107,9 @@ def _pose(frame: dict[str, Any], path: Path) -> Pose:
         raise InputError(f"{where} has no transform_matrix of numbers; a 4x4 matrix is expected.") from error
     if matrix.shape != (4, 4):
         raise InputError(f"{where} has a transform_matrix of shape {matrix.shape}; a 4x4 matrix is expected.")
-    return rigid_inverse(matrix @ _OPENGL_TO_OPENCV, where)
+    with np.errstate(invalid="ignore"):  # of an infinite number, which is refused next
+        matrix = matrix @ _OPENGL_TO_OPENCV
+    return rigid_inverse(matrix, where)
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -171,6 +173,19 @@ def _lens(values: dict[str, Any], photo: Path, path: Path) -> Lens:
 
 def _number(value: Any, key: str, path: Path) -> float:
     try:
-        return float(value)
+        number = float(value)
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has `{key}` {value!r}; a number is expected.") from error
+    if not math.isfinite(number):
+        raise InputError(f"{path} has `{key}` {number}; a finite number is expected.")
+    return number
+
+
+def _depth_scale(document: dict[str, Any], path: Path) -> float:
+    scale = _number(document.get("depth_unit_scale_factor", 1e-3), "depth_unit_scale_factor", path)
+    if scale <= 0:
+        raise InputError(
+            f"{path} has `depth_unit_scale_factor` {scale:g}; world units per unit of the depth files are expected, "
+            "above 0."
+        )
+    return scale

@@ -89,10 +89,11 @@ def _pose(words: list[str], path: Path, photo: str) -> tuple[float, ...]:
         raise InputError(
             f"{path} has a line without `tx ty tz qx qy qz qw` after its time, the pose of {photo}."
         ) from error
+    where = f"{path} for {photo}"
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation_of(np.array([qw, qx, qy, qz]))
+    matrix[:3, :3] = rotation_of(np.array([qw, qx, qy, qz]), where)
     matrix[:3, 3] = x, y, z
-    return rigid_inverse(matrix, f"{path} for {photo}")
+    return rigid_inverse(matrix, where)
 
 
 def _lens(root: Path) -> Lens:

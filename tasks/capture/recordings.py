@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from ss_flow.tasks.capture.layout_scannet import read_sens_index
 from ss_flow.tasks.capture.photo_files import inspect
 from ss_flow.tasks.capture.sensor_depth import registered_depth
 from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
+
+_WHOLE = 0.9
+"""The share of the announced frames below which a video is taken to be cut or damaged."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +46,13 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
 
     Sharpness is the variance of the Laplacian at a width of 320 pixels, compared within each stride, since it depends
     on what is seen as much as on blur.
+    Warns where fewer frames can be decoded than the video announces.
     Raises InputError when the video cannot be opened or shows nothing.
     """
     import cv2
 
     where = str(video.path)
-    total = _count_frames(where)
+    total = _count_frames(video.path)
     stride = max(params.stride, -(-total // params.max_frames))
     if 0 < params.stride < stride:
         warn(
@@ -80,19 +85,22 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
     return tuple(kept)
 
 
-def _count_frames(where: str) -> int:
+def _count_frames(video: Path) -> int:
     import cv2
 
-    reader = cv2.VideoCapture(where)
+    reader = cv2.VideoCapture(str(video))
     if not reader.isOpened():
-        raise InputError(f"{where} cannot be opened as a video; an MP4, MOV, AVI, MKV or WebM file is expected.")
-    # The container's own count is often wrong.
+        raise InputError(f"{video} cannot be opened as a video; an MP4, MOV, AVI, MKV, WebM or MPEG file is expected.")
+    # The container's own count is often wrong, too low mostly: only one that is far too high tells of a damage.
+    announced = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     total = 0
     while reader.grab():
         total += 1
     reader.release()
     if total == 0:
-        raise InputError(f"{where} holds no frame that can be decoded; a video with at least one is needed.")
+        raise InputError(f"{video} holds no frame that can be decoded; a video with at least one is needed.")
+    if total < _WHOLE * announced:
+        warn(f"{video.name} announces {announced} frames, but only {total} can be decoded; it may be cut or damaged.")
     return total
 
 

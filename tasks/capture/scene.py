@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from ss_flow.tasks.capture.layout_tum import open_tum
 from ss_flow.tasks.capture.scene_files import (
     HEIC_SUFFIXES,
     PHOTO_SUFFIXES,
+    PNM_SUFFIXES,
     UNREAD_SUFFIXES,
     VIDEO_SUFFIXES,
     SceneFiles,
@@ -143,11 +145,23 @@ def _open_loose(path: Path) -> SceneFiles:
         raise InputError(f"{path} holds {len(recordings)} recordings; give the path of one of them.")
     if recordings:
         return _open_layout(recordings[0])
-    raise InputError(f"{path} holds no photo and no capture that is known; give {ACCEPTED}.")
+    suffixes = " ".join(sorted(PHOTO_SUFFIXES))
+    raise InputError(f"{path} holds no photo ({suffixes}) and no capture that is known; {_what_to_give(path)}.")
+
+
+def _what_to_give(path: Path) -> str:
+    """What to give in the place of a folder without a photo: its only folder that has some, or any capture."""
+    within = [(folder, photos) for folder in sorted(path.glob("*/")) if (photos := files_in(folder))]
+    if len(within) == 1:
+        folder, photos = within[0]
+        return f"its folder {folder.name}/ holds {len(photos)} of them, so give that"
+    return f"give {ACCEPTED}"
 
 
 def _one_of_each(photos: list[Path]) -> list[Path]:
-    """Photos without those in HEIC that lie beside a copy in another format, as phones export them."""
+    """Photos without those in HEIC that lie beside a copy in another format, as phones export them, and without PGM and
+    its kin beside other formats: there they hold depth, as in recordings of RGB-D cameras."""
+    photos = [photo for photo in photos if photo.suffix.lower() not in PNM_SUFFIXES] or photos
     copied = {photo.stem for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES}
     return [photo for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES or photo.stem not in copied]
 
@@ -155,18 +169,28 @@ def _one_of_each(photos: list[Path]) -> list[Path]:
 def _check_files(scene: SceneFiles) -> None:
     if scene.photos:
         by_name(scene.names, scene.photos)
-    # One listing a folder is far cheaper than asking for each file.
-    listings: dict[Path, set[str]] = {}
-    listed: list[Path | None] = [*scene.photos, *(scene.depths or ())]
+    listed = [*scene.photos, *(scene.depths or ())]
+    _check_exist(listed)
     for file in listed:
-        if file is None:
-            continue
-        if file.parent not in listings:
-            listings[file.parent] = {p.name for p in file.parent.iterdir()} if file.parent.is_dir() else set()
-        if file.name not in listings[file.parent]:
-            raise InputError(f"{file}, which the scene lists, does not exist; put it there or drop the view.")
         if file.suffix.lower() not in PHOTO_SUFFIXES:
             raise InputError(f"{file} is no image file by its name; JPEG, PNG or HEIC is expected.")
+
+
+def _check_exist(files: Sequence[Path]) -> None:
+    # One listing a folder is far cheaper than asking for each file.
+    listings = {folder: _names_of_files(folder) for folder in {file.parent for file in files}}
+    for file in files:
+        if file.name in listings[file.parent]:
+            continue
+        if file.is_symlink():
+            raise InputError(
+                f"{file} links to {file.readlink()}, which is no file; put it there or take the link away."
+            )
+        raise InputError(f"{file}, which the scene lists, does not exist; put it there or drop the view.")
+
+
+def _names_of_files(folder: Path) -> set[str]:
+    return {entry.name for entry in os.scandir(folder) if entry.is_file()} if folder.is_dir() else set()
 
 
 def _some_by_name(folder: Path, names: Sequence[str]) -> tuple[Path | None, ...]:
@@ -174,6 +198,7 @@ def _some_by_name(folder: Path, names: Sequence[str]) -> tuple[Path | None, ...]
     # As `view_names` has it where photos lie in several folders.
     found = by_name(["_".join([*file.parent.relative_to(folder).parts, file.stem]) for file in files], files)
     matched = tuple(found.get(name) for name in names)
+    _check_exist([file for file in matched if file is not None])
     if not any(matched):
         raise InputError(f"{folder} holds no image named after a view; {names[0]}.png, for one, is expected.")
     return matched

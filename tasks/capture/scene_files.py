@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -19,10 +20,11 @@ from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.lens import Lens
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}) | HEIC_SUFFIXES
+PNM_SUFFIXES = frozenset({".pgm", ".ppm", ".pnm"})
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}) | HEIC_SUFFIXES | PNM_SUFFIXES
 UNREAD_SUFFIXES = frozenset({".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raw"})
 """Photos of cameras and phones that are not read."""
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
 
 Pose = tuple[float, ...]
 """World-to-camera, 16 numbers row by row (plain numbers, so that a step's key can hold it)."""
@@ -176,7 +178,8 @@ def files_in(folder: Path, suffixes: frozenset[str] = PHOTO_SUFFIXES) -> list[Pa
     """The files of a folder that carry one of these suffixes, naturally sorted; hidden files do not count."""
     if not folder.is_dir():
         return []
-    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    named = [folder / entry.name for entry in os.scandir(folder) if not entry.is_dir()]
+    found = [p for p in named if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     return sorted(found, key=lambda p: (natural_key(p.name), p.name))
 
 

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.running import progress
+from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame
+from ss_flow.tasks.capture.ingest import first_of
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
 from ss_flow.tasks.geometry.images import decode_valid, pixels_under
@@ -30,11 +31,13 @@ def depth(
 
     files: one-channel images, 16 bit in units of `scale` world units, or 32-bit floats in world units.
     depth_lens: the depth camera, where it is not the colour camera at another resolution; same centre and axes.
-    Pixels that the frame's valid mask leaves out, and those that are not finite, become unknown (0).
+    Pixels that the frame's valid mask leaves out, and those that are not finite, become unknown (0). Warns of views
+    without a known pixel.
     Raises InputError when a file is damaged, not depth, or implausible for a metric scene.
     """
     row = {name: i for i, name in enumerate(names)}
     result = []
+    measured = False
     for i, frame in enumerate(frames):
         ref = files[row[frame.name]]
         lens = lenses[row[frame.name]] if lenses else None
@@ -44,9 +47,10 @@ def depth(
                 f"{ref.path} holds {raw.dtype} pixels; depth of 16 bits a pixel (or 32-bit floats) is expected."
             )
         values = raw.astype(np.float32) * np.float32(scale if raw.dtype == np.uint16 else 1.0)
+        measured = measured or bool((np.isfinite(values) & (values > 0)).any())
         result.append(registered_depth(frame, values, str(ref.path), metric, lens, depth_lens))
         progress(i + 1, len(frames), frame.name)
-    _check_not_all_empty(result, str(files[0].path.parent))
+    _check_known(result, measured, str(files[0].path.parent))
     return tuple(result)
 
 
@@ -98,11 +102,22 @@ def _same_camera(depth_lens: Lens, color: Lens, width: int, height: int) -> bool
     return bool(np.abs(np.subtract(_focal_and_center(depth_lens), _focal_and_center(scaled))).max() < 0.1)
 
 
-def _check_not_all_empty(maps: Sequence[DepthMap], where: str) -> None:
-    if maps and not any(m.depth.any() for m in maps):
+def _check_known(maps: Sequence[DepthMap], measured: bool, where: str) -> None:
+    """measured: whether any file has a known pixel, be it one that a valid mask leaves out."""
+    empty = [m.name for m in maps if not m.depth.any()]
+    if not empty:
+        return
+    if len(empty) == len(maps) and measured:
+        raise InputError(
+            f"the depth maps in {where} have no known pixel that counts: the valid masks (0 = ignored) leave out every "
+            "one, or none lies in the photo; give masks that are 0 only where a pixel is to be ignored."
+        )
+    if len(empty) == len(maps):
         raise InputError(
             f"the depth maps in {where} are 0 everywhere; leave depth out, or give maps with known pixels."
         )
+    views = "1 view has" if len(empty) == 1 else f"{len(empty)} views have"
+    warn(f"{views} no known depth, 0 everywhere or where the valid mask is not 0: {first_of(empty)}.")
 
 
 def resampled(image: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,11 +12,16 @@ from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
 from ss_flow.tasks.geometry.cameras import cameras_by_view
 from ss_flow.tasks.geometry.images import encode_png, suffix_of
 
+_PINHOLE = 1
+"""COLMAP's number of the camera model."""
+_NONE = struct.pack("<Q", 0)
+"""A list without entries, in COLMAP's binary files."""
+
 
 def write_undistorted(folder: Path, frames: Sequence[Frame], cameras: Cameras, maps: Sequence[LabelMap]) -> None:
     """Write a COLMAP workspace of pinhole cameras, and what belongs to its photos.
 
-    `images/` holds the frames' photos as they are, `sparse/0/` the cameras in text form, with the sparse points that
+    `images/` holds the frames' photos as they are, `sparse/0/` the cameras in binary form, with the sparse points that
     came with the capture; `valid/` is 0 where a pixel is to be ignored, for the frames that have such pixels; `masks/`
     holds the instance ids of `maps` (uint16), in the pixels of `images/`.
     """
@@ -50,25 +56,23 @@ def write_nerfstudio(folder: Path, frames: Sequence[Frame], cameras: Cameras) ->
 
 
 def _write_model(folder: Path, files: Sequence[str], cameras: Cameras) -> None:
+    """In binary form: in that of text, COLMAP ends a photo's name at its first blank."""
     from scipy.spatial.transform import Rotation
 
-    lenses: dict[str, int] = {}
+    lenses: dict[bytes, int] = {}
     images = []
     quaternions = Rotation.from_matrix(cameras.world_to_camera[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     shifts = cameras.world_to_camera[:, :3, 3]
     for k, file in enumerate(files):
-        lens = _words("PINHOLE", *cameras.sizes[k].tolist(), *cameras.intrinsics[k].tolist())
+        lens = struct.pack("<iQQ4d", _PINHOLE, *cameras.sizes[k].tolist(), *cameras.intrinsics[k].tolist())
         number = lenses.setdefault(lens, len(lenses) + 1)
-        images.append(_words(k + 1, *quaternions[k].tolist(), *shifts[k].tolist(), number, file) + "\n")
-    points = [_words(i + 1, *point, 128, 128, 128, 0) for i, point in enumerate(cameras.sparse_points.tolist())]
-    for name, heading, lines in (
-        ("cameras", "CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", [_words(n, lens) for lens, n in lenses.items()]),
-        ("images", "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then an empty line", images),
-        ("points3D", "POINT3D_ID X Y Z R G B ERROR; colours and errors are not known", points),
+        placed = struct.pack("<I7dI", k + 1, *quaternions[k], *shifts[k], number)
+        images.append(placed + file.encode() + b"\0" + _NONE)
+    grey = struct.pack("<3Bd", 128, 128, 128, 0.0) + _NONE  # neither colours nor errors nor who sees a point are known
+    points = [struct.pack("<Q3d", i + 1, *point) + grey for i, point in enumerate(cameras.sparse_points.tolist())]
+    for name, entries in (
+        ("cameras", [struct.pack("<I", number) + lens for lens, number in lenses.items()]),
+        ("images", images),
+        ("points3D", points),
     ):
-        text = "".join(f"{line}\n" for line in (f"# {heading}", *lines))
-        (folder / f"{name}.txt").write_text(text, encoding="utf-8")
-
-
-def _words(*values: object) -> str:
-    return " ".join(map(str, values))
+        (folder / f"{name}.bin").write_bytes(struct.pack("<Q", len(entries)) + b"".join(entries))

@@ -56,6 +56,14 @@ def test_results_without_a_view_in_common_are_compared_without_objects(tiny, tmp
     assert "no view of the same name" in ss_flow("diff", tiny.out, other).out
 
 
+def test_a_result_without_masks_as_an_edited_one_is_said_to_have_none(tiny, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(tiny.out, other)
+    shutil.rmtree(other / "masks")
+    told = ss_flow("diff", tiny.out, other)
+    assert told.code == 0 and f"objects: not compared; {other} has no masks." in told.out.replace("\n", " ")
+
+
 def test_bad_input_gets_one_sentence(tiny, tmp_path):
     answer = ss_flow("diff", tiny.out, tmp_path)
     assert answer.code == 2 and "not the output folder of a run" in answer.err

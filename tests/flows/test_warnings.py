@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import html
 import json
+import os
 import shutil
+import subprocess
+import sys
 
+import capture_folders as made
 import cv2
 import numpy as np
 import pytest
@@ -62,3 +66,13 @@ def test_a_run_without_weights_says_in_one_line_what_it_is_worth_and_what_would_
 def test_no_table_is_headed_that_has_no_rows(room, tmp_path):
     told = ss_flow("run", room, "--until", "cameras", "--cache", tmp_path / "store")
     assert told.code == 0 and "measured against" not in told.out
+
+
+def test_a_damaged_video_brings_no_lines_of_ffmpeg_to_the_terminal(tmp_path):
+    video = made.video(tmp_path / "a.avi")
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    code = f"import cv2; reader = cv2.VideoCapture({str(video)!r})\nwhile reader.grab(): pass"
+    environment = {name: value for name, value in os.environ.items() if name != "OPENCV_FFMPEG_LOGLEVEL"}
+    for start, silent in (("", False), ("import ss_flow.flows.cli.main\n", True)):
+        ended = subprocess.run([sys.executable, "-c", start + code], capture_output=True, text=True, env=environment)
+        assert ended.returncode == 0 and (ended.stderr == "") == silent

@@ -83,6 +83,22 @@ def empty_folder(root):
     return root
 
 
+@case("scene", "its folder walk/ holds 3 of them, so give that.")
+def folder_of_a_folder_of_photos(root):
+    made.photos(root / "walk")
+    (root / "notes").mkdir()
+    return root
+
+
+@case(
+    "scene", "(.bmp .heic .heif .jpeg .jpg .pgm .png .pnm .ppm .tif .tiff .webp) and no capture that is known; give a"
+)
+def folder_of_two_folders_of_photos(root):
+    made.photos(root / "walk")
+    made.photos(root / "talk")
+    return root
+
+
 @case("notes.txt", "is no scene")
 def file_of_another_kind(root):
     (root / "notes.txt").write_text("hello")
@@ -174,6 +190,23 @@ def two_photos_of_one_stem(root):
     return root
 
 
+@case("10.jpg", "links to /nowhere/10.jpg, which is no file")
+def photo_that_is_a_dead_link(root):
+    (made.photos(root) / "10.jpg").unlink()
+    (root / "10.jpg").symlink_to("/nowhere/10.jpg")
+    return root
+
+
+@case("10.png", "links to away.png, which is no file")
+def ready_mask_that_is_a_dead_link(root):
+    made.photos(root)
+    for name in made.NAMES:
+        made.write(root / "instance_masks" / f"{name}.png", np.zeros((24, 32), np.uint16))
+    (root / "instance_masks" / "10.png").unlink()
+    (root / "instance_masks" / "10.png").symlink_to("away.png")
+    return root
+
+
 @case("transforms.json", "not valid JSON")
 def transforms_that_is_no_json(root):
     (made.nerfstudio(root) / "transforms.json").write_text("{")
@@ -253,6 +286,14 @@ def photo_that_is_a_cut_png(root):
     return root
 
 
+@case("10.pgm", "no image that can be read")
+def photo_that_is_a_cut_pgm(root):
+    for name in made.NAMES:
+        made.write(root / f"{name}.pgm", made.photo()[..., 0])
+    cut(root / "10.pgm")
+    return root
+
+
 @case("10.jpg", "no image that can be read")
 def photo_that_is_text(root):
     (made.photos(root) / "10.jpg").write_text("hello")
@@ -296,6 +337,34 @@ def depth_without_a_known_pixel(root):
     for name in made.NAMES:
         made.write(root / "depth" / f"{name}.png", made.depth_image(0))
     return root
+
+
+@case("depth", "the valid masks (0 = ignored) leave out every one")
+def valid_masks_that_leave_out_everything(root):
+    made.scannet(root)
+    for name in made.NAMES:
+        made.write(root / "valid" / f"{name}.png", np.zeros((24, 32), np.uint8))
+    return root
+
+
+@case("transforms.json", "`depth_unit_scale_factor` -0.001; world units per unit")
+def depth_in_a_negative_unit(root):
+    return made.nerfstudio(root, depth_unit_scale_factor=-0.001)
+
+
+@case("transforms.json", "`depth_unit_scale_factor` 0; world units per unit")
+def depth_in_no_unit(root):
+    return made.nerfstudio(root, depth_unit_scale_factor=0)
+
+
+@case("transforms.json", "`depth_unit_scale_factor` inf; a finite number is expected")
+def depth_in_an_endless_unit(root):
+    return made.nerfstudio(root, depth_unit_scale_factor=np.inf)
+
+
+@case("transforms.json", "`w` nan; a finite number is expected")
+def transforms_of_a_width_that_is_no_number(root):
+    return made.nerfstudio(root, w=np.nan)
 
 
 @case("2.png", "median depth of 2000 m")
@@ -377,6 +446,19 @@ def colmap_images_missing(root):
     return root
 
 
+@case("cameras.bin", "is missing")
+def colmap_cameras_missing(root):
+    (made.colmap(root) / "sparse" / "1" / "cameras.bin").unlink()
+    return root
+
+
+@case("cameras.txt", "is missing")
+def colmap_points_alone(root):
+    made.write(root / "images" / "1.png", made.photo())
+    (root / "points3D.txt").write_text("")
+    return root
+
+
 @case("cameras.bin", "has a camera of model EUCM; undistort the images first")
 def colmap_lens_of_a_newer_version(root):
     made.colmap(root, binary=True)
@@ -423,6 +505,15 @@ def tum_with_a_short_pose(root):
     return root
 
 
+@case("groundtruth.txt for rgb/10.png", "has a quaternion of length 0")
+def tum_with_a_quaternion_of_zeros(root):
+    track = made.tum(root) / "groundtruth.txt"
+    lines = track.read_text().splitlines()
+    lines[2] = "101.005 1 0.5 -1 0 0 0 0"
+    track.write_text("\n".join(lines))
+    return root
+
+
 @case("camera.txt", "four numbers")
 def tum_with_bad_intrinsics(root):
     (made.tum(root) / "camera.txt").write_text("525 525")
@@ -460,6 +551,13 @@ def test_the_captures_that_the_cases_spoil_are_sound(make, tmp_path):
     if make is made.tum:
         (tmp_path / "camera.txt").write_text("30 30 15.5 11.5")
     read_all(make(tmp_path))
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_infinite_pose_is_refused_without_a_warning_before(tmp_path):
+    edit_json(made.nerfstudio(tmp_path), lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(3, np.inf))
+    with pytest.raises(InputError, match=r"transforms\.json for images/10\.png holds NaN or infinite numbers"):
+        open_scene(tmp_path)
 
 
 def test_opencv_alone_would_read_a_cut_jpeg(tmp_path):

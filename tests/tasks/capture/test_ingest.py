@@ -1,3 +1,4 @@
+import re
 import struct
 import zlib
 from dataclasses import replace
@@ -215,6 +216,17 @@ def test_depth_is_in_metres_and_unknown_where_the_photo_is_ignored(tmp_path):
     np.testing.assert_allclose(maps[0].depth, np.full((12, 16), 1.0))
     np.testing.assert_allclose(maps[1].depth[:, 4:], 1.001)
     assert not maps[1].depth[:, :4].any()
+
+
+def test_views_without_a_known_depth_are_warned_of_by_name(tmp_path):
+    made.scannet(tmp_path)
+    made.write(tmp_path / "depth" / "2.png", made.depth_image(0, 16, 12))
+    made.write(tmp_path / "valid" / "11.png", np.zeros((24, 32), np.uint8))
+    scene = open_scene(tmp_path)
+    said = "2 views have no known depth, 0 everywhere or where the valid mask is not 0: 2, 11."
+    with pytest.warns(UserWarning, match=re.escape(said)):
+        maps = read_depth(scene, ingested(scene))
+    assert [bool(m.depth.any()) for m in maps] == [False, True, False]
 
 
 def test_depth_of_another_camera_is_registered_to_the_photo():

@@ -1,3 +1,5 @@
+import warnings
+
 import capture_folders as made
 import cv2
 import numpy as np
@@ -36,6 +38,28 @@ def test_a_stride_that_gives_too_many_frames_is_widened_over_the_whole_video_wit
     with pytest.warns(UserWarning, match="One frame out of 4 is taken instead of one out of 2, since no more than 10"):
         frames = video_frames(video=video, params=VideoParams(max_frames=10, stride=2, candidates=4))
     assert [f.name for f in frames] == [f"frame-{i:06d}" for i in range(1, 40, 4)]
+
+
+def test_a_video_that_was_cut_is_read_as_far_as_it_goes_with_a_warning(tmp_path):
+    video = made.video(tmp_path / "a.avi")
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    with pytest.warns(UserWarning, match=r"a\.avi announces 40 frames, but only (\d+) can be decoded; it may be cut"):
+        frames = video_frames(video=ref(video), params=VideoParams(min_sharpness=0))
+    assert 10 < len(frames) < 30
+
+
+@pytest.mark.parametrize("announced", [0, 1, 44])
+def test_a_video_that_announces_too_few_frames_or_some_too_many_is_taken_as_whole(tmp_path, announced):
+    video = made.video(tmp_path / "a.avi")
+    data = bytearray(video.read_bytes())
+    for header, place in ((b"avih", 24), (b"strh", 40)):  # where the two count their frames, from their names on
+        at = data.index(header) + place
+        assert data[at : at + 4] == (40).to_bytes(4, "little")
+        data[at : at + 4] = announced.to_bytes(4, "little")
+    video.write_bytes(data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(video_frames(video=ref(video), params=VideoParams(min_sharpness=0))) == 40
 
 
 def test_a_sens_file_gives_its_photos_and_depth_by_entry(tmp_path):

@@ -36,9 +36,30 @@ def test_a_folder_of_photos_is_sorted_as_people_count(tmp_path):
     assert scene.valid == (None, None, None)
 
 
+def test_a_folder_named_like_a_photo_is_none_and_links_to_photos_are(tmp_path):
+    made.photos(tmp_path / "away")
+    (tmp_path / "scene/album.jpg").mkdir(parents=True)
+    for name in made.NAMES:
+        (tmp_path / f"scene/{name}.jpg").symlink_to(tmp_path / f"away/{name}.jpg")
+    assert open_scene(tmp_path / "scene").names == ("2", "10", "11")
+
+
 def test_photos_may_lie_in_a_folder_images(tmp_path):
     made.photos(tmp_path / "images")
     assert open_scene(tmp_path).names == ("2", "10", "11")
+
+
+def test_pgm_and_its_kin_are_photos_unless_they_lie_beside_other_formats(tmp_path):
+    for suffix in ("pgm", "ppm", "pnm"):
+        for i, name in enumerate(made.NAMES):
+            made.write(tmp_path / suffix / f"{name}.{suffix}", made.photo(i)[..., : 1 if suffix == "pgm" else 3])
+        scene = open_scene(tmp_path / suffix)
+        assert (scene.kind, scene.names, scene.skipped) == ("photos", ("2", "10", "11"), ())
+        views = ingest.frames(names=scene.names, photos=made.refs(scene.photos))
+        assert [(view.width, view.height) for view in views] == [(32, 24)] * 3
+    made.photos(tmp_path / "rgbd")
+    made.write(tmp_path / "rgbd/2.depth.pgm", made.depth_image())
+    assert open_scene(tmp_path / "rgbd").names == ("2", "10", "11")
 
 
 def test_scannet_has_metric_poses_and_half_a_pixel_is_added_to_its_centres(tmp_path):
@@ -91,6 +112,20 @@ def test_photos_that_a_colmap_model_lacks_or_that_are_not_read_are_skipped(tmp_p
     loose = made.photos(tmp_path / "loose")
     (next(loose.rglob("2.*")).parent / "IMG_3.DNG").write_bytes(b"")
     assert open_scene(loose).skipped == ("IMG_3.DNG",)
+
+
+def test_a_colmap_model_may_lie_in_a_folder_colmap_as_nerfstudio_leaves_it(tmp_path):
+    made.colmap(tmp_path)
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "sparse").rename(tmp_path / "colmap" / "sparse")
+    scene = open_scene(tmp_path)
+    assert scene.kind == "colmap" and scene.names == ("2", "10", "11")
+    assert_cameras(scene)
+
+
+def test_a_list_of_photos_named_images_txt_makes_no_colmap_model(tmp_path):
+    (made.photos(tmp_path) / "images.txt").write_text("2.jpg\n10.jpg\n")
+    assert open_scene(tmp_path).kind == "photos"
 
 
 def test_a_colmap_model_that_pycolmap_wrote_reads_the_same(tmp_path):
@@ -159,6 +194,9 @@ def test_a_video_is_known_by_its_name_alone(tmp_path):
     (tmp_path / "walk.MP4").write_bytes(b"")
     assert open_scene(tmp_path / "walk.MP4").kind == "video"
     assert open_scene(tmp_path).recording == tmp_path / "walk.MP4"
+    for name in ("walk.mpg", "walk.mpeg"):
+        (tmp_path / name).write_bytes(b"")
+        assert open_scene(tmp_path / name).kind == "video"
 
 
 def test_ready_masks_are_found_beside_any_layout_or_where_they_are_said_to_be(tmp_path):
