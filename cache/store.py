@@ -17,8 +17,9 @@ and is never read. The action comes after all of its objects.
 *Power cut, failing disk, foreign hands.* Nothing is synced; everything is checked when it is read: an object whose
 content is not what its name says is taken out, and its maker runs again.
 
-*Another version.* An object whose type has got or lost fields since is whole: it stays, and OtherVersion is raised. No
-key of this version leads to it, since the definitions of types are code that keys depend on.
+*Another version.* An object whose type has got or lost fields since, or is not to be found here, is whole: it stays,
+and OtherVersion is raised. No key of this version leads to it, since the definitions of types are code that keys depend
+on.
 
 *Concurrent writers.* Two processes that write the same object write the same bytes; the loser of the rename discards
 its copy. Readers never lock.
@@ -44,7 +45,7 @@ from typing import Any
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
-from ss_flow.cache.errors import Gone, OtherVersion, writing
+from ss_flow.cache.errors import Gone, OtherVersion, reading, writing
 from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder
 from ss_flow.cache.plain_json import reader
 from ss_flow.cache.recent import Recent
@@ -145,9 +146,9 @@ class Store:
         """
         object_digest = digest(value)
         target = self.object_path(object_digest)
-        if target.is_dir() and not codec.is_current(target):
-            self._take_out(target, math.inf)
         with writing(self.root):
+            if target.is_dir() and not codec.is_current(target):
+                self._take_out(target, math.inf)
             try:
                 os.utime(target)  # used again: it must not be collected before its action is recorded
             except FileNotFoundError:
@@ -161,7 +162,8 @@ class Store:
         """The stored value. Shared between callers: its arrays are read-only.
 
         Raises Gone when the store holds no such object, or one that is damaged, which is then taken out; OtherVersion
-        when its type has other fields by now.
+        when its type has other fields by now, or is not to be found here; StoreFailure, or MemoryError, when it cannot
+        be read now.
         """
         value = self._recent.get(object_digest)
         if value is None:
@@ -180,12 +182,23 @@ class Store:
         if object_digest not in self:
             raise Gone(object_digest, "is not in the store")
         try:
-            return verified(self.object_path(object_digest), object_digest)
-        except codec.OtherFields as error:
-            raise OtherVersion(object_digest, str(error)) from None
+            return self._verified(self.object_path(object_digest), object_digest)
         except ValueError as error:
             self.discard(object_digest)
             raise Gone(object_digest, f"was damaged ({error})") from None
+
+    def _verified(self, folder: Path, object_digest: str) -> Any:
+        """The object in a folder. Raises ValueError when it is damaged, and else as `get`."""
+        with reading(self.root):
+            try:
+                value = codec.read(folder)
+            except codec.OtherFields as error:
+                if codec.digest_as_stored(folder) == object_digest:
+                    raise OtherVersion(object_digest, str(error)) from None
+                raise
+        if digest(value) != object_digest:
+            raise ValueError("its content is not what its name says")
+        return value
 
     def _with_its_step(self, found: OtherVersion) -> OtherVersion:
         """The same, naming the step that made the object, where one is recorded; reads every record."""
@@ -340,19 +353,3 @@ def _records(folder: str) -> Iterator[Entry]:
 def _is_sound(action: Action) -> bool:
     """Whether the outputs are digests, which lead nowhere out of the store, and one where one is due."""
     return all(map(DIGEST.fullmatch, action.outputs)) and (action.is_list or len(action.outputs) == 1)
-
-
-def verified(folder: Path, object_digest: str) -> Any:
-    """The object in a folder.
-
-    Raises ValueError when it is damaged, OtherFields when it is whole but its type has other fields by now.
-    """
-    try:
-        value = codec.read(folder)
-    except codec.OtherFields as error:
-        if codec.digest_as_stored(folder) == object_digest:
-            raise
-        raise ValueError(f"{folder}: damaged; {error}") from None
-    if digest(value) != object_digest:
-        raise ValueError("its content is not what its name says")
-    return value

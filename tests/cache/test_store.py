@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import shutil
+import sys
 import time
 
 import numpy as np
@@ -233,6 +235,50 @@ def test_an_object_whose_type_has_other_fields_by_now_stays_and_is_not_called_da
         assert verify(store).damaged == ()
         assert len(walks) == 1  # not once for each such object
     assert Store(store.root).get(output).name == "x"
+
+
+@pytest.mark.parametrize("missing", ["module", "class"])
+def test_an_object_whose_type_is_not_to_be_found_here_stays_and_is_not_called_damaged(store, monkeypatch, missing):
+    output = store.put(toy.number(2.0))
+    with monkeypatch.context() as patch:
+        if missing == "module":
+            patch.setitem(sys.modules, "ss_flow_toy", None)
+        else:
+            patch.delattr(toy, "Number")
+        with pytest.raises(OtherVersion, match="there is no type ss_flow_toy:Number here") as told:
+            Store(store.root).get(output)
+        assert "damaged" not in str(told.value)
+        assert verify(store).damaged == ()
+        chunk = store.object_path(output) / "value/c.0"
+        whole = chunk.read_bytes()
+        chunk.write_bytes(whole[::-1])
+        assert [damage.name for damage in verify(Store(store.root)).damaged] == [output]
+    assert store.get(store.put(toy.number(2.0))).value[0] == 2.0
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EACCES, errno.EIO, errno.ENOMEM])
+def test_an_object_that_cannot_be_read_now_stays_and_the_store_says_why_in_one_sentence(store, monkeypatch, number):
+    value = LabelMap("x", np.eye(3, dtype=np.uint16))
+    output = store.put(value)
+    refused = OSError(number, os.strerror(number))
+    for trouble in ("open", "lstat"):
+        with monkeypatch.context() as patch:
+            place, name = (codec, "open") if trouble == "open" else (codec.os, "lstat")
+            patch.setattr(place, name, lambda *_: (_ for _ in ()).throw(refused), raising=False)
+            for ask in (Store(store.root).get, lambda _: store.put(value), lambda _: verify(store)):
+                with pytest.raises(StoreFailure, match=os.strerror(number)):
+                    ask(output)
+    assert Store(store.root).get(output).ids.trace() == 3
+
+
+def test_an_object_that_memory_is_too_short_for_stays(store, monkeypatch):
+    output = store.put(LabelMap("x", np.zeros((400, 500), np.uint16)))
+    for name in ("_read_chunks", "_read_file"):
+        with monkeypatch.context() as patch:
+            patch.setattr(codec, name, lambda *_: (_ for _ in ()).throw(MemoryError))
+            with pytest.raises(MemoryError):
+                Store(store.root).get(output)
+    assert Store(store.root).get(output).ids.shape == (400, 500)
 
 
 def test_an_object_that_lost_a_field_on_the_disk_is_damaged(store):
