@@ -37,7 +37,7 @@ import re
 import socket
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -268,9 +268,15 @@ class Store:
             return None
         if time.time() - modified > GRACE_SECONDS / 4:
             with contextlib.suppress(OSError):
-                for used in (self.action_path(key), *map(self.object_path, action.outputs)):
-                    os.utime(used)
+                os.utime(path)
+                self.use(action.outputs)
         return action
+
+    def use(self, digests: Iterable[str]) -> None:
+        """Count objects as used now, so that they are not collected for a while."""
+        for name in digests:
+            with contextlib.suppress(OSError):
+                os.utime(self.object_path(name))
 
     def record(self, action: Action) -> None:
         """Publish an action; its outputs must be stored already."""

@@ -63,6 +63,10 @@ class Run:
         """The events of the nodes that have a result."""
         return [event for event in settled(self.events()) if event["event"] in DONE]
 
+    def taken(self) -> set[str]:
+        """The digests of the results of other runs that it uses."""
+        return {digest for event in self.events() if event["event"] == "taken" for digest in event["outputs"]}
+
     def graph(self) -> nx.MultiDiGraph[str]:
         """The steps that have results: `count` of each, and an edge for each input, by its name, from what makes it.
 

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import ss_flow_toy as toy
+from aged_store import age_all
 
 from ss_flow import engine
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
 from ss_flow.explain import first_difference
-from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick
+from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick, stored
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
@@ -460,6 +461,20 @@ def test_a_cut_last_line_of_the_event_log_is_left_out(store):
     with (latest.folder / "events.jsonl").open("a") as stream:
         stream.write('{"event": "fini')
     assert len(latest.nodes()) == 8
+
+
+def test_a_result_that_is_taken_from_another_run_counts_as_used_and_is_in_the_record_of_the_run(store):
+    digests = run(store, toy.flow).values["squares"]
+    age_all(store.root)
+
+    def build():
+        return {"total": toy.total(stored("earlier", digests)), "first": toy.square(stored("one", digests[0]))}
+
+    run(store, build)
+    (made, *_) = latest_runs(store.runs, "toy")
+    assert made.taken() == set(digests)
+    used = {entry.name: entry.used for entry in store.objects()}
+    assert all(time.time() - used[name] < 600 for name in digests)
 
 
 def test_a_result_gone_from_the_store_is_computed_again(store):
