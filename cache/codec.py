@@ -8,6 +8,7 @@ stored can hold.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import itertools
@@ -15,6 +16,8 @@ import json
 import math
 import os
 import stat
+import sys
+import types
 import typing
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -54,14 +57,19 @@ UNFIT = (*NOT_THERE, KeyError, TypeError, AttributeError, RecursionError, Overfl
 def write(value: Any, folder: Path) -> None:
     """Write a dataclass instance as a Zarr group at `folder`, which must not exist.
 
-    Raises TypeError for a value that is not a dataclass, or a field that neither Zarr nor JSON can hold.
+    Raises TypeError for a value that is not a frozen dataclass, for a field that neither Zarr nor JSON can hold, and
+    for one that could not be given back to the type.
     """
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         raise TypeError(f"a task returned {type(value).__name__}; only dataclasses of arrays are stored")
     kind = type(value)
+    if not kind.__dataclass_params__.frozen:
+        raise TypeError(f"{kind.__name__} is not frozen; tasks share what is stored: declare @dataclass(frozen=True)")
     attributes: dict[str, Any] = {}
     arrays: dict[str, np.ndarray] = {}
     for item in dataclasses.fields(value):
+        if not item.init:
+            raise TypeError(f"{kind.__name__}.{item.name} has init=False, so it could not be read back; use a property")
         content = getattr(value, item.name)
         if isinstance(content, np.ndarray):
             if content.dtype.name not in DTYPES:
@@ -140,7 +148,7 @@ def read(folder: Path) -> Any:
         changes = [f"has no field {one} any more" for one in sorted(stored - due)]
         changes += [f"has the new field {one}" for one in sorted(due - stored)]
         raise OtherFields(f"{kind.__name__} {', '.join(changes)}")
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)
     try:
         values = {item.name: _field(folder, item.name, content, hints) for item in dataclasses.fields(kind)}
         return kind(**values)
@@ -297,8 +305,27 @@ def _plain(content: Any, where: str) -> Any:
     raise TypeError(f"{where} holds a {type(content).__name__}, which is neither an array nor plain data")
 
 
+def _hints(kind: type) -> dict[str, Any]:
+    """The declared types of a dataclass's fields, but for those with a name that only type checkers import."""
+    try:
+        return typing.get_type_hints(kind)
+    except NameError:
+        known: dict[str, Any] = {}
+        for item in dataclasses.fields(kind):
+            with contextlib.suppress(NameError):
+                alone = types.SimpleNamespace(__annotations__={item.name: item.type})
+                known |= typing.get_type_hints(alone, vars(sys.modules[kind.__module__]))
+        return known
+
+
 def _restored(content: Any, hint: Any) -> Any:
-    """A field as it was written: lists as the tuples that they are declared to be; nothing else is converted."""
+    """A field as it was written: lists as the tuples that they are declared to be; nothing else is converted.
+
+    Of a union, the first member that is a tuple or a list counts.
+    """
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        among = typing.get_args(hint)
+        hint = next((one for one in among if one is list or typing.get_origin(one) in (tuple, list)), None)
     if typing.get_origin(hint) is not tuple or not isinstance(content, list):
         return content
     inner = typing.get_args(hint)

@@ -30,6 +30,8 @@ its copy. Readers never lock.
 from __future__ import annotations
 
 import contextlib
+import copy
+import dataclasses
 import json
 import math
 import os
@@ -159,7 +161,7 @@ class Store:
         return object_digest
 
     def get(self, object_digest: str) -> Any:
-        """The stored value. Shared between callers: its arrays are read-only.
+        """The stored value. Shared between callers: its arrays are read-only, its lists and tables the caller's own.
 
         Raises Gone when the store holds no such object, or one that is damaged, which is then taken out; OtherVersion
         when its type has other fields by now, or is not to be found here; StoreFailure, or MemoryError, when it cannot
@@ -172,7 +174,7 @@ class Store:
             except OtherVersion as found:
                 raise self._with_its_step(found) from None
             self._recent.keep(object_digest, value)
-        return value
+        return _own(value)
 
     def _load(self, object_digest: str) -> Any:
         return self.read(object_digest)
@@ -346,6 +348,18 @@ class Store:
     def drop_part(self, name: str, *, unused_since: float = math.inf) -> bool:
         """Take a part out; False when it is not there, or was written since."""
         return self._take_out(self._part_path(name), unused_since)
+
+
+def _own(value: Any) -> Any:
+    """The same with lists and tables of its own, which can be changed as nothing else of a frozen dataclass can."""
+    fields = {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}
+    changeable = {name: content for name, content in fields.items() if isinstance(content, dict | list)}
+    if not changeable:
+        return value
+    own = copy.copy(value)
+    for name, content in changeable.items():
+        object.__setattr__(own, name, copy.deepcopy(content))
+    return own
 
 
 def _records(folder: str) -> Iterator[Entry]:

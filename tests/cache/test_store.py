@@ -327,6 +327,21 @@ def test_what_is_stored_comes_back_as_it_was_and_not_as_its_type_declares(store,
             assert repr(getattr(found, name)) == repr(getattr(score, name))
 
 
+@pytest.mark.parametrize("at", [(1, 2), None, ()])
+def test_a_type_that_only_type_checkers_know_is_no_hindrance_and_a_tuple_of_a_union_comes_back_as_one(store, at):
+    found = store.get(store.put(toy.Checked(np.ones(2), at, ("x", 1))))
+    assert (found.at, found.other, found.cells.sum()) == (at, ("x", 1), 2.0)
+
+
+def test_lists_and_tables_belong_to_who_asked_for_them(store):
+    digest = store.put(toy.Table({"a": [1]}, ["a"]))
+    for _ in range(2):
+        found = store.get(digest)
+        assert found == toy.Table({"a": [1]}, ["a"])
+        found.rows["a"].append(2)
+        found.names.clear()
+
+
 def test_the_digest_of_a_file_whose_name_is_no_text_is_remembered(tmp_path):
     file = tmp_path / "a\udcff.jpg"
     file.write_bytes(b"x")

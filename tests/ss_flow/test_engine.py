@@ -477,6 +477,16 @@ def test_a_result_that_is_taken_from_another_run_counts_as_used_and_is_in_the_re
     assert all(time.time() - used[name] < 600 for name in digests)
 
 
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_a_task_that_changes_what_it_is_given_changes_it_for_no_other(store, executor):
+    def build():
+        table = toy.table()
+        return {"count": toy.counted(table, toy.spoilt(table))}
+
+    report = run(store, build, executor=executor)
+    assert store.get(report.values["count"]).value[0] == 11
+
+
 def test_a_result_gone_from_the_store_is_computed_again(store):
     import shutil
 
