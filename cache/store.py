@@ -32,6 +32,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import errno
 import json
 import math
 import os
@@ -56,6 +57,9 @@ MEMORY_BYTES = 2 << 30
 """How much of what was read lately a process keeps in memory."""
 GRACE_SECONDS = 3600.0
 """What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
+
+NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""What keeps a process from opening any file."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ class Store:
     """
 
     def __init__(self, root: Path, *, memory_bytes: int = MEMORY_BYTES) -> None:
-        self.root = root
+        self.root = root = root.absolute()  # a process may change its folder
         self._recent = Recent(memory_bytes)
         self._actions = f"{root}/actions"
         self._objects = f"{root}/objects"
@@ -231,7 +235,7 @@ class Store:
             except FileNotFoundError:
                 return False
             try:
-                if place.stat().st_mtime < unused_since:
+                if place.lstat().st_mtime < unused_since:
                     return True
             except FileNotFoundError:  # old enough that another process has swept it from tmp/
                 return True
@@ -254,13 +258,18 @@ class Store:
     def action(self, key: str, *, whole: bool = True) -> Action | None:
         """The record under a key, or None when there is none; with `whole`, also when one of its outputs is gone.
 
-        A whole one counts as used now.
+        A whole one counts as used now. Raises StoreFailure when this process can read no file at the moment.
         """
         path = f"{self._actions}/{key[:2]}/{key}.json"
         try:
             content, modified = read_stamped(path)
             action = _read_action(content)
-        except (FileNotFoundError, ValueError):  # not there, or not one of ours
+        except ValueError:  # not one of ours
+            return None
+        except OSError as error:  # not there, no file, or not ours to read
+            if error.errno in NO_FILES:
+                with reading(self.root):
+                    raise
             return None
         if action.key != key or not _is_sound(action):
             return None
@@ -322,12 +331,22 @@ class Store:
         with writing(self.root), self.temporary() as place:
             place.write_text(text, encoding="utf-8")
             path.parent.mkdir(exist_ok=True)
-            place.replace(path)
+            try:
+                place.replace(path)
+            except IsADirectoryError:  # a foreign hand's, and no record
+                remove(path)
+                place.replace(path)
 
     def now(self) -> float:
-        """The time by the clock that stamps the store's files, which may be another host's."""
+        """The time by the clock that stamps the store's files, which may be another host's; by this machine's where the
+        store can only be read."""
         with writing(self.root), self.temporary() as place:
-            place.touch()
+            try:
+                place.touch()
+            except OSError as error:
+                if error.errno in (errno.EROFS, errno.EACCES):
+                    return time.time()
+                raise
             return place.stat().st_mtime
 
     def sweep_temporaries(self) -> int:
@@ -366,7 +385,7 @@ def _records(folder: str) -> Iterator[Entry]:
     """The JSON files of a folder."""
     for entry in entries(folder):
         with contextlib.suppress(FileNotFoundError):
-            status = entry.stat()
+            status = entry.stat(follow_symlinks=False)  # which may lead round in a circle
             yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)
 
 

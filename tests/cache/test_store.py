@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import GRACE_SECONDS, Action, Store
+from ss_flow.cache.survey import Survey
 from ss_flow.cache.verify import verify
 from ss_flow.tasks import artifacts
 from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, Metrics, PointCloud
@@ -269,6 +271,46 @@ def test_an_object_that_cannot_be_read_now_stays_and_the_store_says_why_in_one_s
                 with pytest.raises(StoreFailure, match=os.strerror(number)):
                     ask(output)
     assert Store(store.root).get(output).ids.trace() == 3
+
+
+def test_a_store_that_was_named_by_a_relative_path_stays_where_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    store = Store(Path("here"))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert store.put(toy.number(1.0)) in Store(tmp_path / "here")
+
+
+@pytest.mark.parametrize("kind", ["folder", "loop", "unreadable"])
+def test_a_record_that_cannot_be_read_counts_for_nothing_and_is_recorded_again(store, monkeypatch, kind):
+    action = Action("ab" * 32, "step", (store.put(toy.number(1.0)),), False, {}, 1.5, 10.0)
+    store.record(action)
+    path = store.action_path(action.key)
+    if kind == "unreadable":
+        refused = PermissionError(errno.EACCES, "Permission denied")
+        monkeypatch.setattr("ss_flow.cache.store.read_stamped", lambda _: (_ for _ in ()).throw(refused))
+    else:
+        path.unlink()
+        path.mkdir() if kind == "folder" else path.symlink_to(path)
+    assert store.action(action.key) is None
+    assert not Survey.of(store).is_whole(action.key)
+    assert [damage.name for damage in verify(store).damaged] == [action.key]
+    if kind == "folder":
+        path.mkdir()
+    store.record(action)
+    monkeypatch.undo()
+    assert store.action(action.key) == action
+
+
+def test_a_process_that_can_open_no_file_takes_no_record_for_missing(store, monkeypatch):
+    action = Action("ab" * 32, "step", (store.put(toy.number(1.0)),), False, {}, 1.5, 10.0)
+    store.record(action)
+    refused = OSError(errno.EMFILE, "Too many open files")
+    monkeypatch.setattr("ss_flow.cache.store.read_stamped", lambda _: (_ for _ in ()).throw(refused))
+    with pytest.raises(StoreFailure, match="cannot be read: Too many open files"):
+        verify(store)
+    monkeypatch.undo()
+    assert store.action(action.key) == action
 
 
 def test_an_object_that_memory_is_too_short_for_stays(store, monkeypatch):

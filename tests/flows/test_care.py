@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import threading
@@ -140,6 +141,23 @@ def test_a_living_run_keeps_what_it_has_taken_from_another(tmp_path):
     gc(store.root, "--keep-runs", "0", "--max-size", "0")
     assert entries(store.root) == ({node["key"] for node in run.nodes()}, {taken, run.results()["half"][0]})
     claims.release_all()
+
+
+@pytest.mark.parametrize(
+    "command", [("status",), ("cache", "ls"), ("cache", "du"), ("cache", "verify"), ("cache", "gc", "--dry-run")]
+)
+def test_a_store_that_can_only_be_read_can_be_looked_into(tmp_path, monkeypatch, command):
+    store = Store(tmp_path / "store")
+    run_flow(toy.flow, store, scene="toy")
+
+    def refused(path, *_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    for name in ("touch", "unlink", "write_text", "rename", "replace"):
+        monkeypatch.setattr(Path, name, refused)
+    monkeypatch.setattr(os, "access", lambda path, mode, access=os.access: mode != os.W_OK and access(path, mode))
+    called = ss_flow(*command, "--cache", store.root)
+    assert (called.code, called.err) == (0, "")
 
 
 def test_want_of_room_takes_what_was_used_least_recently(warm):

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ import ss_flow_toy as toy
 from aged_store import age_all
 
 from ss_flow import engine
+from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
@@ -453,6 +457,28 @@ def test_the_folder_of_a_run_has_a_name_that_file_systems_take(store, name):
     (found,) = latest_runs(store.runs)
     assert found.scene == f"/scenes/{name}"
     assert name[:30] in found.folder.name and len(found.folder.name.encode()) <= 130
+
+
+@pytest.mark.parametrize(
+    "content", ["{}", "[]", '"scene"', '{"scene": "toy"}', '{"scene": "toy", "started": "x"}', "{"]
+)
+def test_a_run_whose_record_is_damaged_is_passed_over(store, content):
+    first = run(store, toy.flow)
+    folder = store.runs / "damaged"
+    folder.mkdir()
+    (folder / "run.json").write_text(content)
+    assert run(store, toy.flow).values == first.values
+    assert folder not in [one.folder for one in latest_runs(store.runs)]
+
+
+def test_a_store_that_can_only_be_read_ends_the_run_with_one_sentence(store, monkeypatch):
+    run(store, toy.flow)
+    refused = OSError(errno.EROFS, os.strerror(errno.EROFS))
+    monkeypatch.setattr(Path, "touch", lambda *_, **__: (_ for _ in ()).throw(refused))
+    assert set(ran(run(store, toy.flow, recorded=False))) == set()
+    monkeypatch.setattr(engine, "start_run", lambda *_: (_ for _ in ()).throw(refused))
+    with pytest.raises(StoreFailure, match="cannot be written: Read-only file system"):
+        run(store, toy.flow)
 
 
 def test_a_cut_last_line_of_the_event_log_is_left_out(store):
