@@ -63,7 +63,7 @@ def write(value: Any, folder: Path) -> None:
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         raise TypeError(f"a task returned {type(value).__name__}; only dataclasses of arrays are stored")
     kind = type(value)
-    if not kind.__dataclass_params__.frozen:
+    if not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
         raise TypeError(f"{kind.__name__} is not frozen; tasks share what is stored: declare @dataclass(frozen=True)")
     attributes: dict[str, Any] = {}
     arrays: dict[str, np.ndarray] = {}
