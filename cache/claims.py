@@ -238,14 +238,18 @@ class Folder:
             return [name for name in os.listdir(self._folder) if not name.startswith(".")]
 
 
-@functools.cache
 def _this_process() -> dict[str, object]:
     """Which process this is, on which machine: containers may share a host's name, but not its process numbers."""
+    return _process(os.getpid())
+
+
+@functools.cache
+def _process(pid: int) -> dict[str, object]:  # by its number, since a fork copies what is remembered
     parts = [socket.gethostname()]
     with contextlib.suppress(OSError):
         parts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
         parts.append(os.readlink("/proc/self/ns/pid"))
-    return {"host": " ".join(parts), "pid": os.getpid(), "started": _started(os.getpid())}
+    return {"host": " ".join(parts), "pid": pid, "started": _started(pid)}
 
 
 def _started(pid: int) -> float:

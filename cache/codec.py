@@ -8,6 +8,7 @@ stored can hold.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import itertools
@@ -15,6 +16,8 @@ import json
 import math
 import os
 import stat
+import sys
+import types
 import typing
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -42,20 +45,31 @@ DTYPES = frozenset(
 
 
 class OtherFields(ValueError):
-    """What is stored has other fields than its type has now; says which."""
+    """What is stored is of a type that has other fields now, or is not to be found here; says which."""
+
+
+NOT_THERE = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+"""Of what goes wrong when a file is read, that which the object itself is to blame for."""
+UNFIT = (*NOT_THERE, KeyError, TypeError, AttributeError, RecursionError, OverflowError)
+"""What reading raises where the content is not what `write` writes."""
 
 
 def write(value: Any, folder: Path) -> None:
     """Write a dataclass instance as a Zarr group at `folder`, which must not exist.
 
-    Raises TypeError for a value that is not a dataclass, or a field that neither Zarr nor JSON can hold.
+    Raises TypeError for a value that is not a frozen dataclass, for a field that neither Zarr nor JSON can hold, and
+    for one that could not be given back to the type.
     """
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         raise TypeError(f"a task returned {type(value).__name__}; only dataclasses of arrays are stored")
     kind = type(value)
+    if not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        raise TypeError(f"{kind.__name__} is not frozen; tasks share what is stored: declare @dataclass(frozen=True)")
     attributes: dict[str, Any] = {}
     arrays: dict[str, np.ndarray] = {}
     for item in dataclasses.fields(value):
+        if not item.init:
+            raise TypeError(f"{kind.__name__}.{item.name} has init=False, so it could not be read back; use a property")
         content = getattr(value, item.name)
         if isinstance(content, np.ndarray):
             if content.dtype.name not in DTYPES:
@@ -121,8 +135,9 @@ def _write_zarr(array: np.ndarray, folder: Path) -> None:
 def read(folder: Path) -> Any:
     """Read what `write` wrote. Arrays come back read-only, since the store shares them between tasks.
 
-    Raises ValueError when it is damaged, of a type that is not one of this package's dataclasses, or was written by
-    another format; OtherFields when the type has other fields by now, or a folder of an array is missing.
+    Raises ValueError when it is damaged, of a foreign type, or was written by another format; OtherFields when the type
+    is not to be found here or has other fields by now, or a folder of an array is missing; OSError and MemoryError when
+    it cannot be read now, and may be whole.
     """
     form, name, content = _header(folder)
     if form != FORMAT:
@@ -133,24 +148,24 @@ def read(folder: Path) -> Any:
         changes = [f"has no field {one} any more" for one in sorted(stored - due)]
         changes += [f"has the new field {one}" for one in sorted(due - stored)]
         raise OtherFields(f"{kind.__name__} {', '.join(changes)}")
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)
     try:
         values = {item.name: _field(folder, item.name, content, hints) for item in dataclasses.fields(kind)}
         return kind(**values)
-    except (OSError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError) as error:
+    except UNFIT as error:
         raise ValueError(f"{folder}: damaged; {type(error).__name__}: {error}") from None
 
 
 def digest_as_stored(folder: Path) -> str:
     """The digest of an object by the fields that are stored, whatever fields its type has now.
 
-    Raises ValueError when it is damaged.
+    Raises ValueError when it is damaged, OSError and MemoryError when it cannot be read now.
     """
     _, name, content = _header(folder)
     try:
         fields = {one: _field(folder, one, content, {}) for one in _names(folder, content)}
         return digest_of_fields(str(name).replace(":", "."), fields)
-    except (OSError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError) as error:
+    except UNFIT as error:
         raise ValueError(f"{folder}: damaged; {type(error).__name__}: {error}") from None
 
 
@@ -167,7 +182,7 @@ def _header(folder: Path) -> tuple[Any, Any, Any]:
     try:
         header: dict[str, Any] = json.loads(_read_file(folder / "zarr.json", MOST_HEADER_BYTES))["attributes"]
         return header.get("format"), header["type"], header["values"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (*UNFIT, ValueError) as error:
         raise ValueError(f"{folder}: not a stored object ({error})") from None
 
 
@@ -175,7 +190,7 @@ def _names(folder: Path, content: Any) -> set[str]:
     """The fields that are stored."""
     try:
         return {*content, *(entry.name for entry in os.scandir(folder) if entry.is_dir(follow_symlinks=False))}
-    except (OSError, TypeError) as error:
+    except (*NOT_THERE, TypeError) as error:
         raise ValueError(f"{folder}: not a stored object ({error})") from None
 
 
@@ -228,10 +243,13 @@ def _read_chunks(folder: Path, shape: tuple[int, ...], chunk: tuple[int, ...], d
         size = int.from_bytes(packed[4:8], "little")  # Blosc's header: how much memory unpacking takes
         if size != chunk_bytes:
             raise ValueError(f"{folder}: damaged; chunk {number} holds {size} bytes, not {chunk_bytes}")
-        if len(rows) == chunk[0]:
-            blosc.decompress(packed, rows)
-        else:  # the last chunk is as large as the others
-            rows[...] = np.frombuffer(blosc.decompress(packed), content.dtype, rows.size).reshape(rows.shape)
+        try:
+            if len(rows) == chunk[0]:
+                blosc.decompress(packed, rows)
+            else:  # the last chunk is as large as the others
+                rows[...] = np.frombuffer(blosc.decompress(packed), content.dtype, rows.size).reshape(rows.shape)
+        except RuntimeError as error:
+            raise ValueError(f"{folder}: damaged; chunk {number}: {error}") from None
 
     with ThreadPoolExecutor(READERS) as pool:
         list(pool.map(read, range(-(-shape[0] // chunk[0]))))
@@ -244,13 +262,14 @@ def _read_file(path: Path, most: int) -> bytes:
     if not stat.S_ISREG(status.st_mode) or status.st_size > most:
         raise ValueError(f"{path}: damaged; {status.st_size} bytes, where {most} are the most")
     with open(path, "rb") as stream:
-        return stream.read(most)
+        return stream.read(status.st_size)
 
 
 def type_named(name: str) -> type:
     """The dataclass that a stored object names as "module:class".
 
-    Raises ValueError when it is not a dataclass of this package's own modules.
+    Raises ValueError when its module is neither of this package nor named ss_flow_...; OtherFields when there is no
+    such dataclass here.
     """
     module, _, qualified = str(name).partition(":")
     if not module.startswith(TRUSTED_PREFIXES):
@@ -259,10 +278,12 @@ def type_named(name: str) -> type:
         found: Any = importlib.import_module(module)
         for part in qualified.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError):
-        raise ValueError(f"there is no type {name}") from None
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever a module raises that another flow brought, or that is being edited
+        raise OtherFields(f"there is no type {name} here ({error})") from None
     if not dataclasses.is_dataclass(found) or not isinstance(found, type) or found.__module__ != module:
-        raise ValueError(f"{name} is not a dataclass of its module")
+        raise OtherFields(f"there is no dataclass {name} here")
     return found
 
 
@@ -284,8 +305,27 @@ def _plain(content: Any, where: str) -> Any:
     raise TypeError(f"{where} holds a {type(content).__name__}, which is neither an array nor plain data")
 
 
+def _hints(kind: type) -> dict[str, Any]:
+    """The declared types of a dataclass's fields, but for those with a name that only type checkers import."""
+    try:
+        return typing.get_type_hints(kind)
+    except NameError:
+        known: dict[str, Any] = {}
+        for item in dataclasses.fields(kind):
+            with contextlib.suppress(NameError):
+                alone = types.SimpleNamespace(__annotations__={item.name: item.type})
+                known |= typing.get_type_hints(alone, vars(sys.modules[kind.__module__]))
+        return known
+
+
 def _restored(content: Any, hint: Any) -> Any:
-    """A field as it was written: lists as the tuples that they are declared to be; nothing else is converted."""
+    """A field as it was written: lists as the tuples that they are declared to be; nothing else is converted.
+
+    Of a union, the first member that is a tuple or a list counts.
+    """
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        among = typing.get_args(hint)
+        hint = next((one for one in among if one is list or typing.get_origin(one) in (tuple, list)), None)
     if typing.get_origin(hint) is not tuple or not isinstance(content, list):
         return content
     inner = typing.get_args(hint)

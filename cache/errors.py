@@ -23,10 +23,10 @@ class Gone(LookupError):
 
 
 class OtherVersion(Gone):
-    """An object that is whole, but whose type has other fields in this version. It stays in the store."""
+    """An object that is whole, but whose type has other fields here, or is not to be found. It stays in the store."""
 
     def __str__(self) -> str:
-        return f"object {self.digest[:12]} was stored by another version of this package: {self.reason}"
+        return f"object {self.digest[:12]} was stored by other code than is here: {self.reason}"
 
 
 @contextlib.contextmanager
@@ -42,3 +42,14 @@ def writing(root: Path) -> Iterator[None]:
             f"the store {root} cannot be written: {reason}. What was finished is kept: when there is room "
             "(`ss-flow cache gc` makes some) and permission, run again to go on."
         ) from error
+
+
+@contextlib.contextmanager
+def reading(root: Path) -> Iterator[None]:
+    """The same for what only reads: what cannot be read now may be whole, and stays."""
+    try:
+        yield
+    except StoreFailure:
+        raise
+    except OSError as error:
+        raise StoreFailure(f"the store {root} cannot be read: {error.strerror or error}; nothing was lost.") from error

@@ -40,6 +40,9 @@ def remove(path: Path) -> None:
         pass
     except (IsADirectoryError, PermissionError):
         shutil.rmtree(path, ignore_errors=True)
+    except OSError:  # a disk that can only be read says so of what is not there, too
+        if path.exists():
+            raise
 
 
 def entries(folder: str) -> list[os.DirEntry[str]]:

@@ -32,10 +32,9 @@ from typing import Any
 from ss_flow.cache.bucket import Bucket
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims, Seen
-from ss_flow.cache.codec import OtherFields
-from ss_flow.cache.errors import Gone, OtherVersion, writing
+from ss_flow.cache.errors import Gone, writing
 from ss_flow.cache.files import rename_folder, user_cache
-from ss_flow.cache.store import GRACE_SECONDS, MEMORY_BYTES, Action, Entry, Store, verified
+from ss_flow.cache.store import GRACE_SECONDS, MEMORY_BYTES, Action, Entry, Store
 
 MANIFEST = "zarr.json"
 """The file of an object that is written last, and deleted first."""
@@ -108,7 +107,7 @@ class RemoteStore(Store):
         """The copy here, if there is one and it is whole; a damaged one is taken out."""
         if super().__contains__(object_digest):
             with contextlib.suppress(ValueError):
-                return verified(self.object_path(object_digest), object_digest)
+                return self._verified(self.object_path(object_digest), object_digest)
             super()._take_out(self.object_path(object_digest), math.inf)
         return None
 
@@ -136,9 +135,7 @@ class RemoteStore(Store):
 
         self._bucket.each(fetch, filter(_FILE.fullmatch, files))
         try:
-            value = verified(place, object_digest)
-        except OtherFields as error:
-            raise OtherVersion(object_digest, str(error)) from None
+            value = self._verified(place, object_digest)
         except ValueError as error:
             self.discard(object_digest)
             raise Gone(object_digest, f"was damaged ({error})") from None

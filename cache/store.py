@@ -17,8 +17,9 @@ and is never read. The action comes after all of its objects.
 *Power cut, failing disk, foreign hands.* Nothing is synced; everything is checked when it is read: an object whose
 content is not what its name says is taken out, and its maker runs again.
 
-*Another version.* An object whose type has got or lost fields since is whole: it stays, and OtherVersion is raised. No
-key of this version leads to it, since the definitions of types are code that keys depend on.
+*Another version.* An object whose type has got or lost fields since, or is not to be found here, is whole: it stays,
+and OtherVersion is raised. No key of this version leads to it, since the definitions of types are code that keys depend
+on.
 
 *Concurrent writers.* Two processes that write the same object write the same bytes; the loser of the rename discards
 its copy. Readers never lock.
@@ -29,6 +30,9 @@ its copy. Readers never lock.
 from __future__ import annotations
 
 import contextlib
+import copy
+import dataclasses
+import errno
 import json
 import math
 import os
@@ -36,7 +40,7 @@ import re
 import socket
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +48,7 @@ from typing import Any
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
-from ss_flow.cache.errors import Gone, OtherVersion, writing
+from ss_flow.cache.errors import Gone, OtherVersion, reading, writing
 from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder
 from ss_flow.cache.plain_json import reader
 from ss_flow.cache.recent import Recent
@@ -53,6 +57,9 @@ MEMORY_BYTES = 2 << 30
 """How much of what was read lately a process keeps in memory."""
 GRACE_SECONDS = 3600.0
 """What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
+
+NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""What keeps a process from opening any file."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +103,7 @@ class Store:
     """
 
     def __init__(self, root: Path, *, memory_bytes: int = MEMORY_BYTES) -> None:
-        self.root = root
+        self.root = root = root.absolute()  # a process may change its folder
         self._recent = Recent(memory_bytes)
         self._actions = f"{root}/actions"
         self._objects = f"{root}/objects"
@@ -145,9 +152,9 @@ class Store:
         """
         object_digest = digest(value)
         target = self.object_path(object_digest)
-        if target.is_dir() and not codec.is_current(target):
-            self._take_out(target, math.inf)
         with writing(self.root):
+            if target.is_dir() and not codec.is_current(target):
+                self._take_out(target, math.inf)
             try:
                 os.utime(target)  # used again: it must not be collected before its action is recorded
             except FileNotFoundError:
@@ -158,10 +165,11 @@ class Store:
         return object_digest
 
     def get(self, object_digest: str) -> Any:
-        """The stored value. Shared between callers: its arrays are read-only.
+        """The stored value. Shared between callers: its arrays are read-only, its lists and tables the caller's own.
 
         Raises Gone when the store holds no such object, or one that is damaged, which is then taken out; OtherVersion
-        when its type has other fields by now.
+        when its type has other fields by now, or is not to be found here; StoreFailure, or MemoryError, when it cannot
+        be read now.
         """
         value = self._recent.get(object_digest)
         if value is None:
@@ -170,7 +178,7 @@ class Store:
             except OtherVersion as found:
                 raise self._with_its_step(found) from None
             self._recent.keep(object_digest, value)
-        return value
+        return _own(value)
 
     def _load(self, object_digest: str) -> Any:
         return self.read(object_digest)
@@ -180,12 +188,23 @@ class Store:
         if object_digest not in self:
             raise Gone(object_digest, "is not in the store")
         try:
-            return verified(self.object_path(object_digest), object_digest)
-        except codec.OtherFields as error:
-            raise OtherVersion(object_digest, str(error)) from None
+            return self._verified(self.object_path(object_digest), object_digest)
         except ValueError as error:
             self.discard(object_digest)
             raise Gone(object_digest, f"was damaged ({error})") from None
+
+    def _verified(self, folder: Path, object_digest: str) -> Any:
+        """The object in a folder. Raises ValueError when it is damaged, and else as `get`."""
+        with reading(self.root):
+            try:
+                value = codec.read(folder)
+            except codec.OtherFields as error:
+                if codec.digest_as_stored(folder) == object_digest:
+                    raise OtherVersion(object_digest, str(error)) from None
+                raise
+        if digest(value) != object_digest:
+            raise ValueError("its content is not what its name says")
+        return value
 
     def _with_its_step(self, found: OtherVersion) -> OtherVersion:
         """The same, naming the step that made the object, where one is recorded; reads every record."""
@@ -216,7 +235,7 @@ class Store:
             except FileNotFoundError:
                 return False
             try:
-                if place.stat().st_mtime < unused_since:
+                if place.lstat().st_mtime < unused_since:
                     return True
             except FileNotFoundError:  # old enough that another process has swept it from tmp/
                 return True
@@ -239,13 +258,18 @@ class Store:
     def action(self, key: str, *, whole: bool = True) -> Action | None:
         """The record under a key, or None when there is none; with `whole`, also when one of its outputs is gone.
 
-        A whole one counts as used now.
+        A whole one counts as used now. Raises StoreFailure when this process can read no file at the moment.
         """
         path = f"{self._actions}/{key[:2]}/{key}.json"
         try:
             content, modified = read_stamped(path)
             action = _read_action(content)
-        except (FileNotFoundError, ValueError):  # not there, or not one of ours
+        except ValueError:  # not one of ours
+            return None
+        except OSError as error:  # not there, no file, or not ours to read
+            if error.errno in NO_FILES:
+                with reading(self.root):
+                    raise
             return None
         if action.key != key or not _is_sound(action):
             return None
@@ -255,9 +279,15 @@ class Store:
             return None
         if time.time() - modified > GRACE_SECONDS / 4:
             with contextlib.suppress(OSError):
-                for used in (self.action_path(key), *map(self.object_path, action.outputs)):
-                    os.utime(used)
+                os.utime(path)
+                self.use(action.outputs)
         return action
+
+    def use(self, digests: Iterable[str]) -> None:
+        """Count objects as used now, so that they are not collected for a while."""
+        for name in digests:
+            with contextlib.suppress(OSError):
+                os.utime(self.object_path(name))
 
     def record(self, action: Action) -> None:
         """Publish an action; its outputs must be stored already."""
@@ -301,12 +331,22 @@ class Store:
         with writing(self.root), self.temporary() as place:
             place.write_text(text, encoding="utf-8")
             path.parent.mkdir(exist_ok=True)
-            place.replace(path)
+            try:
+                place.replace(path)
+            except IsADirectoryError:  # a foreign hand's, and no record
+                remove(path)
+                place.replace(path)
 
     def now(self) -> float:
-        """The time by the clock that stamps the store's files, which may be another host's."""
+        """The time by the clock that stamps the store's files, which may be another host's; by this machine's where the
+        store can only be read."""
         with writing(self.root), self.temporary() as place:
-            place.touch()
+            try:
+                place.touch()
+            except OSError as error:
+                if error.errno in (errno.EROFS, errno.EACCES):
+                    return time.time()
+                raise
             return place.stat().st_mtime
 
     def sweep_temporaries(self) -> int:
@@ -329,30 +369,26 @@ class Store:
         return self._take_out(self._part_path(name), unused_since)
 
 
+def _own(value: Any) -> Any:
+    """The same with lists and tables of its own, which can be changed as nothing else of a frozen dataclass can."""
+    fields = {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}
+    changeable = {name: content for name, content in fields.items() if isinstance(content, dict | list)}
+    if not changeable:
+        return value
+    own = copy.copy(value)
+    for name, content in changeable.items():
+        object.__setattr__(own, name, copy.deepcopy(content))
+    return own
+
+
 def _records(folder: str) -> Iterator[Entry]:
     """The JSON files of a folder."""
     for entry in entries(folder):
         with contextlib.suppress(FileNotFoundError):
-            status = entry.stat()
+            status = entry.stat(follow_symlinks=False)  # which may lead round in a circle
             yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)
 
 
 def _is_sound(action: Action) -> bool:
     """Whether the outputs are digests, which lead nowhere out of the store, and one where one is due."""
     return all(map(DIGEST.fullmatch, action.outputs)) and (action.is_list or len(action.outputs) == 1)
-
-
-def verified(folder: Path, object_digest: str) -> Any:
-    """The object in a folder.
-
-    Raises ValueError when it is damaged, OtherFields when it is whole but its type has other fields by now.
-    """
-    try:
-        value = codec.read(folder)
-    except codec.OtherFields as error:
-        if codec.digest_as_stored(folder) == object_digest:
-            raise
-        raise ValueError(f"{folder}: damaged; {error}") from None
-    if digest(value) != object_digest:
-        raise ValueError("its content is not what its name says")
-    return value

@@ -41,11 +41,11 @@ def verify(store: Store, progress: Callable[[int, int], None] = lambda done, tot
     """Check every object, action and part of a store against its name; take out what is damaged.
 
     An object is damaged when its content is not what its name says, or when this version cannot read it for another
-    reason than that its type has other fields by now; an action when its record cannot be read or is that of another
-    key; a part when its content is not what its name says.
+    reason than that its type has other fields by now, or is not to be found here; an action when its record cannot be
+    read or is that of another key; a part when its content is not what its name says.
 
     progress: hears how many objects are done, of how many.
-    Raises StoreFailure when the store cannot be used.
+    Raises StoreFailure, or MemoryError, when the store cannot be used or read.
     """
     damaged: list[Damage] = []
     parts, actions, objects = Tally(), Tally(), Tally()

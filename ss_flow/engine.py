@@ -12,7 +12,7 @@ from typing import Any
 import psutil
 
 from ss_flow.cache.claims import Claims
-from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
+from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure, writing
 from ss_flow.cache.store import Store
 from ss_flow.events import Log, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
@@ -180,7 +180,8 @@ class _Run:
         for request in requests:
             events = None
             if recorded:
-                folder = start_run(runs, {"scene": request.scene, **request.header}).folder
+                with writing(store.root):
+                    folder = start_run(runs, {"scene": request.scene, **request.header}).folder
                 claims.take(RUN_CLAIM + folder.name)
                 events = folder / "events.jsonl"
             self._logs.append(Log(events, store.root))

@@ -19,7 +19,7 @@ class Reporter:
 
     def event(self, kind: str, **details: Any) -> None:
         """Something happened to a node (hit, started, finished, failed, retried, skipped, waiting, would run), or to
-        the whole (run started, restarted, stopping, run ended).
+        the whole (run started, restarted, stopping, run ended); or a result of another run is used (taken).
 
         Of a node, `of` says how many nodes of its step are needed and `known` how many of its flow, as far as is known.
         """

@@ -38,7 +38,7 @@ class Resolution:
 
     load: gives the artifact of a digest, for what decides how the graph goes on. call: gets a call whose inputs are
     known; it must be settled sooner or later. skipped: hears of a call that cannot be made, and why. failed: hears of
-    a node that cannot be expanded, or picks what its list does not have.
+    a node that cannot be expanded, or picks what its list does not have. taken: hears of a result of another run.
     """
 
     def __init__(
@@ -47,8 +47,9 @@ class Resolution:
         call: Callable[[Call], None],
         skipped: Callable[[Call, Failure], None],
         failed: Callable[[Node, Failure], None],
+        taken: Callable[[Stored], None],
     ) -> None:
-        self._load, self._call, self._skipped, self._failed = load, call, skipped, failed
+        self._load, self._call, self._skipped, self._failed, self._taken = load, call, skipped, failed, taken
         self.values: dict[Node, Value | Failure] = {}
         self.known_calls: dict[Flow, KnownCalls] = defaultdict(KnownCalls)
         self._unresolved: dict[Node, int] = {}
@@ -174,6 +175,7 @@ class Resolution:
                 else:
                     self.settle(node, value)
             case Stored():
+                self._taken(node)
                 self.settle(node, node.value)
 
     def _failed_source(self, node: Node) -> Failure | None:

@@ -63,6 +63,10 @@ class Run:
         """The events of the nodes that have a result."""
         return [event for event in settled(self.events()) if event["event"] in DONE]
 
+    def taken(self) -> set[str]:
+        """The digests of the results of other runs that it uses."""
+        return {digest for event in self.events() if event["event"] == "taken" for digest in event["outputs"]}
+
     def graph(self) -> nx.MultiDiGraph[str]:
         """The steps that have results: `count` of each, and an edge for each input, by its name, from what makes it.
 
@@ -110,16 +114,16 @@ def start_run(runs: Path, header: dict[str, Any]) -> Run:
 
 
 def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
-    """Runs, the latest first; of one scene (a resolved path), or of all."""
-    found = []
+    """Runs, the latest first; of one scene (a resolved path), or of all. A record that says no scene is passed over."""
+    found: list[tuple[float, Run]] = []
     for file in runs.glob("*/run.json"):
         try:
             header = json.loads(file.read_text())
-        except (FileNotFoundError, ValueError):  # collected just now, or cut short
+            if header["scene"] == scene or scene is None:
+                found.append((float(header["started"]), Run(file.parent, header)))
+        except (FileNotFoundError, ValueError, KeyError, TypeError):  # collected just now, or damaged
             continue
-        if scene is None or header["scene"] == scene:
-            found.append(Run(file.parent, header))
-    yield from sorted(found, key=lambda run: run.header["started"], reverse=True)
+    yield from (run for _, run in sorted(found, key=lambda one: one[0], reverse=True))
 
 
 class PreviousKeys:

@@ -24,7 +24,7 @@ from ss_flow.execute import Invocation
 from ss_flow.executors import Executor
 from ss_flow.executors.worker import WorkerDied
 from ss_flow.explain import changed_items, first_difference
-from ss_flow.graph import Call, Flow, Node
+from ss_flow.graph import Call, Flow, Node, Stored
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.kept_closures import kept_closure
 from ss_flow.keys import Components, Keys, Value
@@ -73,7 +73,7 @@ class Scheduler:
         self._dry = dry
         self._keys = Keys(functools.partial(kept_closure, folder=store.closures))
         self._tokens = Tokens(capacity)
-        self._graph = Resolution(store.get, self._call, self._skip, self._fail_node)
+        self._graph = Resolution(store.get, self._call, self._skip, self._fail_node, self._take)
         self._jobs: dict[str, Job] = {}
         self._queue = Queue()
         self._claimed_elsewhere: dict[str, Job] = {}
@@ -135,6 +135,12 @@ class Scheduler:
 
     def _skip(self, node: Call, failed: Failure) -> None:
         self._tell("skipped", node, because=failed.label)
+
+    def _take(self, node: Stored) -> None:
+        """No action of this run leads to these objects, so the record of the run says that they are needed."""
+        digests = [node.value] if isinstance(node.value, str) else list(node.value)
+        self._store.use(digests)
+        self._flows[node.flow].reporter.event("taken", label=node.label, outputs=digests)
 
     def _call(self, node: Call) -> None:
         """A call whose inputs are known is a hit, or a job."""

@@ -117,6 +117,7 @@ class Wanted:
             if claim in living:
                 unknown.discard(claim)
                 roots.held.update(node["key"] for node in run.nodes())
+                roots.objects.update(run.taken())
             elif self._keep is not None and later[run.scene] > self._keep and self._is_quiet(run):
                 self.outdated.append(run)
             else:

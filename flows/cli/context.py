@@ -45,22 +45,25 @@ class StoreOptions:
         return str(location) if is_url(location) else Path(location).expanduser()
 
     def existing_store(self) -> Store:
-        """The store, to look into. Raises InputError when there is none, or it cannot be used."""
+        """The store, to look into, be it on a disk that can only be read. Raises InputError when there is none, or it
+        cannot be used."""
         location = self.location
         if isinstance(location, Path) and not location.exists():
             raise InputError(f"there is no store {location}; `ss-flow run SCENE` makes one, --cache names another.")
-        return self.open_store()
+        return self._opened(location)
 
     def open_store(self) -> Store:
         """The store, made where there is none.
 
         Raises InputError when the folder cannot be used or the URL is not that of a store.
         """
-        location = self.location
+        return self._opened(self.location, os.W_OK)
+
+    def _opened(self, location: str | Path, mode: int = os.R_OK) -> Store:
         try:
             store = open_store(location.resolve() if isinstance(location, Path) else location)
-            if not os.access(store.root, os.W_OK):
-                raise PermissionError("no permission to write")
+            if not os.access(store.root, mode):
+                raise PermissionError(f"no permission to {'write' if mode == os.W_OK else 'read'}")
         except ValueError as error:
             raise InputError(str(error)) from None
         except StoreFailure:

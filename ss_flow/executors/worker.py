@@ -39,7 +39,7 @@ class Worker:
         program = f"from ss_flow.executors.worker import serve; serve({remote.fileno()})"
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", program],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
             stdin=subprocess.DEVNULL,
             stdout=2,  # what a library prints must not get between a document on stdout
             pass_fds=[remote.fileno()],

@@ -46,6 +46,22 @@ import os; os._exit(0)
     assert claims.take("k")
 
 
+def test_a_forked_process_claims_in_its_own_name(store):
+    program = f"""
+import json, os
+from pathlib import Path
+from ss_flow.cache.claims import Claims
+Claims(Path({str(store.root)!r}))
+if os.fork() == 0:
+    Claims(Path({str(store.root)!r})).take("k")
+    Path({str(store.root / "pid")!r}).write_text(str(os.getpid()))
+    os._exit(0)
+os.wait()
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+    assert json.loads(place(store).read_text())["pid"] == int((store.root / "pid").read_text())
+
+
 def test_the_claim_of_another_process_with_the_same_number_is_taken_over(store, claims):
     ours = json.loads(claims._token)
     place(store).write_text(json.dumps({**ours, "started": ours["started"] - 1000}))

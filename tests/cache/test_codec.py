@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -141,6 +141,22 @@ def test_what_is_not_a_dataclass_of_arrays_is_refused(tmp_path):
         codec.write({"a": 1}, tmp_path / "a")
     with pytest.raises(TypeError, match=r"Holder\.callback"):
         codec.write(Holder(print), tmp_path / "b")
+
+
+def test_what_could_be_changed_or_not_be_read_back_is_refused(tmp_path):
+    @dataclass
+    class Loose:
+        value: float = 0.0
+
+    @dataclass(frozen=True)
+    class Derived:
+        value: float = field(default=0.0, init=False)
+
+    with pytest.raises(TypeError, match="Loose is not frozen"):
+        codec.write(Loose(), tmp_path / "a")
+    with pytest.raises(TypeError, match=r"Derived\.value has init=False"):
+        codec.write(Derived(), tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_gaussians_of_no_rows_keep_their_shapes(tmp_path):

@@ -22,7 +22,7 @@ from ss_flow.cache import remote as remote_module
 from ss_flow.cache.bucket import Bucket
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.collect import Roots, collect
-from ss_flow.cache.errors import Gone, StoreFailure
+from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
 from ss_flow.cache.location import open_store
 from ss_flow.cache.remote import MANIFEST, RemoteStore, default_folder
 from ss_flow.cache.store import GRACE_SECONDS, Action, Store
@@ -256,6 +256,18 @@ def test_a_damaged_copy_here_is_downloaded_again(here, there):
     place.write_text("{}")
     assert digest(RemoteStore(there.location, there.root).get(object_digest)) == object_digest
     assert place.read_text() != "{}"
+
+
+def test_an_object_whose_type_is_not_to_be_found_here_stays_in_the_bucket_and_here(here, there, monkeypatch):
+    output = here.put(toy.number(2.0))
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "ss_flow_toy", None)
+        for store in (there, here):
+            with pytest.raises(OtherVersion, match="there is no type ss_flow_toy:Number here"):
+                store.get(output)
+            assert verify(store).damaged == ()
+        assert here.object_path(output).is_dir()
+    assert there.get(output).value[0] == 2.0
 
 
 def test_a_damaged_copy_here_that_the_bucket_does_not_hold_is_gone(here, bucket):

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import shutil
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import GRACE_SECONDS, Action, Store
+from ss_flow.cache.survey import Survey
 from ss_flow.cache.verify import verify
 from ss_flow.tasks import artifacts
 from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, Metrics, PointCloud
@@ -235,6 +239,90 @@ def test_an_object_whose_type_has_other_fields_by_now_stays_and_is_not_called_da
     assert Store(store.root).get(output).name == "x"
 
 
+@pytest.mark.parametrize("missing", ["module", "class"])
+def test_an_object_whose_type_is_not_to_be_found_here_stays_and_is_not_called_damaged(store, monkeypatch, missing):
+    output = store.put(toy.number(2.0))
+    with monkeypatch.context() as patch:
+        if missing == "module":
+            patch.setitem(sys.modules, "ss_flow_toy", None)
+        else:
+            patch.delattr(toy, "Number")
+        with pytest.raises(OtherVersion, match="there is no type ss_flow_toy:Number here") as told:
+            Store(store.root).get(output)
+        assert "damaged" not in str(told.value)
+        assert verify(store).damaged == ()
+        chunk = store.object_path(output) / "value/c.0"
+        whole = chunk.read_bytes()
+        chunk.write_bytes(whole[::-1])
+        assert [damage.name for damage in verify(Store(store.root)).damaged] == [output]
+    assert store.get(store.put(toy.number(2.0))).value[0] == 2.0
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EACCES, errno.EIO, errno.ENOMEM])
+def test_an_object_that_cannot_be_read_now_stays_and_the_store_says_why_in_one_sentence(store, monkeypatch, number):
+    value = LabelMap("x", np.eye(3, dtype=np.uint16))
+    output = store.put(value)
+    refused = OSError(number, os.strerror(number))
+    for trouble in ("open", "lstat"):
+        with monkeypatch.context() as patch:
+            place, name = (codec, "open") if trouble == "open" else (codec.os, "lstat")
+            patch.setattr(place, name, lambda *_: (_ for _ in ()).throw(refused), raising=False)
+            for ask in (Store(store.root).get, lambda _: store.put(value), lambda _: verify(store)):
+                with pytest.raises(StoreFailure, match=os.strerror(number)):
+                    ask(output)
+    assert Store(store.root).get(output).ids.trace() == 3
+
+
+def test_a_store_that_was_named_by_a_relative_path_stays_where_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    store = Store(Path("here"))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert store.put(toy.number(1.0)) in Store(tmp_path / "here")
+
+
+@pytest.mark.parametrize("kind", ["folder", "loop", "unreadable"])
+def test_a_record_that_cannot_be_read_counts_for_nothing_and_is_recorded_again(store, monkeypatch, kind):
+    action = Action("ab" * 32, "step", (store.put(toy.number(1.0)),), False, {}, 1.5, 10.0)
+    store.record(action)
+    path = store.action_path(action.key)
+    if kind == "unreadable":
+        refused = PermissionError(errno.EACCES, "Permission denied")
+        monkeypatch.setattr("ss_flow.cache.store.read_stamped", lambda _: (_ for _ in ()).throw(refused))
+    else:
+        path.unlink()
+        path.mkdir() if kind == "folder" else path.symlink_to(path)
+    assert store.action(action.key) is None
+    assert not Survey.of(store).is_whole(action.key)
+    assert [damage.name for damage in verify(store).damaged] == [action.key]
+    if kind == "folder":
+        path.mkdir()
+    store.record(action)
+    monkeypatch.undo()
+    assert store.action(action.key) == action
+
+
+def test_a_process_that_can_open_no_file_takes_no_record_for_missing(store, monkeypatch):
+    action = Action("ab" * 32, "step", (store.put(toy.number(1.0)),), False, {}, 1.5, 10.0)
+    store.record(action)
+    refused = OSError(errno.EMFILE, "Too many open files")
+    monkeypatch.setattr("ss_flow.cache.store.read_stamped", lambda _: (_ for _ in ()).throw(refused))
+    with pytest.raises(StoreFailure, match="cannot be read: Too many open files"):
+        verify(store)
+    monkeypatch.undo()
+    assert store.action(action.key) == action
+
+
+def test_an_object_that_memory_is_too_short_for_stays(store, monkeypatch):
+    output = store.put(LabelMap("x", np.zeros((400, 500), np.uint16)))
+    for name in ("_read_chunks", "_read_file"):
+        with monkeypatch.context() as patch:
+            patch.setattr(codec, name, lambda *_: (_ for _ in ()).throw(MemoryError))
+            with pytest.raises(MemoryError):
+                Store(store.root).get(output)
+    assert Store(store.root).get(output).ids.shape == (400, 500)
+
+
 def test_an_object_that_lost_a_field_on_the_disk_is_damaged(store):
     output = store.put(LabelMap("x", np.eye(64, dtype=np.uint16)))
     shutil.rmtree(store.object_path(output) / "ids")
@@ -279,6 +367,21 @@ def test_what_is_stored_comes_back_as_it_was_and_not_as_its_type_declares(store,
     for found in (store.get(digest), store.get(digest), Store(store.root).get(digest)):
         for name in ("value", "at", "path"):
             assert repr(getattr(found, name)) == repr(getattr(score, name))
+
+
+@pytest.mark.parametrize("at", [(1, 2), None, ()])
+def test_a_type_that_only_type_checkers_know_is_no_hindrance_and_a_tuple_of_a_union_comes_back_as_one(store, at):
+    found = store.get(store.put(toy.Checked(np.ones(2), at, ("x", 1))))
+    assert (found.at, found.other, found.cells.sum()) == (at, ("x", 1), 2.0)
+
+
+def test_lists_and_tables_belong_to_who_asked_for_them(store):
+    digest = store.put(toy.Table({"a": [1]}, ["a"]))
+    for _ in range(2):
+        found = store.get(digest)
+        assert found == toy.Table({"a": [1]}, ["a"])
+        found.rows["a"].append(2)
+        found.names.clear()
 
 
 def test_the_digest_of_a_file_whose_name_is_no_text_is_remembered(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import threading
@@ -18,6 +19,7 @@ from ss_flow.cache.collect import collect
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.flows.cli.care import Wanted, size_text
+from ss_flow.graph import stored
 from ss_flow.runs import latest_runs
 
 
@@ -126,6 +128,36 @@ def test_a_living_run_keeps_what_it_found_and_an_unknown_one_stops_the_collectio
     assert refused.code == 2 and "the run elsewhere of another machine is alive" in refused.err
     claims.release_all()
     assert removed(gc(warm.store, "--keep-runs", "0"))["records of runs"] == 1
+
+
+def test_a_living_run_keeps_what_it_has_taken_from_another(tmp_path):
+    store = Store(tmp_path / "store")
+    taken = run_flow(toy.flow, store, scene="one").values["total"]
+    run_flow(lambda: {"half": toy.half(stored("total", taken))}, store, scene="two")
+    (run,) = latest_runs(store.runs, "two")
+    age_all(store.root)
+    claims = store.open_claims()
+    claims.take(f"run-{run.folder.name}")
+    gc(store.root, "--keep-runs", "0", "--max-size", "0")
+    assert entries(store.root) == ({node["key"] for node in run.nodes()}, {taken, run.results()["half"][0]})
+    claims.release_all()
+
+
+@pytest.mark.parametrize(
+    "command", [("status",), ("cache", "ls"), ("cache", "du"), ("cache", "verify"), ("cache", "gc", "--dry-run")]
+)
+def test_a_store_that_can_only_be_read_can_be_looked_into(tmp_path, monkeypatch, command):
+    store = Store(tmp_path / "store")
+    run_flow(toy.flow, store, scene="toy")
+
+    def refused(path, *_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    for name in ("touch", "unlink", "write_text", "rename", "replace"):
+        monkeypatch.setattr(Path, name, refused)
+    monkeypatch.setattr(os, "access", lambda path, mode, access=os.access: mode != os.W_OK and access(path, mode))
+    called = ss_flow(*command, "--cache", store.root)
+    assert (called.code, called.err) == (0, "")
 
 
 def test_want_of_room_takes_what_was_used_least_recently(warm):

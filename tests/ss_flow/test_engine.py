@@ -1,20 +1,25 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 import ss_flow_toy as toy
+from aged_store import age_all
 
 from ss_flow import engine
+from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
 from ss_flow.explain import first_difference
-from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick
+from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick, stored
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
@@ -454,12 +459,58 @@ def test_the_folder_of_a_run_has_a_name_that_file_systems_take(store, name):
     assert name[:30] in found.folder.name and len(found.folder.name.encode()) <= 130
 
 
+@pytest.mark.parametrize(
+    "content", ["{}", "[]", '"scene"', '{"scene": "toy"}', '{"scene": "toy", "started": "x"}', "{"]
+)
+def test_a_run_whose_record_is_damaged_is_passed_over(store, content):
+    first = run(store, toy.flow)
+    folder = store.runs / "damaged"
+    folder.mkdir()
+    (folder / "run.json").write_text(content)
+    assert run(store, toy.flow).values == first.values
+    assert folder not in [one.folder for one in latest_runs(store.runs)]
+
+
+def test_a_store_that_can_only_be_read_ends_the_run_with_one_sentence(store, monkeypatch):
+    run(store, toy.flow)
+    refused = OSError(errno.EROFS, os.strerror(errno.EROFS))
+    monkeypatch.setattr(Path, "touch", lambda *_, **__: (_ for _ in ()).throw(refused))
+    assert set(ran(run(store, toy.flow, recorded=False))) == set()
+    monkeypatch.setattr(engine, "start_run", lambda *_: (_ for _ in ()).throw(refused))
+    with pytest.raises(StoreFailure, match="cannot be written: Read-only file system"):
+        run(store, toy.flow)
+
+
 def test_a_cut_last_line_of_the_event_log_is_left_out(store):
     run(store, toy.flow)
     latest = next(latest_runs(store.root / "roots" / "runs"))
     with (latest.folder / "events.jsonl").open("a") as stream:
         stream.write('{"event": "fini')
     assert len(latest.nodes()) == 8
+
+
+def test_a_result_that_is_taken_from_another_run_counts_as_used_and_is_in_the_record_of_the_run(store):
+    digests = run(store, toy.flow).values["squares"]
+    age_all(store.root)
+
+    def build():
+        return {"total": toy.total(stored("earlier", digests)), "first": toy.square(stored("one", digests[0]))}
+
+    run(store, build)
+    (made, *_) = latest_runs(store.runs, "toy")
+    assert made.taken() == set(digests)
+    used = {entry.name: entry.used for entry in store.objects()}
+    assert all(time.time() - used[name] < 600 for name in digests)
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_a_task_that_changes_what_it_is_given_changes_it_for_no_other(store, executor):
+    def build():
+        table = toy.table()
+        return {"count": toy.counted(table, toy.spoilt(table))}
+
+    report = run(store, build, executor=executor)
+    assert store.get(report.values["count"]).value[0] == 11
 
 
 def test_a_result_gone_from_the_store_is_computed_again(store):

@@ -508,6 +508,13 @@ def test_the_workers_of_a_killed_run_end_with_it(tmp_path):
     wait_for(lambda: not any(child.is_running() for child in children))
 
 
+def test_a_worker_finds_what_a_prompt_finds_in_its_folder(store, monkeypatch):
+    monkeypatch.chdir(SUPPORT)
+    monkeypatch.setattr(sys, "path", ["", *(place for place in sys.path if place not in ("", SUPPORT))])
+    report = run_flow(toy.flow, store, scene="toy", executor="processes", jobs=1)
+    assert report.failures == []
+
+
 def test_threads_may_submit_to_dask_at_once(store, cluster):
     executor = Opened(at(cluster), store)
     results = []

@@ -8,12 +8,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ss_flow.graph import each, expand
 from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
 from ss_flow.task import Bundle, FileRef, Resources, task
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,23 @@ class Score:
     cells: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
 
+@dataclass(frozen=True)
+class Checked:
+    """A type that is known to type checkers alone, and a declared tuple beside it."""
+
+    cells: NDArray[np.float64]
+    at: tuple[int, ...] | None
+    other: tuple[str, int] = ("", 0)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Plain values that can be changed."""
+
+    rows: dict[str, list[int]]
+    names: list[str]
+
+
 def number(value: float) -> Number:
     return Number(np.array([value]))
 
@@ -38,6 +59,24 @@ def number(value: float) -> Number:
 @task()
 def source(*, values: tuple[float, ...]) -> tuple[Number, ...]:
     return tuple(number(v) for v in values)
+
+
+@task()
+def table() -> Table:
+    return Table({"a": [1]}, ["a"])
+
+
+@task()
+def spoilt(of: Table) -> Number:
+    """Changes what it is given."""
+    of.rows["a"].append(2)
+    of.names.clear()
+    return number(0.0)
+
+
+@task()
+def counted(of: Table, after: Number) -> Number:
+    return number(10 * len(of.rows["a"]) + len(of.names))
 
 
 @task()
