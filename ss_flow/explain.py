@@ -43,7 +43,7 @@ def nearest(among: Sequence[Components], now: Components) -> Components:
     parts = ("parameters", "packages", "environment", "inputs")
 
     def distance(before: Components) -> int:
-        return sum(len(_changed(before[part], now[part])) for part in parts) + (before["code"] != now["code"])
+        return sum(len(_changed(before[part], now[part])) for part in parts) + int(before["code"] != now["code"])
 
     return min(among, key=distance)
 

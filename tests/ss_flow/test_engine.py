@@ -16,7 +16,7 @@ from ss_flow.closure import Closure, closure_of
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
 from ss_flow.explain import first_difference
-from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick
+from ss_flow.graph import INDEX, Flow, each, expand, gather, labelled, otherwise, pick
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
@@ -588,8 +588,12 @@ def test_an_input_that_is_no_node_is_refused():
         (lambda xs: each(xs, build=lambda x: toy.total((3.0,))), "must be a node"),
         (lambda xs: toy.square(xs[7]), "not among the 2 items"),
         (lambda xs: toy.total(pick(xs, [0, 7])), "not among the 2 items"),
+        (lambda xs: each(toy.square(xs[0]), build=toy.square), "is a single artifact"),
+        (lambda xs: toy.square(toy.square(xs[0])[0]), "is a single artifact"),
+        (lambda xs: expand(xs[0], lambda x: None), "must be a node, not NoneType"),
+        (lambda xs: expand(xs[0], lambda x: xs["a"]), "chosen by its number, not by a str"),
     ],
-    ids=["lengths", "no node", "item", "pick"],
+    ids=["lengths", "no node", "item", "pick", "each of one", "item of one", "nothing", "name"],
 )
 def test_a_node_that_cannot_be_expanded_fails_and_the_other_flows_go_on(store, bad, said):
     flows = [lambda: {"x": bad(toy.source(values=(1.0, 2.0)))}, toy.flow]
@@ -597,6 +601,54 @@ def test_a_node_that_cannot_be_expanded_fails_and_the_other_flows_go_on(store, b
     (failure,) = failed.failures
     assert said in str(failure.error) and failed.values["x"] is failure
     assert good.failures == [] and value(store, good.values["total"]) == 14.0
+
+
+def test_expand_loads_all_of_a_list(store):
+    def flow():
+        xs = toy.source(values=(1.0, 2.0))
+        return {"x": expand(xs, lambda loaded: toy.clip(xs[0], limit=-float(sum(x.value[0] for x in loaded))))}
+
+    assert value(store, run(store, flow).values["x"]) == -3.0
+
+
+@pytest.mark.parametrize(
+    ("build", "said"),
+    [
+        (lambda: None, "a dict of nodes, not NoneType"),
+        (lambda: {"x": [toy.source(values=(1.0,))]}, "the output x must be a node, not list"),
+        (lambda: {"x": OF_ANOTHER_FLOW}, "the output x is a node of another flow"),
+        (lambda: {"x": toy.square(OF_ANOTHER_FLOW)}, "the input x of ss_flow_toy.square is a node of another flow"),
+        (lambda: {"x": toy.total((OF_ANOTHER_FLOW,))}, "is a node of another flow"),
+        (lambda: {"x": toy.source(values=(1.0, {2}))}, "the parameter values holds a set"),
+    ],
+)
+def test_a_mistake_in_a_flow_is_told_in_one_sentence(store, build, said):
+    with pytest.raises(TypeError, match=said):
+        run(store, build)
+
+
+with Flow("another").building():
+    OF_ANOTHER_FLOW = toy.source(values=(1.0,))
+
+
+def test_a_task_declares_the_types_of_its_artifacts_and_of_its_result():
+    def untyped(x, *, by=1):
+        return x
+
+    with pytest.raises(TypeError, match="the task t must declare the type of x, its result"):
+        task(name="t")(untyped)
+
+
+def test_a_call_has_parameters_of_its_own_as_its_key_sees_them():
+    @task(name="t")
+    def several(*, pair: tuple[int, ...], many: list[int], free: object) -> Linear:
+        return Linear()
+
+    given = {"pair": [1, np.int64(2)], "many": (1,), "free": {"b": [1], "a": np.float32(0.5)}}
+    with Flow("x").building():
+        kept = several(**given).parameters
+    given["free"]["b"].append(2)
+    assert repr(kept) == "{'pair': (1, 2), 'many': [1], 'free': {'a': 0.5, 'b': [1]}}"
 
 
 def test_a_node_cannot_be_gone_through_as_a_list():
