@@ -121,7 +121,7 @@ class Expand(Node):
 
     sources: list[Node]
     build: Callable[..., Node]
-    """Called in the flow. For `each`, with the lengths of the lists; for `expand`, with the loaded artifacts."""
+    """Called in the flow. For `each`, with the lengths of the lists; for `expand`, with the loaded artifact."""
     loads: bool
 
     def waits_for(self) -> list[Node]:
@@ -286,7 +286,10 @@ def each(
 
 
 def expand(plan: A, build: Callable[[A], R]) -> R:
-    """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes."""
+    """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes.
+
+    Of a list, `build` gets the number of its items: none is loaded.
+    """
     flow = _building()
     node = Expand(flow, "expand", _item.get(), [cast(Any, plan)], cast(Any, build), loads=True)
     return cast(R, node)

@@ -217,13 +217,10 @@ class Resolution:
 
     def _expand(self, node: Expand) -> None:
         values: list[Any] = [self.values[source] for source in node.sources]
-        if node.loads:
-            arguments = [self._load(v) if isinstance(v, str) else tuple(map(self._load, v)) for v in values]
-        elif any(isinstance(v, str) for v in values):
+        if not node.loads and any(isinstance(v, str) for v in values):
             error = TypeError(f"{node.label} goes through a list, but what it was given is a single artifact")
             return self.settle(node, self._fail(node, error))
-        else:
-            arguments = [len(v) for v in values]
+        arguments = [self._load(v) if isinstance(v, str) else len(v) for v in values]
         self._replace(node, functools.partial(node.build, *arguments))
 
     def _replace(self, node: Node, build: Callable[[], Node]) -> None:
