@@ -27,8 +27,9 @@ _FLOAT = struct.Struct("<d").pack
 def digest(value: Any) -> str:
     """The hexadecimal blake3 digest of a value.
 
-    value: None, bool, int, float, str, bytes, a NumPy array or scalar, a list or tuple, a mapping with string keys, or
-    a dataclass of these. Fields declared with `field(metadata={"key": False})` do not count.
+    value: None, bool, int, float, str, bytes, a NumPy array (neither masked nor of records) or scalar, a list or tuple,
+    a mapping with string keys, or a dataclass of these. Fields declared with `field(metadata={"key": False})` do not
+    count.
 
     Raises TypeError for any other type, naming it.
     """
@@ -116,20 +117,24 @@ class _Encoder:
             self.add(value[name])
 
     def _add_array(self, array: np.ndarray) -> None:
-        if array.dtype.hasobject:
-            raise TypeError("cannot digest an array of Python objects")
-        array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+        if isinstance(array, np.ma.MaskedArray):  # its mask would not count
+            raise TypeError("cannot digest a masked array")
+        if array.dtype.hasobject or array.dtype.kind == "V":  # the names of a record's fields would not count
+            raise TypeError(f"cannot digest an array of {'Python objects' if array.dtype.hasobject else 'records'}")
+        array = np.asarray(array, dtype=array.dtype.newbyteorder("<"), order="C")
         self._tagged(b"a", array.dtype.str.encode())
         self._add_items(array.shape)
         self._hasher = self._hasher or blake3()
         self._hasher.update(self._pending)
         self._pending.clear()
         flat = array.reshape(-1)
-        rows = max(1, CHUNK_BYTES // array.dtype.itemsize) if array.dtype.itemsize else 1
+        if array.dtype.kind == "c":  # a part that is NaN hides nothing of the other
+            flat = flat.view(array.real.dtype)
+        rows = max(1, CHUNK_BYTES // flat.dtype.itemsize) if flat.dtype.itemsize else 1
         for start in range(0, flat.size, rows):  # in blocks that stay in the processor's cache
             block = flat[start : start + rows]
-            if array.dtype.kind in "fc" and np.isnan(block).any():
-                block = np.where(np.isnan(block), np.array(np.nan, array.dtype), block)
+            if flat.dtype.kind == "f" and np.isnan(block).any():
+                block = np.where(np.isnan(block), np.array(np.nan, flat.dtype), block)
             self._hasher.update(block.view(np.uint8).data)
 
 
@@ -140,7 +145,7 @@ def _bytes(text: str) -> bytes:
 _ENCODERS: dict[type, Callable[[_Encoder, Any], None]] = {
     str: lambda encoder, value: encoder._tagged(b"s", _bytes(value)),
     bool: lambda encoder, value: encoder._tagged(b"b", b"\x01" if value else b"\x00"),
-    int: lambda encoder, value: encoder._tagged(b"i", str(value).encode()),
+    int: lambda encoder, value: encoder._tagged(b"i", int.__repr__(value).encode()),
     float: lambda encoder, value: encoder._tagged(b"f", _FLOAT(float("nan") if value != value else value)),
     type(None): lambda encoder, value: encoder._tagged(b"0", b""),
     bytes: lambda encoder, value: encoder._tagged(b"y", value),

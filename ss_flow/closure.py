@@ -19,6 +19,8 @@ from typing import Any
 
 from blake3 import blake3
 
+from ss_flow.code_text import canonical_code, dotted
+from ss_flow.distributions import is_distributed
 from ss_flow.sources import (
     Imports,
     Module,
@@ -93,8 +95,10 @@ def forget() -> None:
 def _forget_trees() -> None:
     global _generation
     _generation += 1
-    for remembered in (_closure, _digests, _needed, _read, module_of, module_without_stars, source_digest):
+    for remembered in (_closure, _is_followed, _digests, _needed, _read):
         remembered.cache_clear()
+    for read in (module_of, module_without_stars, source_digest):
+        read.cache_clear()
 
 
 def fix_sources(own: str = "") -> int:
@@ -114,8 +118,6 @@ def fix_sources(own: str = "") -> int:
 @functools.cache
 def _closure(module_name: str, function_name: str) -> Closure:
     own = module_name.partition(".")[0]
-    followed = (*FOLLOWED, own) if own != ENGINE else FOLLOWED
-    known = sys.stdlib_module_names | {ENGINE, own}
     found: dict[str, str] = {}
     modules: set[str] = set()
     sources: set[str] = set()
@@ -133,19 +135,40 @@ def _closure(module_name: str, function_name: str) -> Closure:
         sources.update(module.stars)
         for origin, attribute in module.imports.get(name, ()):
             modules.add(origin.partition(".")[0])
-            if attribute is not None and origin.startswith(followed):
+            if attribute is not None and _is_followed(origin, own):
                 pending.append((origin, attribute))
         if name not in module.definitions:
             continue
         found |= _digests(module_name, name)
-        needs = _needed(module_name, name, followed)
+        needs = _needed(module_name, name, own)
         pending.extend(needs.names)
         modules |= needs.imported
         sources |= needs.looked_for
     sources |= {name for name in found if ":" in name}
+    others = {name for name in modules - sys.stdlib_module_names - {ENGINE} if not _is_followed(name, own)}
     return Closure(
-        dict(sorted(found.items())), frozenset(modules - known), {name: source_digest(name) for name in sorted(sources)}
+        dict(sorted(found.items())), frozenset(others), {name: source_digest(name) for name in sorted(sources)}
     )
+
+
+@functools.cache
+def _is_followed(module_name: str, own: str) -> bool:
+    """Whether definitions of a module count one by one. own: the top-level module of the function.
+
+    They do in a module beside that one that no distribution holds: no version would tell an edit of it.
+    """
+    top = module_name.partition(".")[0]
+    if module_name.startswith(FOLLOWED):
+        return True
+    if own == ENGINE or top == own:
+        return top == own != ENGINE
+    if top in (ENGINE, *sys.stdlib_module_names) or is_distributed(top):
+        return False
+    here, there = source_of(own), source_of(top)
+    if here is None or there is None or here.folder != there.folder:
+        return False
+    _packages.add(top)
+    return True
 
 
 @functools.cache
@@ -154,21 +177,25 @@ def _digests(module_name: str, name: str) -> dict[str, str]:
     module = module_of(module_name)
     assert module is not None
     native = {(file := f"{module_name}:{source}"): source_digest(file) for source in native_sources(module)}
-    return {f"{module_name}.{name}": blake3(_read(module_name, name)[0].encode()).hexdigest()} | native
+    text, nodes = _read(module_name, name)
+    used = {node.id for node in nodes if isinstance(node, ast.Name)} & module.imports.keys()
+    if used:  # what it says with the names that its module imports
+        text += f"\n{sorted((local, module.imports[local]) for local in used)}"
+    return {f"{module_name}.{name}": blake3(text.encode()).hexdigest()} | native
 
 
 @functools.cache
-def _needed(module_name: str, name: str, followed: tuple[str, ...]) -> _Needs:
+def _needed(module_name: str, name: str, own: str) -> _Needs:
     """What one definition leads to in the packages that are followed."""
     module = module_of(module_name)
     assert module is not None
     nodes = _read(module_name, name)[1]
-    own = imports_of(module, nodes)
+    inner = imports_of(module, nodes)
     named = {node.id for node in nodes if isinstance(node, ast.Name)} & module.imports.keys()
-    origins = [*own.values(), *(module.imports[name] for name in named)]
+    origins = [*inner.values(), *(module.imports[name] for name in named)]
     imported = {origin.partition(".")[0] for several in origins for origin, _ in several}
     looked_for: set[str] = set()
-    needed = dict.fromkeys(_dependencies(module, nodes, module.imports | own, followed, looked_for))
+    needed = dict.fromkeys(_dependencies(module, nodes, module.imports | inner, own, looked_for))
     return _Needs(tuple(needed), frozenset(imported.union(_loaded_by_name(nodes))), frozenset(looked_for))
 
 
@@ -178,31 +205,39 @@ def _read(module_name: str, name: str) -> tuple[str, list[ast.AST]]:
     module = module_of(module_name)
     assert module is not None
     nodes: list[ast.AST] = []
-    return "\n".join(_canonical(statement, nodes) for statement in module.definitions[name]), nodes
+    return "\n".join(canonical_code(statement, nodes, module.imports) for statement in module.definitions[name]), nodes
 
 
 def _dependencies(
-    module: Module, nodes: list[ast.AST], local: Imports, followed: tuple[str, ...], looked_for: set[str]
+    module: Module, nodes: list[ast.AST], local: Imports, own: str, looked_for: set[str]
 ) -> Iterator[tuple[str, str]]:
+    holders = {id(node.value) for node in nodes if isinstance(node, ast.Attribute)}
     for node in nodes:
         if isinstance(node, ast.Attribute):
-            first, *between = _dotted(node.value)
+            first, *between = dotted(node.value)
             for origin, attribute in local.get(first, ()):
                 path = between if attribute is None else [attribute, *between]
-                if (holder := _module_at(origin, path, followed, looked_for)) is not None:
+                if (holder := _module_at(origin, path, own, looked_for)) is not None:
                     yield holder, node.attr
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
             if node.id in module.definitions:
                 yield module.name, node.id
             for origin, attribute in local.get(node.id, ()):
-                if attribute is not None and origin.startswith(followed):
+                if attribute is not None and _is_followed(origin, own):
                     yield origin, attribute
+                if id(node) not in holders:  # as a value: any of what a module holds may be meant
+                    yield from _all_of(_module_at(origin, [attribute] if attribute else [], own, looked_for))
 
 
-def _module_at(module: str, path: list[str], followed: tuple[str, ...], looked_for: set[str]) -> str | None:
+def _all_of(module_name: str | None) -> Iterator[tuple[str, str]]:
+    if module_name is not None and (module := module_of(module_name)) is not None:
+        yield from ((module_name, name) for name in module.definitions)
+
+
+def _module_at(module: str, path: list[str], own: str, looked_for: set[str]) -> str | None:
     """The module that `module.a.b` stands for, through what packages import; None when that is none to follow."""
     names, seen = list(path), set[tuple[str, ...]]()
-    while module.startswith(followed) and (module, *names) not in seen:
+    while _is_followed(module, own) and (module, *names) not in seen:
         seen.add((module, *names))
         if not names:
             return module
@@ -215,15 +250,6 @@ def _module_at(module: str, path: list[str], followed: tuple[str, ...], looked_f
     return None
 
 
-def _dotted(node: ast.expr) -> list[str]:
-    """The names of `a.b.c`; [""] for another expression."""
-    names: list[str] = []
-    while isinstance(node, ast.Attribute):
-        names.append(node.attr)
-        node = node.value
-    return [node.id, *reversed(names)] if isinstance(node, ast.Name) else [""]
-
-
 def _loaded_by_name(nodes: list[ast.AST]) -> Iterator[str]:
     """The top-level modules of `import_module("...")`."""
     for node in nodes:
@@ -233,44 +259,3 @@ def _loaded_by_name(nodes: list[ast.AST]) -> Iterator[str]:
                 args=[ast.Constant(value=str(name)), *_],
             ):
                 yield name.partition(".")[0]
-
-
-def _canonical(node: Any, counted: list[ast.AST]) -> str:
-    """A definition as text in which only what is executed counts; the nodes of that are added to `counted`.
-
-    Left out are docstrings (under fields too), and the `@task(...)` decorator: how a task runs (cores, memory) is not
-    what it returns.
-    """
-    if isinstance(node, list):
-        return f"[{','.join([_canonical(item, counted) for item in node])}]"
-    if not isinstance(node, ast.AST):
-        return repr(node)
-    counted.append(node)
-    fields = []
-    for name in node._fields:
-        part = getattr(node, name, None)
-        if part is None or name == "ctx":  # whether a name is read or written follows from where it stands
-            continue
-        if isinstance(node, _DEFINITIONS):
-            if name == "body":
-                part = [statement for statement in part if not _is_docstring(statement)]
-            elif name == "decorator_list" and not isinstance(node, ast.ClassDef):
-                part = [decorator for decorator in part if "task" not in _called_names(decorator)]
-        fields.append(f"{name}={_canonical(part, counted)}")
-    return f"{type(node).__name__}({','.join(fields)})"
-
-
-_DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
-
-
-def _is_docstring(statement: ast.stmt) -> bool:
-    return (
-        isinstance(statement, ast.Expr)
-        and isinstance(statement.value, ast.Constant)
-        and isinstance(statement.value.value, str)
-    )
-
-
-def _called_names(decorator: ast.expr) -> set[str]:
-    called = decorator.func if isinstance(decorator, ast.Call) else decorator
-    return {called.id} if isinstance(called, ast.Name) else set()

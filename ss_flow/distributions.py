@@ -20,6 +20,11 @@ def versions_of(module: str) -> dict[str, str]:
     return dict(map(_name_and_version, reversed(found))) if found else {module: ABSENT}
 
 
+def is_distributed(module: str) -> bool:
+    """Whether an installed distribution holds a top-level module."""
+    return module in _distributions()
+
+
 def version(distribution: str) -> str:
     """The version of an installed distribution."""
     try:

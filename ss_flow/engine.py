@@ -136,6 +136,18 @@ def _this_machine(gpus: int | None) -> Resources:
     )
 
 
+def _checked(outputs: Any, flow: Flow) -> dict[str, Node]:
+    """The outputs of a flow, where they are such."""
+    if not isinstance(outputs, Mapping):
+        raise TypeError(f"a flow must return its outputs by name, a dict of nodes, not {type(outputs).__name__}")
+    for name, node in outputs.items():
+        if not isinstance(node, Node):
+            raise TypeError(f"the output {name} must be a node, not {type(node).__name__}; `gather` makes one of many")
+        if node.flow is not flow:
+            raise TypeError(f"the output {name} is a node of another flow")
+    return dict(outputs)
+
+
 def _digests(value: Value) -> list[str]:
     return [value] if isinstance(value, str) else list(value)
 
@@ -198,7 +210,7 @@ class _Run:
         targets: list[dict[str, Node]] = []
         for flow, request in zip(flows, self._requests, strict=True):
             with flow.building():
-                outputs = dict(request.build())
+                outputs = _checked(request.build(), flow)
             targets.append({request.until: outputs[request.until]} if request.until else outputs)
         return flows, targets
 

@@ -11,6 +11,7 @@ from ss_flow.cache.canonical import digest
 from ss_flow.keys import Components
 
 SHOWN_CHARACTERS = 60
+SHOWN_BEFORE = 10
 SHOWN_ITEMS = 3
 
 
@@ -24,26 +25,34 @@ def first_difference(before: Components, now: Components, items: Callable[[str],
     if before["task"] != now["task"]:
         return "the format of keys changed"
     for name in _changed(before["parameters"], now["parameters"]):
-        old, new = (_shown(side["parameters"], name) for side in (before, now))
-        return f"parameter {name} {old} -> {new}"
+        return f"parameter {name} {_shown(before['parameters'], now['parameters'], name)}"
     for name in _changed(before["code"], now["code"]):
         word = "changed" if name in before["code"] and name in now["code"] else "is new or gone"
         return f"{_what(name)} of {name.removeprefix('ss_flow.')} {word}"
     for name in _changed(before["packages"], now["packages"]):
-        old, new = (_shown(side["packages"], name) for side in (before, now))
-        return f"package {name} {old} -> {new}"
+        return f"package {name} {_shown(before['packages'], now['packages'], name)}"
     for name in _changed(before["environment"], now["environment"]):
-        old, new = (_shown(side["environment"], name) for side in (before, now))
-        return f"{name} of this machine {old} -> {new}"
+        return f"{name} of this machine {_shown(before['environment'], now['environment'], name)}"
     for name in changed_inputs(before, now):
         return f"input {name} changed{items(name)}"
     return ""
 
 
+def nearest(among: Sequence[Components], now: Components) -> Components:
+    """Of several keys' parts, those that differ least from these; of equal ones, the first."""
+    parts = ("parameters", "packages", "environment", "inputs")
+
+    def distance(before: Components) -> int:
+        return sum(len(_changed(before[part], now[part])) for part in parts) + int(before["code"] != now["code"])
+
+    return min(among, key=distance)
+
+
 def _what(name: str) -> str:
     """What a definition consists of: a dataclass, such as the type of a result, has fields first of all."""
     module, _, attribute = name.rpartition(".")
-    return "fields or code" if is_dataclass(getattr(sys.modules.get(module), attribute, None)) else "code"
+    found = getattr(sys.modules.get(module), attribute, None)
+    return "fields or code" if isinstance(found, type) and is_dataclass(found) else "code"
 
 
 def changed_inputs(before: Components, now: Components) -> list[str]:
@@ -57,8 +66,20 @@ def _changed(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
     return [n for n in names if n not in before or n not in now or digest(before[n]) != digest(now[n])]
 
 
-def _shown(values: dict[str, Any], name: str) -> str:
-    text = str(values[name]) if name in values else "(absent)"
+def _shown(before: dict[str, Any], now: dict[str, Any], name: str) -> str:
+    """The two values side by side; of long ones, a part that begins shortly before they differ."""
+    sides = [str(side[name]) if name in side else "(absent)" for side in (before, now)]
+    if sides[0] == sides[1]:  # 1 and "1"
+        sides = [repr(side[name]) if name in side else "(absent)" for side in (before, now)]
+    start = 0
+    if max(map(len, sides)) > SHOWN_CHARACTERS:
+        same = next((i for i, (old, new) in enumerate(zip(*sides, strict=False)) if old != new), min(map(len, sides)))
+        start = max(0, same - SHOWN_BEFORE)
+    return " -> ".join(_cut(side, start) for side in sides)
+
+
+def _cut(text: str, start: int) -> str:
+    text = text if start == 0 else f"...{text[start:]}"
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
 
 

@@ -9,6 +9,7 @@ comes next, `otherwise` says what stands in for a failed node, a plain sequence 
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -47,7 +48,12 @@ class Node:
         return []
 
     def __getitem__(self, index: int) -> Node:
-        """One artifact of a list."""
+        """One artifact of a list. Raises TypeError when the index is not a number."""
+        try:
+            index = operator.index(index)
+        except TypeError:
+            kind = type(index).__name__
+            raise TypeError(f"an item of {self.label} is chosen by its number, not by a {kind}") from None
         return Item(self.flow, self.step, str(index), self, index)
 
     def __iter__(self) -> Iterator[Node]:
@@ -115,7 +121,7 @@ class Expand(Node):
 
     sources: list[Node]
     build: Callable[..., Node]
-    """Called in the flow. For `each`, with the lengths of the lists; for `expand`, with the loaded artifacts."""
+    """Called in the flow. For `each`, with the lengths of the lists; for `expand`, with the loaded artifact."""
     loads: bool
 
     def waits_for(self) -> list[Node]:
@@ -168,13 +174,20 @@ class Flow:
     def add(self, task: Task[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Call:
         """The node of one call of a task.
 
-        Raises TypeError when the arguments do not fit the task, or an input is not a node.
+        Raises TypeError when the arguments do not fit the task, an input is not a node of this flow, or a parameter is
+        not plain data.
         """
+        from ss_flow.own_copy import own_copy  # not above: the bare `ss-flow` does without NumPy
+
         given = task.arguments(args, kwargs)
         inputs: dict[str, Any] = {
             n: value if isinstance(value, Node) else gather(value) for n, value in given[0].items()
         }
-        return Call(self, task.name, _item.get(), task, inputs, given[1])
+        for name, node in inputs.items():
+            if node.flow is not self:
+                raise TypeError(f"the input {name} of {task.name} is a node of another flow")
+        parameters = {name: own_copy(name, value, task.hints.get(name)) for name, value in given[1].items()}
+        return Call(self, task.name, _item.get(), task, inputs, parameters)
 
 
 def nodes_by_step(outputs: Iterable[Node]) -> dict[str, list[Node]]:
@@ -208,6 +221,8 @@ def gather(nodes: Sequence[A]) -> tuple[A, ...]:
     for node in nodes:
         if not isinstance(node, Node):
             raise TypeError(f"an input of a task in a flow must be a node, not {type(node).__name__}")
+        if node.flow is not _building():
+            raise TypeError(f"{node.label} is a node of another flow")
     return cast(tuple[A, ...], _gathered(list(nodes), "fail"))
 
 
@@ -271,7 +286,10 @@ def each(
 
 
 def expand(plan: A, build: Callable[[A], R]) -> R:
-    """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes."""
+    """A node whose result decides what comes next: once `plan` is known, `build` is called with it and adds nodes.
+
+    Of a list, `build` gets the number of its items: none is loaded.
+    """
     flow = _building()
     node = Expand(flow, "expand", _item.get(), [cast(Any, plan)], cast(Any, build), loads=True)
     return cast(R, node)

@@ -22,12 +22,12 @@ from typing import Any
 
 from blake3 import blake3
 
-from ss_flow import closure, sources
+from ss_flow import closure, code_text, sources
 from ss_flow.cache.files import write_atomically
 from ss_flow.closure import Closure, closure_of, reading
 from ss_flow.sources import source_digest
 
-_ANALYSIS = b"".join(Path(file).read_bytes() for file in (closure.__file__, sources.__file__))
+_ANALYSIS = b"".join(Path(file).read_bytes() for file in (closure.__file__, code_text.__file__, sources.__file__))
 _SIGNS = {"python": platform.python_version(), "analysis": blake3(_ANALYSIS).hexdigest()}
 """What a closure depends on besides what it is read from."""
 

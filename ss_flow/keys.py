@@ -122,7 +122,8 @@ class Keys:
 def _flat(name: str, value: Any, hint: Any) -> dict[str, Any]:
     """A parameter as {dotted name: plain value}; a file counts by content alone.
 
-    hint: its declared type. Where that does not tell a dataclass's class, or no field would, the class counts too.
+    hint: its declared type. Where that does not tell a dataclass's class, or no field would, the class counts too, and
+    its code where the declared type does not name it: the task's own code then does not lead there.
     """
     if isinstance(value, FileRef):
         return {name: value.digest}
@@ -131,8 +132,11 @@ def _flat(name: str, value: Any, hint: Any) -> dict[str, Any]:
         kind = type(value)
         counted = [f.name for f in dataclasses.fields(value) if f.metadata.get("key", True)]
         items: Any = [(field, getattr(value, field), _hints(kind).get(field)) for field in counted]
-        if not items or [typing.get_origin(one) or one for one in _candidates(hint)] != [kind]:
+        declared = [typing.get_origin(one) or one for one in _candidates(hint)]
+        if not items or declared != [kind]:
             flat[name or "params"] = f"{kind.__module__}.{kind.__qualname__}"
+        if kind not in declared:
+            flat[name or "params"] += f" (code {digest(closure_of(kind).definitions)[:32]})"
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes) and any(map(_is_nested, value)):
         items = [(str(i), item, _hint_of_item(hint, i)) for i, item in enumerate(value)]
     else:

@@ -190,7 +190,8 @@ class Resolution:
         value = self.values[source]
         if isinstance(value, Failure):
             return value
-        assert not isinstance(value, str), f"{node.label} is of a list, but its source is a single artifact"
+        if isinstance(value, str):
+            return self._fail(node, TypeError(f"{node.label} is of a list, but its source is a single artifact"))
         try:
             return tuple(value[position] for position in positions)
         except IndexError:
@@ -218,7 +219,10 @@ class Resolution:
 
     def _expand(self, node: Expand) -> None:
         values: list[Any] = [self.values[source] for source in node.sources]
-        arguments = [self._load(v) if node.loads and isinstance(v, str) else len(v) for v in values]
+        if not node.loads and any(isinstance(v, str) for v in values):
+            error = TypeError(f"{node.label} goes through a list, but what it was given is a single artifact")
+            return self.settle(node, self._fail(node, error))
+        arguments = [self._load(v) if isinstance(v, str) else len(v) for v in values]
         self._replace(node, functools.partial(node.build, *arguments))
 
     def _replace(self, node: Node, build: Callable[[], Node]) -> None:
@@ -226,6 +230,8 @@ class Resolution:
         try:
             with node.flow.building(node.item):
                 inner = build()
+                if not isinstance(inner, Node):
+                    raise TypeError(f"what {node.label} builds must be a node, not {type(inner).__name__}")
         except Exception as error:  # the other flows go on
             self.settle(node, self._fail(node, error))
             return

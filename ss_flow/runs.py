@@ -11,7 +11,7 @@ import itertools
 import json
 import time
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -127,22 +127,24 @@ def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
 
 
 class PreviousKeys:
-    """The key under which the latest of the runs so far of a scene found each label's result.
+    """The keys under which the latest of the runs so far of a scene found the results of each label, in their order.
 
-    A label that the latest run never reached counts with the run before, so that `why` survives an interrupted run.
-    Read when first asked: most runs find everything.
+    Several calls may share a label. A label that the latest run never reached counts with the run before, so that `why`
+    survives an interrupted run. Read when first asked: most runs find everything.
     """
 
     def __init__(self, runs: Path, scene: str) -> None:
         self._latest = list(itertools.islice(latest_runs(runs, scene), RUNS_BACK))
 
-    def __call__(self, label: str) -> str | None:
-        return self._keys.get(label)
+    def __call__(self, label: str) -> Sequence[str]:
+        return self._keys.get(label, ())
 
     @functools.cached_property
-    def _keys(self) -> dict[str, str]:
-        keys: dict[str, str] = {}
+    def _keys(self) -> dict[str, list[str]]:
+        keys: dict[str, list[str]] = {}
         for run in self._latest:
+            found: dict[str, list[str]] = {}
             for event in run.nodes():
-                keys.setdefault(event["label"], event["key"])
+                found.setdefault(event["label"], []).append(event["key"])
+            keys = found | keys
         return keys

@@ -23,7 +23,7 @@ from ss_flow.events import Reporter
 from ss_flow.execute import Invocation
 from ss_flow.executors import Executor
 from ss_flow.executors.worker import WorkerDied
-from ss_flow.explain import changed_items, first_difference
+from ss_flow.explain import changed_items, first_difference, nearest
 from ss_flow.graph import Call, Flow, Node, Stored
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.kept_closures import kept_closure
@@ -32,6 +32,8 @@ from ss_flow.resolution import Failure, NotRun, Resolution
 from ss_flow.task import Resources
 
 POLL_SECONDS = 0.2
+COMPARED = 10
+"""For `why`: with how many earlier calls of the same label a call is compared."""
 OUT_OF_MEMORY = (WorkerDied, MemoryError)
 """A call that ends like this is tried once more, with nothing beside it: most likely memory ran out."""
 
@@ -41,8 +43,8 @@ class Listening:
     """What the scheduler knows of a flow besides its nodes."""
 
     reporter: Reporter
-    previous: Callable[[str], str | None]
-    """For `why`: the key under which a label's result was found the last time."""
+    previous: Callable[[str], Sequence[str]]
+    """For `why`: the keys under which a label's results were found the last time."""
 
 
 class Scheduler:
@@ -186,18 +188,20 @@ class Scheduler:
 
     def _why(self, node: Call, key: str, parts: Components) -> str:
         known = self._flows[node.flow].previous(node.label)
-        if known is None:
+        if not known:
             return "never computed for this scene"
-        if known == key:
+        if key in known:
             return "its result is no longer in the store"
-        before = self._store.action(known, whole=False)
-        if before is None:
+        records = [self._store.action(one, whole=False) for one in known[:COMPARED]]
+        among = [record.components for record in records if record is not None]
+        if not among:
             return "what changed is not known: the record of the last time is no longer in the store"
+        before = nearest(among, parts)
         closure = self._keys.recipe(node.task).closure
-        code = before.components["code"]
+        code = before["code"]
         known_code = closure if code == parts["code"] else self._store.part(code) or {}
-        items = functools.partial(self._changed_items, node, before.components["inputs"])
-        return first_difference({**before.components, "code": known_code}, {**parts, "code": closure}, items)
+        items = functools.partial(self._changed_items, node, before["inputs"])
+        return first_difference({**before, "code": known_code}, {**parts, "code": closure}, items)
 
     def _changed_items(self, node: Call, before: Mapping[str, str], name: str) -> str:
         now = self._graph.values[node.inputs[name]]
@@ -305,4 +309,7 @@ class Scheduler:
 
 
 def _described(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
+    try:
+        return f"{type(error).__name__}: {error}"
+    except Exception:  # of whoever wrote that error
+        return f"{type(error).__name__}, which cannot say what it is about"

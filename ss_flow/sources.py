@@ -31,6 +31,11 @@ class Source:
     is_package: bool
     text: str
 
+    @property
+    def folder(self) -> Path:
+        """Where a top-level module stands beside others."""
+        return (self.path.parent.parent if self.is_package else self.path.parent).resolve()
+
 
 @dataclass
 class Module:
@@ -153,28 +158,50 @@ def module_without_stars(name: str) -> Module | None:
     if source is None:
         return None
     module = Module(name, source.is_package)
-    statements = list(_top_level(ast.parse(source.text).body))
-    bound = {name for statement in statements for name in _bound_names(statement)}
-    for statement in statements:
-        for changed in dict.fromkeys([*_bound_names(statement), *(n for n in _changed_names(statement) if n in bound)]):
-            module.definitions.setdefault(changed, []).append(statement)
-    nodes = (ast.walk(statement) if isinstance(statement, _BLOCKS) else (statement,) for statement in statements)
-    module.imports = imports_of(module, itertools.chain.from_iterable(nodes))
+    statements = list(_top_level(ast.parse(source.text).body, ()))
+    bound = {name for statement, _ in statements for name in _bound_at_top(statement)}
+    changing = {s.name: _changed_by_call(s) for s, _ in statements if isinstance(s, ast.FunctionDef)}
+    bound |= {name for several in changing.values() for name in several[0]}
+    for statement, tests in statements:
+        called = (changing[name] for name in _called_at_once(statement) if name in changing)
+        changed = [*_changed_names(statement), *itertools.chain(*itertools.chain(*called))]
+        for name in dict.fromkeys([*_bound_at_top(statement), *(name for name in changed if name in bound)]):
+            known = module.definitions.setdefault(name, [])
+            known += [*(test for test in tests if test not in known), statement]
+        nodes = ast.walk(statement) if isinstance(statement, _BLOCKS) else (statement,)
+        for name, origins in imports_of(module, nodes).items():
+            module.imports.setdefault(name, []).extend(origins)
+            if tests:  # which of several it is
+                known = module.definitions.setdefault(name, [])
+                known += [test for test in tests if test not in known]
     return module
 
 
-def _top_level(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    """The statements of a module, those under `if` and `try` included; what only type checkers see is not."""
+def _top_level(body: list[ast.stmt], tests: tuple[ast.stmt, ...]) -> Iterator[tuple[ast.stmt, tuple[ast.stmt, ...]]]:
+    """The statements of a module, those under `if` and `try` included, each with the tests that it stands under.
+
+    What only type checkers see is not among them.
+    """
     for statement in body:
         if isinstance(statement, ast.If):
-            if "TYPE_CHECKING" not in ast.dump(statement.test):
-                yield from _top_level(statement.body)
-            yield from _top_level(statement.orelse)
-        elif isinstance(statement, ast.Try):
+            if ast.unparse(statement.test).rpartition(".")[2] == "TYPE_CHECKING":
+                yield from _top_level(statement.orelse, tests)
+            else:
+                test = ast.copy_location(ast.Expr(statement.test), statement)
+                yield test, tests
+                yield from _top_level([*statement.body, *statement.orelse], (*tests, test))
+        elif isinstance(statement, ast.Try | ast.TryStar):
             for part in (statement.body, *(h.body for h in statement.handlers), statement.orelse, statement.finalbody):
-                yield from _top_level(part)
+                yield from _top_level(part, tests)
         else:
-            yield statement
+            yield statement, tests
+
+
+def _bound_at_top(statement: ast.stmt) -> list[str]:
+    """The names that a statement binds in its module, `:=` included."""
+    if isinstance(statement, DEFINITIONS):
+        return _bound_names(statement)
+    return [*_bound_names(statement), *(n.target.id for n in ast.walk(statement) if isinstance(n, ast.NamedExpr))]
 
 
 def _bound_names(statement: ast.AST) -> list[str]:
@@ -195,13 +222,32 @@ def _bound_names(statement: ast.AST) -> list[str]:
     return []
 
 
+DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 _BLOCKS = (ast.For, ast.AsyncFor, ast.While, ast.With, ast.AsyncWith, ast.Match)
 
 
 def _changed_names(statement: ast.stmt) -> Iterator[str]:
     """The names whose objects a statement changes: `x[...] = y`, `x.y = z`, `x.append(y)`, `fill(x)`."""
-    if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-        return
+    if not isinstance(statement, DEFINITIONS):
+        yield from _changed_in(statement)
+
+
+def _changed_by_call(function: ast.FunctionDef) -> tuple[list[str], list[str]]:
+    """The names that a function declares global, and those whose objects it changes: where they are its module's."""
+    declared = [name for node in ast.walk(function) if isinstance(node, ast.Global) for name in node.names]
+    own = {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
+    return declared, [name for name in _changed_in(function) if name not in own]
+
+
+def _called_at_once(statement: ast.stmt) -> Iterator[str]:
+    """The functions that are called when a statement of a module runs, decorators among them, by their names."""
+    if isinstance(statement, DEFINITIONS):
+        yield from (decorator.id for decorator in statement.decorator_list if isinstance(decorator, ast.Name))
+    for part in statement.decorator_list if isinstance(statement, DEFINITIONS) else (statement,):
+        yield from (n.func.id for n in ast.walk(part) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name))
+
+
+def _changed_in(statement: ast.stmt) -> Iterator[str]:
     for node in ast.walk(statement):
         changed: list[ast.expr] = []
         if isinstance(node, ast.Subscript | ast.Attribute) and _is_written(node):

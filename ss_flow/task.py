@@ -209,6 +209,7 @@ def task(
     uses: distributions whose versions count in the key, besides those that the code imports.
     isolate: run in a process of its own (the library aborts on errors, or is not deterministic beside others).
     environment: what else of this machine the result depends on (say, the instruction set); its items enter the key.
+    Raises TypeError when the function does not declare the types of its artifacts and of its result.
     """
 
     def declare(function: Callable[P, R]) -> Task[P, R]:
@@ -216,6 +217,11 @@ def task(
 
         fix_sources(function.__module__.partition(".")[0])
         step = name or _default_name(function)
+        of = inspect.signature(function)
+        untyped = [p.name for p in of.parameters.values() if p.kind != p.KEYWORD_ONLY and p.annotation is p.empty]
+        untyped += ["its result"] if of.return_annotation is of.empty else []
+        if untyped:
+            raise TypeError(f"the task {step} must declare the type of {', '.join(untyped)}")
         declared: Any = Task(function, step, resources, uses, isolate, environment)
         functools.update_wrapper(declared, function)
         return typing.cast(Task[P, R], declared)

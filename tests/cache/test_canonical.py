@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import enum
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -37,6 +38,8 @@ def test_a_value_has_one_digest(value):
         (np.zeros(2), np.zeros((2, 1))),
         (np.zeros(2, np.float32), np.zeros(2, np.int32)),
         (0.0, -0.0),
+        (np.array(5.0), np.array([5.0])),
+        (np.array([complex(np.nan, 1)]), np.array([complex(np.nan, 2)])),
     ],
 )
 def test_values_that_differ_in_type_or_shape_differ_in_digest(a, b):
@@ -55,6 +58,14 @@ def test_the_order_of_a_mapping_does_not_count():
     assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
 
 
+class Level(int, enum.Enum):
+    LOW = 1
+
+
+def test_a_member_of_an_enumeration_counts_as_its_number():
+    assert digest(Level.LOW) == digest(1)
+
+
 @dataclass(frozen=True)
 class Place:
     where: str = field(metadata={"key": False})
@@ -65,7 +76,15 @@ def test_a_field_declared_outside_the_key_does_not_count():
     assert digest(Place("here", "x")) == digest(Place("there", "x")) != digest(Place("here", "y"))
 
 
-@pytest.mark.parametrize("value", [object(), {1: 2}, Path("x"), {1, 2}, np.array([None])])
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(object(), {1: 2}, Path("x"), {1, 2}, np.array([None])),
+        np.ma.masked_array([1.0, 2.0], [0, 1]),
+        np.zeros(2, [("x", "f4"), ("y", "i4")]),
+    ],
+    ids=["object", "number as key", "path", "set", "objects", "masked", "records"],
+)
 def test_an_unknown_type_is_refused(value):
     with pytest.raises(TypeError, match="cannot digest"):
         digest(value)

@@ -263,3 +263,67 @@ def test_the_branches_of_single_dispatch_belong_to_the_function(package):
     assert "probe.maths.twice" in found
     edited = package(step=step.replace("return 3", "return 4"), maths=MATHS)
     assert {name for name in found if found[name] != edited[name]} == {"probe.step.told"}
+
+
+EDITS = {
+    "what is imported from a library": ("from numpy import mean as reduce\n", "mean", "median", "reduce(x)"),
+    "what is imported from Python": ("from math import floor as rounded\n", "floor", "ceil", "rounded(x)"),
+    "names exchanged": ("from probe.maths import twice as f, unrelated as g\n", "f, unrelated as g",
+                        "g, unrelated as f", "f(g(x))"),
+    "flag of a condition": ("HIGH = True\nif HIGH:\n    N = 1\nelse:\n    N = 2\n", "True", "False", "N"),
+    "condition": ("if 1 > 0:\n    N = 1\nelse:\n    N = 2\n", "1 > 0", "1 < 0", "N"),
+    "outer condition": ("if 1 > 0:\n    if True:\n        N = 1\n", "1 > 0", "1 < 0", "N"),
+    "condition of a function": ("if 1 > 0:\n    def f(x): return x\n", "1 > 0", "1 > 2", "f(x)"),
+    "condition of an import": ("if 1 > 0:\n    from math import sin as f\nelse:\n    from math import cos as f\n",
+                               "1 > 0", "1 > 2", "f(x)"),
+    "not for type checkers": ("from typing import TYPE_CHECKING\nif not TYPE_CHECKING:\n    N = 1\n",
+                              "= 1", "= 2", "N"),
+    "named in an expression": ("print(N := 3)\n", "3", "4", "N"),
+    "named in a condition": ("if (N := 3) > 1:\n    pass\n", "3", "4", "N"),
+    "group of exceptions": ("try:\n    N = 3\nexcept* ValueError:\n    N = 2\n", "3", "4", "N"),
+    "filled by a decorator": (
+        "TABLE = {}\ndef add(f):\n    TABLE[f.__name__] = f\n    return f\n@add\ndef g(): return 3\n",
+        "3", "4", "TABLE"),
+    "filled by a decorator with arguments": (
+        "TABLE = {}\ndef add(n):\n    def inner(f):\n        TABLE[n] = f\n        return f\n    return inner\n"
+        "@add(1)\ndef g(): return 3\n", "3", "4", "TABLE"),
+    "filled by a call": ("TABLE = {}\ndef add(n, v):\n    TABLE[n] = v\nadd('f', 3)\n", "3", "4", "TABLE"),
+    "set by a call": ("TABLE = None\ndef _start():\n    global TABLE\n    TABLE = 3\n_start()\n", "3", "4", "TABLE"),
+    "module as a value": ("from probe import maths\n", "", "", "{1: maths}[1].twice(x)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_an_edit_that_changes_what_a_name_stands_for_is_seen(package, case):
+    before, old, new, used = EDITS[case]
+    step = f"{before}\ndef run(x):\n    return {used}\n"
+    found = package(step=step, maths=MATHS)
+    maths = MATHS if old else MATHS.replace("2", "3")
+    assert found != package(step=step.replace(before, before.replace(old, new)) if old else step, maths=maths)
+
+
+@pytest.mark.parametrize("hints", ["x: 'Out'", "x: list['Out']", "x: 'list[Out]'"])
+def test_a_class_that_only_an_annotation_in_quotes_names_is_followed(package, hints):
+    step = f"class Out:\n    pass\n\ndef twice():\n    pass\n\ndef run({hints}) -> Literal['twice']:\n    return x\n"
+    assert set(package(step=f"from typing import Literal\n{step}")) == {"probe.step.run", "probe.step.Out"}
+
+
+def test_how_text_is_written_does_not_count(package):
+    assert package(step="def run(x):\n    return u'abc'\n") == package(step="def run(x):\n    return 'abc'\n")
+
+
+@pytest.mark.parametrize("way", ["import ss_flow.task as sst", "from ss_flow import task as sst"])
+def test_the_task_decorator_does_not_count_whatever_it_is_called(package, way):
+    step = "@sst.task({})\ndef run(x: int) -> int:\n    return x\n"
+    plain, more = (package(step=f"{way}\n{step.format(given)}") for given in ("", "isolate=True"))
+    assert plain == more
+    other = "def task(given):\n    return lambda f: f\n"
+    one, two = (package(step=f"from probe import other as sst\n{step.format(x)}", other=other) for x in (1, 2))
+    assert one != two
+
+
+def test_a_module_beside_that_no_distribution_holds_is_followed(package, tmp_path):
+    (tmp_path / "beside_probe.py").write_text("def f(x):\n    return x\n")
+    step = "from beside_probe import f\nimport numpy as np\n\ndef run(x):\n    return np.abs(f(x))\n"
+    assert {"beside_probe.f"} < set(package(step=step))
+    assert modules_of(package, step=step) == {"numpy"}

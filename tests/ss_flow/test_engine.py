@@ -13,13 +13,15 @@ import pytest
 import ss_flow_toy as toy
 from aged_store import age_all
 
-from ss_flow import engine
+from ss_flow import engine, keys
+from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
+from ss_flow.closure import Closure, closure_of
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
 from ss_flow.explain import first_difference
-from ss_flow.graph import INDEX, Flow, each, gather, labelled, otherwise, pick, stored
+from ss_flow.graph import INDEX, Flow, each, expand, gather, labelled, otherwise, pick, stored
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
@@ -439,8 +441,17 @@ def test_the_class_of_a_parameter_counts_where_its_declared_type_does_not_tell_i
     ]
     assert len({Keys().key(modelled, {}, one) for one in given}) == len(given)
     parts = [Keys().components(modelled, {}, one)["parameters"] for one in ({"base": Linear()}, {"base": Square()})]
-    assert parts == [{"base.slope": 1.0}, {"base": f"{__name__}.Square", "base.slope": 1.0}]
+    code = digest(closure_of(Square).definitions)[:32]
+    assert parts == [{"base.slope": 1.0}, {"base": f"{__name__}.Square (code {code})", "base.slope": 1.0}]
     assert Keys().components(modelled, {}, {"several": (Linear(2.0),)})["parameters"] == {"several.0.slope": 2.0}
+
+
+def test_the_code_of_a_parameter_counts_where_its_declared_type_does_not_name_it(monkeypatch):
+    given = ({"base": Linear()}, {"union": Linear()}, {"base": Square()})
+    before = [Keys().key(modelled, {}, one) for one in given]
+    edited = Closure({"Square": "edited"}, frozenset(), {})
+    monkeypatch.setattr(keys, "closure_of", lambda of: edited if of is Square else closure_of(of))
+    assert [Keys().key(modelled, {}, one) == key for one, key in zip(given, before, strict=True)] == [True, True, False]
 
 
 def test_a_parameter_that_two_tasks_share_has_the_same_keys_whoever_comes_first():
@@ -535,7 +546,13 @@ def test_what_changed_is_not_known_where_the_record_of_the_last_time_is_gone(sto
 
 @pytest.mark.parametrize(
     ("then", "now", "said"),
-    [(1, 1.0, "1 -> 1.0"), (-0.0, 0.0, "-0.0 -> 0.0"), (True, 1, "True -> 1"), ({"a": 1}, {"a": 1.0}, "{'a': 1} -> ")],
+    [
+        (1, 1.0, "1 -> 1.0"),
+        (-0.0, 0.0, "-0.0 -> 0.0"),
+        (True, 1, "True -> 1"),
+        (1, "1", "1 -> '1'"),
+        ({"a": 1}, {"a": 1.0}, "{'a': 1} -> "),
+    ],
 )
 def test_values_that_only_python_takes_for_equal_are_told_apart(then, now, said):
     parts = {"task": {}, "code": {}, "packages": {}, "environment": {}, "inputs": {}}
@@ -543,6 +560,47 @@ def test_values_that_only_python_takes_for_equal_are_told_apart(then, now, said)
     assert changed.startswith(f"parameter x {said}")
     same = {**parts, "parameters": {"x": float("nan"), "y": {"a": 1, "b": 2}}}
     assert first_difference(same, {**parts, "parameters": {"y": {"b": 2, "a": 1}, "x": float("nan")}}) == ""
+
+
+def test_of_long_values_why_shows_where_they_differ():
+    parts = {"task": {}, "code": {}, "packages": {}, "environment": {}, "inputs": {}}
+    then, now = list(range(1000)), [*range(990), 1, *range(991, 1000)]
+    changed = first_difference({**parts, "parameters": {"x": then}}, {**parts, "parameters": {"x": now}})
+    old, new = changed.removeprefix("parameter x ").split(" -> ")
+    assert "989, 990, 991" in old and "989, 1, 991" in new and max(len(old), len(new)) <= 60
+
+
+def test_why_compares_a_call_with_that_one_of_its_label_that_it_differs_from_least(store):
+    def flow(limit):
+        xs = toy.source(values=(1.0, 2.0))
+        return {"a": toy.clip(xs[0], limit=limit), "b": toy.clip(xs[1], limit=limit), "c": toy.clip(xs[1], limit=7.0)}
+
+    run(store, lambda: flow(3.0))
+    report = run(store, lambda: flow(4.0))
+    assert {n["why"] for n in report.nodes if n["event"] == "finished"} == {"parameter limit 3.0 -> 4.0"}
+
+    def other(value):
+        xs = toy.source(values=(1.0, value))
+        return {"a": toy.clip(xs[0], limit=5.0), "b": toy.clip(xs[1], limit=6.0)}
+
+    run(store, lambda: other(2.0))
+    report = run(store, lambda: other(3.0))
+    assert [n["why"] for n in report.nodes if n["step"] == "ss_flow_toy.clip" and "why" in n] == ["input x changed"]
+
+
+class Mute(Exception):
+    def __str__(self):
+        raise ValueError
+
+
+@task()
+def muted(x: toy.Number) -> toy.Number:
+    raise Mute
+
+
+def test_an_error_that_cannot_be_told_fails_its_node_alone(store):
+    report = run(store, lambda: {"x": muted(toy.source(values=(1.0,))[0])})
+    assert [type(failure.error) for failure in report.failures] == [Mute]
 
 
 def test_a_numpy_scalar_counts_as_the_number_that_it_is(store):
@@ -581,8 +639,12 @@ def test_an_input_that_is_no_node_is_refused():
         (lambda xs: each(xs, build=lambda x: toy.total((3.0,))), "must be a node"),
         (lambda xs: toy.square(xs[7]), "not among the 2 items"),
         (lambda xs: toy.total(pick(xs, [0, 7])), "not among the 2 items"),
+        (lambda xs: each(toy.square(xs[0]), build=toy.square), "is a single artifact"),
+        (lambda xs: toy.square(toy.square(xs[0])[0]), "is a single artifact"),
+        (lambda xs: expand(xs[0], lambda x: None), "must be a node, not NoneType"),
+        (lambda xs: expand(xs[0], lambda x: xs["a"]), "chosen by its number, not by a str"),
     ],
-    ids=["lengths", "no node", "item", "pick"],
+    ids=["lengths", "no node", "item", "pick", "each of one", "item of one", "nothing", "name"],
 )
 def test_a_node_that_cannot_be_expanded_fails_and_the_other_flows_go_on(store, bad, said):
     flows = [lambda: {"x": bad(toy.source(values=(1.0, 2.0)))}, toy.flow]
@@ -590,6 +652,54 @@ def test_a_node_that_cannot_be_expanded_fails_and_the_other_flows_go_on(store, b
     (failure,) = failed.failures
     assert said in str(failure.error) and failed.values["x"] is failure
     assert good.failures == [] and value(store, good.values["total"]) == 14.0
+
+
+def test_expand_gets_the_number_of_the_items_of_a_list(store):
+    def flow():
+        xs = toy.source(values=(1.0, 2.0))
+        return {"x": expand(xs, lambda count: toy.clip(xs[0], limit=-float(count)))}
+
+    assert value(store, run(store, flow).values["x"]) == -2.0
+
+
+@pytest.mark.parametrize(
+    ("build", "said"),
+    [
+        (lambda: None, "a dict of nodes, not NoneType"),
+        (lambda: {"x": [toy.source(values=(1.0,))]}, "the output x must be a node, not list"),
+        (lambda: {"x": OF_ANOTHER_FLOW}, "the output x is a node of another flow"),
+        (lambda: {"x": toy.square(OF_ANOTHER_FLOW)}, "the input x of ss_flow_toy.square is a node of another flow"),
+        (lambda: {"x": toy.total((OF_ANOTHER_FLOW,))}, "is a node of another flow"),
+        (lambda: {"x": toy.source(values=(1.0, {2}))}, "the parameter values holds a set"),
+    ],
+)
+def test_a_mistake_in_a_flow_is_told_in_one_sentence(store, build, said):
+    with pytest.raises(TypeError, match=said):
+        run(store, build)
+
+
+with Flow("another").building():
+    OF_ANOTHER_FLOW = toy.source(values=(1.0,))
+
+
+def test_a_task_declares_the_types_of_its_artifacts_and_of_its_result():
+    def untyped(x, *, by=1):
+        return x
+
+    with pytest.raises(TypeError, match="the task t must declare the type of x, its result"):
+        task(name="t")(untyped)
+
+
+def test_a_call_has_parameters_of_its_own_as_its_key_sees_them():
+    @task(name="t")
+    def several(*, pair: tuple[int, ...], many: list[int], free: object) -> Linear:
+        return Linear()
+
+    given = {"pair": [1, np.int64(2)], "many": (1,), "free": {"b": [1], "a": np.float32(0.5)}}
+    with Flow("x").building():
+        kept = several(**given).parameters
+    given["free"]["b"].append(2)
+    assert repr(kept) == "{'pair': (1, 2), 'many': [1], 'free': {'a': 0.5, 'b': [1]}}"
 
 
 def test_a_node_cannot_be_gone_through_as_a_list():
@@ -605,5 +715,6 @@ def test_a_gpu_counts_where_the_driver_shows_one_unless_tasks_are_said_to_use_no
 
 def test_a_definition_that_has_fields_is_said_to_have_changed_in_fields_or_code():
     parts = {"task": {}, "parameters": {}, "packages": {}, "environment": {}, "inputs": {}}
-    before, now = ({**parts, "code": {f"ss_flow_toy.{name}": d}} for name, d in (("Number", "a"), ("Number", "b")))
-    assert first_difference(before, now) == "fields or code of ss_flow_toy.Number changed"
+    for name, what in (("Number", "fields or code"), ("square", "code"), ("helper", "code")):
+        before, now = ({**parts, "code": {f"ss_flow_toy.{name}": digest}} for digest in "ab")
+        assert first_difference(before, now) == f"{what} of ss_flow_toy.{name} changed"
