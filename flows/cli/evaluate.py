@@ -71,8 +71,8 @@ class Evaluate:
     """For "points": annotated points farther than this from everything labelled count as unlabelled, in world units; 0
     = no limit, as in the protocol."""
     compat: bool = False
-    """For "points": score as the published scripts do: by the annotation of the finer mesh, and with the ids 0 to the
-    number of instances, also where they have gaps."""
+    """For "points" with a --truth of ScanNet: score as the published scripts do: by the annotation of the finer mesh,
+    and with the ids 0 to the number of instances, also where they have gaps."""
     texts: OptionalPath = None
     """For "lerf-...": a file (.json) of what to ask for in the place of a category's own name: {category: text}."""
     json: bool = False
@@ -99,6 +99,8 @@ class Evaluate:
             raise InputError(f"--radius {self.radius} is out of range; it must be 0 or more.")
         if self.protocol != "points" and (self.radius or self.compat):
             raise InputError("--radius and --compat are for --protocol points; add it.")
+        if self.compat and not self.truth:
+            raise InputError("--compat follows the published scripts, which score ScanNet's mesh; add --truth DIR.")
         if self.protocol in ("views", "objects") and self.truth:
             raise InputError("--truth is for --protocol points and for those on labelled frames; add one.")
         if self.protocol not in LERF and self.texts:

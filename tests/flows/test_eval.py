@@ -187,6 +187,7 @@ WRONG = [
     ("--protocol", "objects", "--truth", "."),
     ("--protocol", "points", "--texts", "x.json"),
     ("--protocol", "lerf-2d", "--compat"),
+    ("--protocol", "points", "--compat"),
 ]
 
 
