@@ -111,6 +111,8 @@ TABLE = {
     "splat.reconstruct.iterations_per_view": (8, 8, 8),
     "splat.reconstruct.min_iterations": (1000, 1000, 30),
     "splat.reconstruct.max_iterations": (1000, 1000, 60),
+    # A28: the background is trained like the others, by the rates and the schedule of their steps.
+    "splat.reconstruct.background_scale": (1.0, 1.0, 2.0),
     # 23
     "splat.reconstruct.densify": ("classic", "classic", "classic"),
     "splat.reconstruct.max_points": (0, 0, 10_000),
@@ -178,6 +180,8 @@ TABLE = {
     "splat.refine.prompts": (5, 5, 5),
     "splat.refine.prompt_alpha": (0.0, 0.3, 0.3),
     "splat.refine.drop_hull": (False, True, True),
+    # P3: a view is left out only where no Gaussian is visible.
+    "splat.refine.min_visible": (1, 1, 10),
     # 27
     "splat.refine.alpha_threshold": (0.5, 0.5, 0.5),
     # 28, and the cut of P2. The reference drops black Gaussians and, by a slip, the most opaque ones.
