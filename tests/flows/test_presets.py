@@ -230,7 +230,7 @@ TABLE = {
     "splat.reconstruct.prune_contribution": (0.0, 0.0, 1 / 255),
     # 38: the text says CLIP, the code how it is asked.
     "semantics.query.prompt": ("an image of a {text}", "an image of a {text}", "{text}"),
-    # 39: the masks are those that the Gaussians cast (Sec. 4.2).
+    # 39: the masks are those that the Gaussians cast (Sec. 5.2).
     "semantics.masks": ("rendered", "rendered", "refined"),
     "semantics.describe.background": ("blur", "blur", "blur"),
     "semantics.describe.margin_px": (10, 10, 10),
