@@ -2,7 +2,8 @@
 
 Not in it, as no parameter holds them: what is a rule and not a number (of rows 10, 27, 28, 38), the reference's image
 crops (2), its point sources (11), its erosion radii of the first view and of one branch (13), and the dense
-descriptors (42-44).
+descriptors (42-44). DBSCAN's eps (14, 15) is in metres there and in multiples of the cloud's spacing here, the same
+only where points are 2 cm apart.
 """
 
 from __future__ import annotations
@@ -70,11 +71,11 @@ TABLE = {
     "split.reproject.selection.erosion.diagonal": (0.0, 0.0, 800.0),
     "split.reproject.selection.erosion.keep_share": (0.0, 0.0, 0.25),
     "split.reproject.selection.erosion.keep_pixels": (0, 0, 30),
-    # 14: 0.10 m of a cloud with 2 cm between points; a share of 1 keeps the largest cluster alone.
+    # 14: 0.10 m if points are 2 cm apart; a share of 1 keeps the largest cluster alone.
     "split.observe.clusters.eps": (5.0, 5.0, 0.0),
     "split.observe.clusters.min_samples": (10, 10, 10),
     "split.observe.clusters.keep_share": (1.0, 1.0, 0.1),
-    # 15: 0.05 m of such a cloud.
+    # 15: 0.05 m then.
     "split.propagate.label_clusters.eps": (2.5, 2.5, 2.5),
     "split.propagate.label_clusters.min_samples": (10, 10, 10),
     "split.propagate.label_clusters.keep_share": (1.0, 1.0, 0.05),
