@@ -69,6 +69,8 @@ def scan_truth(folder: Path, reference: Reference, *, compat: bool = False) -> T
     """
     semantic = next((p for p in (folder / "habitat", folder) if (p / "mesh_semantic.ply").is_file()), None)
     if semantic is not None:
+        if compat:
+            raise InputError(f"{semantic} is Replica's, and --compat is for ScanNet's annotation; leave it out.")
         info = semantic / "info_semantic.json"
         if not info.is_file():
             raise InputError(f"{semantic} has no info_semantic.json, which says what the objects of Replica are.")

@@ -70,6 +70,7 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
             lambda seen: retrain(
                 some(views, seen),
                 exclusive(refined(row), pick(masks_refined, seen)),
+                found.instances[row],
                 reconstructed(row),
                 params=settings.reconstruct,
                 visibility=visibility,

@@ -450,7 +450,7 @@ class EditedScene(Gaussians):
 
 @dataclass(frozen=True)
 class Descriptors:
-    """The semantic descriptor of one instance (Split&Splat, Sec. 4.2: f_obj)."""
+    """The semantic descriptor of one instance (Split&Splat, Sec. 5.2: f_obj)."""
 
     instance_id: int
     embedding: Float32

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,6 +27,7 @@ from ss_flow.flows.cli.context import (
 )
 from ss_flow.flows.cli.query import encoder_name, query_params
 from ss_flow.flows.cli.telling import print_table
+from ss_flow.flows.deliver import FALLBACKS
 from ss_flow.flows.evaluate import (
     LERF,
     LabelledScene,
@@ -71,8 +72,8 @@ class Evaluate:
     """For "points": annotated points farther than this from everything labelled count as unlabelled, in world units; 0
     = no limit, as in the protocol."""
     compat: bool = False
-    """For "points": score as the published scripts do: by the annotation of the finer mesh, and with the ids 0 to the
-    number of instances, also where they have gaps."""
+    """For "points" with a --truth of ScanNet: score as the published scripts do: by the annotation of the finer mesh,
+    and with the ids 0 to the number of instances, also where they have gaps."""
     texts: OptionalPath = None
     """For "lerf-...": a file (.json) of what to ask for in the place of a category's own name: {category: text}."""
     json: bool = False
@@ -85,7 +86,7 @@ class Evaluate:
         warnings: list[str] = []
         tables = self._measured(warnings)
         if self.json:
-            told = {"protocol": self.protocol, "result": str(self.result), "metrics": tables.stages}
+            told = {"protocol": self.protocol, "result": str(self.result), **tables.asked, "metrics": tables.stages}
             objects = {"objects": tables.objects} if tables.objects else {}
             print(json.dumps({**told, **objects, "warnings": warnings}, indent=1))
             return 0
@@ -99,6 +100,8 @@ class Evaluate:
             raise InputError(f"--radius {self.radius} is out of range; it must be 0 or more.")
         if self.protocol != "points" and (self.radius or self.compat):
             raise InputError("--radius and --compat are for --protocol points; add it.")
+        if self.compat and not self.truth:
+            raise InputError("--compat follows the published scripts, which score ScanNet's mesh; add --truth DIR.")
         if self.protocol in ("views", "objects") and self.truth:
             raise InputError("--truth is for --protocol points and for those on labelled frames; add one.")
         if self.protocol not in LERF and self.texts:
@@ -178,7 +181,11 @@ class Evaluate:
             said = ", ".join(labelled.unread)
             warnings.append(f"{name_in_words(name)} cannot be asked for {said}; these categories score 0.")
         build = LERF[self.protocol]
-        return _Tables(_metrics(_evaluated(run, lambda nodes, reference: dict(build(nodes, labelled)), warnings)))
+        asked: dict[str, Any] = {"encoder": FALLBACKS["encoder"] if name == "none" else name}
+        if self.protocol != "lerf-2d":
+            asked |= {"prompt": labelled.query.prompt, "tau_corr": labelled.query.tau_corr}
+        stages = _metrics(_evaluated(run, lambda nodes, reference: dict(build(nodes, labelled)), warnings))
+        return _Tables(stages, asked=asked)
 
 
 @dataclass(frozen=True)
@@ -189,6 +196,8 @@ class _Tables:
     """Figures by stage."""
     objects: Mapping[str, list[dict[str, float]]] | None = None
     """Rows of single objects, by what they are."""
+    asked: Mapping[str, Any] = field(default_factory=dict)
+    """What texts were asked with, where they were (spec 2.2): the encoder, and what it depends on besides."""
 
 
 def name_in_words(encoder: str) -> str:
@@ -240,6 +249,8 @@ def _rows(**columns: np.ndarray) -> list[dict[str, float]]:
 
 
 def _tell(tables: _Tables, out: Console) -> None:
+    if tables.asked:
+        out.print(escape(", ".join(f"{name}: {value}" for name, value in tables.asked.items())), highlight=False)
     table = Table("metric", *(_STAGES.get(stage, stage) for stage in tables.stages), box=None)
     stages = tables.stages.values()
     for name in dict.fromkeys(name for values in stages for name in values):

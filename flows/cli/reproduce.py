@@ -122,7 +122,9 @@ class Reproduce:
         usual = (2 if self.table == "ablation" else 1) if self.data == GENERATED else (20 if plan.data == "scan" else 1)
         stride = (self.stride or usual) if variant.subsampled else 1
         params = settings.preset(Params(), self.execution.preset)
-        texts = [f"capture.stride={stride}", *(f"{name}={seed}" for name in _SEEDS)]
+        # The paper's authors scale ScanNet's photos to its depth maps, 640 x 480 (spec 2.1).
+        small = ["capture.ingest.max_side=640"] if plan.data == "scan" and self.data != GENERATED else []
+        texts = [f"capture.stride={stride}", *small, *(f"{name}={seed}" for name in _SEEDS)]
         return settings.apply(params, [*texts, *self.execution.texts, *variant.settings])
 
     def _prepared(self, runs: Sequence[Run], plan: Plan, digests: FileDigests) -> tuple[dict[int, _Ready], list[str]]:
@@ -202,9 +204,12 @@ class Reproduce:
         masks = dict.fromkeys(self._masks_of(one.prepared) for one in ready)
         encoder = networks.encoder.name if networks.encoder else FALLBACKS["encoder"]
         strides = sorted({one.prepared.params.capture.stride for one in ready})
+        side = ready[0].prepared.params.capture.ingest.max_side
+        photos = f"photos: 640 x 480 in the code of the paper's authors, at most {side} pixels wide or high here"
         return [
             f"data: {printed.data.partition(';')[0]} in the paper, {rooms} here",
             f"masks: SAM 2 in the paper, {' and '.join(masks)} here",
+            *([photos] if self.data != GENERATED and not ready[0].labelled else []),
             *([f"encoder: CLIP in the paper, {encoder} here"] if ready[0].labelled else []),
             f"preset: {' '.join((self.execution.preset, *self.execution.texts))}; every n-th frame: "
             f"{', '.join(map(str, strides))}",

@@ -32,8 +32,8 @@ def open_scannet(root: Path) -> SceneFiles:
     """A ScanNet export: `color/ intrinsic/`, and `pose/` and `depth/` or one of them.
 
     Poses are camera-to-world in metres; depth is in millimetres. The intrinsics assume integer pixel centres, hence
-    half a pixel is added to cx and cy (spec 3.0). A pose that is infinite throughout marks a view whose tracking was
-    lost; such views are skipped.
+    half a pixel is added to cx and cy (spec 3.0). A pose that holds an infinity or NaN marks a view whose tracking was
+    lost; such views are skipped (spec 2.1).
     Raises InputError when a view lacks its pose or depth, or a file makes no sense.
     """
     photos = list(by_stem(files_in(root / "color")).items())
@@ -80,7 +80,7 @@ def _read_pose(root: Path, stem: str) -> Pose | None:
 
 
 def _pose(camera_to_world: Float64, where: str) -> Pose | None:
-    if np.isinf(camera_to_world[:3]).all():
+    if not np.isfinite(camera_to_world[:3]).all():
         return None
     return rigid_inverse(camera_to_world, where)
 

@@ -52,7 +52,7 @@ _OF_ANY_CAPTURE = ("color", "frames", "images", "input", "photos", "rgb", "trans
 
 @dataclass(frozen=True)
 class Votes:
-    """How far the views agree on the dense points (Split&Splat, Sec. 3.1.2)."""
+    """How far the views agree on the dense points (Split&Splat, Sec. 3.1.3)."""
 
     labelled: float
     """Share of the points that got a label."""

@@ -50,6 +50,8 @@ class TruePoints:
     """What the annotation calls instances 0, 1, ...; none where it does not say."""
     stuff: Int32 = field(default_factory=lambda: np.zeros(0, np.int32))
     """The instances that are walls, floors or the like."""
+    first_id: int = 0
+    """The id that the annotation begins with: 1 where its 0 means "nothing"."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def lifted(points: PointCloud, seen: Sequence[Visibility], truth: Sequence[Label
             at = ids.ids.ravel()[seen[view].pixel]
             pairs.append(np.stack([seen[view].point_index, at], axis=1)[at > 0])
     instance = most_frequent(np.concatenate(pairs), len(points.points))
-    return TruePoints(points.points, instance)
+    return TruePoints(points.points, instance, first_id=1)
 
 
 def most_frequent(votes: NDArray[np.int64], count: int) -> Int32:
@@ -148,7 +150,9 @@ def instance_ious(scene: Gaussians, truth: TruePoints) -> InstanceIoUs:
 def _all_metrics(
     truth: TruePoints, predicted: Int32, instances: Sequence[InstanceMasks], *, compat_gap_bug: bool
 ) -> dict[str, float]:
-    found = point_metrics(truth.instance, predicted, _scores(instances), compat_gap_bug=compat_gap_bug)
+    found = point_metrics(
+        truth.instance, predicted, _scores(instances), first_id=truth.first_id, compat_gap_bug=compat_gap_bug
+    )
     return found | (quality_by_kind(truth.instance, predicted, truth.stuff) if len(truth.stuff) else {})
 
 
@@ -157,16 +161,19 @@ def quality_by_kind(truth: Labels, predicted: Labels, stuff: Int32) -> dict[str,
 
     truth: [N] instance of each point, negative = not annotated. predicted: [N], 0 = unlabelled. stuff: the true
     instances that are stuff. A prediction of which more than half lies on the other kind is no false positive here, but
-    one there. Returns pq_things and pq_stuff, without the one that no instance is of.
+    one there; one that lies mostly where nothing is annotated is none at all. Returns pq_things and pq_stuff, without
+    the one that no instance is of.
     """
     annotated = truth >= 0
     table = contingency(truth[annotated], predicted[annotated]).without(predicted=0)
+    _, everywhere = np.unique(predicted[np.isin(predicted, table.predicted_ids)], return_counts=True)
+    on_void = 2 * table.predicted_area < everywhere
     is_stuff = np.isin(table.truth_ids, stuff)
     found = {}
     for name, own in (("pq_things", ~is_stuff), ("pq_stuff", is_stuff)):
         if own.any():
             of_other = 2 * table.intersection[~own].sum(axis=0) > table.predicted_area
-            found[name] = panoptic_quality(table.of_truth(own), of_other).pq
+            found[name] = panoptic_quality(table.of_truth(own), of_other | on_void).pq
     return found
 
 
@@ -179,15 +186,20 @@ def _scores(instances: Sequence[InstanceMasks]) -> dict[int, float]:
 
 
 def point_metrics(
-    truth: Labels, predicted: Labels, score: Mapping[int, float], *, compat_gap_bug: bool = False
+    truth: Labels,
+    predicted: Labels,
+    score: Mapping[int, float],
+    *,
+    first_id: int = 0,
+    compat_gap_bug: bool = False,
 ) -> dict[str, float]:
     """All measures on points.
 
     truth: [N] instance of each point, negative = not annotated. predicted: [N], 0 = unlabelled. score: how sure each
-    predicted instance is. compat_gap_bug: see `ig_metrics`.
+    predicted instance is. first_id: see `TruePoints`. compat_gap_bug: see `ig_metrics`.
     Returns those of `ig_metrics`, ap, ap50, ap25, those of `segmentation_metrics` on the annotated points, annotated
-    (the share of the points that are), and id_gaps, 1 where the ids of the ground truth have gaps and so the published
-    script scores other instances. Raises InputError when no point is annotated.
+    (the share of the points that are), and id_gaps, 1 where the ids of the ground truth have gaps, from `first_id` on,
+    and so the published script scores other instances. Raises InputError when no point is annotated.
     """
     together = ig_metrics(truth, predicted, compat_gap_bug=compat_gap_bug)
     table = contingency(truth, predicted).without(predicted=0)
@@ -199,7 +211,7 @@ def point_metrics(
         "ap50": scannet_ap(table, score, 0.5),
         "ap25": scannet_ap(table, score, 0.25),
         "annotated": float((truth >= 0).mean()),
-        "id_gaps": float(len(known) != known.max() + 1),
+        "id_gaps": float(len(known) != known.max() + 1 - first_id),
     }
 
 

@@ -166,7 +166,7 @@ def merge_union(masks: Bool, grid: Int32, duplicate: float, overlap: float) -> t
         for row in rows:
             mask = masks[row]
             hit = [p for p in pool if _pixels(p & mask) > overlap * min(_pixels(p), _pixels(mask))]
-            if hit and level > grid.min():
+            if hit and level > 0:
                 for promoted in hit:
                     promoted |= mask
             else:

@@ -1,4 +1,4 @@
-"""One vector for each instance: what a text-image encoder sees of it (Split&Splat, Sec. 4.2; spec rows 38-40)."""
+"""One vector for each instance: what a text-image encoder sees of it (Split&Splat, Sec. 5.2; spec rows 38-40)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which instances, or parts of them, a text means (Split&Splat, Sec. 4.2 and 4.4.4; spec row 41, A29)."""
+"""Which instances, or parts of them, a text means (Split&Splat, Sec. 5.2 and 5.4.4; spec row 41, A29)."""
 
 from __future__ import annotations
 

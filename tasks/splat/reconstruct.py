@@ -10,7 +10,7 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import REFINED, Float32, Gaussians, InstanceMasks, Int32
+from ss_flow.tasks.artifacts import Float32, Gaussians, InstanceMasks, Int32
 from ss_flow.tasks.gaussians.densification import Schedule
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, initialise, laid_flat
 from ss_flow.tasks.gaussians.learning_rates import LearningRates
@@ -139,6 +139,7 @@ def reconstruct(
 def retrain(
     views: Views,
     instance: InstanceMasks,
+    first: InstanceMasks,
     gaussians: Gaussians,
     *,
     params: ReconstructParams,
@@ -146,17 +147,21 @@ def retrain(
 ) -> Gaussians:
     """The Gaussians of an instance after its masks were refined (spec row 31).
 
-    instance: with the refined masks. gaussians: of the first training; they come back as they are where refinement
-    changed no mask, or where `retrain_share` is 0. The rest as for `reconstruct`.
+    instance: with the refined masks. first: with those of the first training. gaussians: of the first training; they
+    come back as they are where it saw the same masks, or where `retrain_share` is 0. The rest as for `reconstruct`.
     """
-    unchanged = not (instance.origin == REFINED).any() or not params.retrain_share
-    if unchanged or instance.weak or not len(instance.points) or not instance.views:
+    seen_already = not params.dilation and _same_masks(first, instance)
+    if seen_already or not params.retrain_share or instance.weak or not len(instance.points) or not instance.views:
         return gaussians
     scene = views.compared(visibility)
     instance = _completed(scene, instance, params)
     initial = gaussians if params.warm_start and len(gaussians) else _from_points(instance, params)
     steps = max(1, round(params.retrain_share * params.iterations(instance)))
     return _trained(scene, instance, initial, params, steps)
+
+
+def _same_masks(a: InstanceMasks, b: InstanceMasks) -> bool:
+    return a.views == b.views and np.array_equal(a.packed, b.packed)
 
 
 def _completed(scene: SceneViews, instance: InstanceMasks, params: ReconstructParams) -> InstanceMasks:

@@ -164,7 +164,7 @@ def rendered(
     params: RefineParams,
     visibility: VisibilityParams = VisibilityParams(),
 ) -> InstanceMasks:
-    """An instance with M^gs in the place of its masks, which its descriptor then sees (Split&Splat, Sec. 4.2).
+    """An instance with M^gs in the place of its masks, which its descriptor then sees (Split&Splat, Sec. 5.2).
 
     views: at least those that have a mask. gaussians: of the instance. Views without a mask get none, and where the
     Gaussians show nothing the mask goes. The background (id 0) and an instance without Gaussians come back as they are.

@@ -138,7 +138,7 @@ RUNS: dict[str, tuple[Make, str]] = {
     ),
     "a photo that was cut": (lambda base, scene: [cut(scene / "color/0003.jpg", scene)], "color/0003.jpg"),
     "depth that is no image": (lambda base, scene: [file(scene / "depth/0001.png", scene)], "depth/0001.png"),
-    "a pose that is not finite": (
+    "a pose with a word in it": (
         lambda base, scene: [without_number(scene / "pose/0002.txt", scene)],
         "pose/0002.txt",
     ),
@@ -170,7 +170,7 @@ def cut(photo: Path, scene: Path) -> Path:
 
 
 def without_number(pose: Path, scene: Path) -> Path:
-    pose.write_text(pose.read_text().replace(pose.read_text().split()[3], "nan", 1))
+    pose.write_text(pose.read_text().replace(pose.read_text().split()[3], "far", 1))
     return scene
 
 

@@ -100,6 +100,11 @@ def test_texts_are_looked_for_on_labelled_frames(tiny, labels, protocol):
     found = document["metrics"]["splat"]
     assert found["num_frames"] == 3 and 0 < found["macc50"] <= found["macc25"] < 1, "nothing is found of the sheep"
     assert len(document["warnings"]) == 1 and "sheep" in document["warnings"][0]
+    asked = {name: document.get(name) for name in ("encoder", "prompt", "tau_corr")}
+    of_query = (None, None) if protocol == "lerf-2d" else ("{text}", 0.02)
+    assert tuple(asked.values()) == ("colour words (no network)", *of_query)
+    first = ss_flow(*(option for option in options if option != "--json")).out.splitlines()[0]
+    assert first == ", ".join(f"{name}: {value}" for name, value in asked.items() if value is not None)
 
 
 def test_a_category_can_be_asked_for_in_other_words(tiny, labels, tmp_path):
@@ -187,6 +192,7 @@ WRONG = [
     ("--protocol", "objects", "--truth", "."),
     ("--protocol", "points", "--texts", "x.json"),
     ("--protocol", "lerf-2d", "--compat"),
+    ("--protocol", "points", "--compat"),
 ]
 
 

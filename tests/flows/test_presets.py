@@ -2,7 +2,8 @@
 
 Not in it, as no parameter holds them: what is a rule and not a number (of rows 10, 27, 28, 38), the reference's image
 crops (2), its point sources (11), its erosion radii of the first view and of one branch (13), and the dense
-descriptors (42-44).
+descriptors (42-44). DBSCAN's eps (14, 15) is in metres there and in multiples of the cloud's spacing here, the same
+only where points are 2 cm apart.
 """
 
 from __future__ import annotations
@@ -70,11 +71,11 @@ TABLE = {
     "split.reproject.selection.erosion.diagonal": (0.0, 0.0, 800.0),
     "split.reproject.selection.erosion.keep_share": (0.0, 0.0, 0.25),
     "split.reproject.selection.erosion.keep_pixels": (0, 0, 30),
-    # 14: 0.10 m of a cloud with 2 cm between points; a share of 1 keeps the largest cluster alone.
+    # 14: 0.10 m if points are 2 cm apart; a share of 1 keeps the largest cluster alone.
     "split.observe.clusters.eps": (5.0, 5.0, 0.0),
     "split.observe.clusters.min_samples": (10, 10, 10),
     "split.observe.clusters.keep_share": (1.0, 1.0, 0.1),
-    # 15: 0.05 m of such a cloud.
+    # 15: 0.05 m then.
     "split.propagate.label_clusters.eps": (2.5, 2.5, 2.5),
     "split.propagate.label_clusters.min_samples": (10, 10, 10),
     "split.propagate.label_clusters.keep_share": (1.0, 1.0, 0.05),
@@ -111,6 +112,8 @@ TABLE = {
     "splat.reconstruct.iterations_per_view": (8, 8, 8),
     "splat.reconstruct.min_iterations": (1000, 1000, 30),
     "splat.reconstruct.max_iterations": (1000, 1000, 60),
+    # A28: the background is trained like the others, by the rates and the schedule of their steps.
+    "splat.reconstruct.background_scale": (1.0, 1.0, 2.0),
     # 23
     "splat.reconstruct.densify": ("classic", "classic", "classic"),
     "splat.reconstruct.max_points": (0, 0, 10_000),
@@ -178,6 +181,8 @@ TABLE = {
     "splat.refine.prompts": (5, 5, 5),
     "splat.refine.prompt_alpha": (0.0, 0.3, 0.3),
     "splat.refine.drop_hull": (False, True, True),
+    # P3: a view is left out only where no Gaussian is visible.
+    "splat.refine.min_visible": (1, 1, 10),
     # 27
     "splat.refine.alpha_threshold": (0.5, 0.5, 0.5),
     # 28, and the cut of P2. The reference drops black Gaussians and, by a slip, the most opaque ones.
@@ -226,7 +231,7 @@ TABLE = {
     "splat.reconstruct.prune_contribution": (0.0, 0.0, 1 / 255),
     # 38: the text says CLIP, the code how it is asked.
     "semantics.query.prompt": ("an image of a {text}", "an image of a {text}", "{text}"),
-    # 39: the masks are those that the Gaussians cast (Sec. 4.2).
+    # 39: the masks are those that the Gaussians cast (Sec. 5.2).
     "semantics.masks": ("rendered", "rendered", "refined"),
     "semantics.describe.background": ("blur", "blur", "blur"),
     "semantics.describe.margin_px": (10, 10, 10),

@@ -69,6 +69,14 @@ def test_scenes_stand_beside_the_papers_and_unmeasured_cells_are_empty(place):
     assert single[MEAN]["ours"]["iou"] == pytest.approx(after_splat["room-0"]["ours"]["miou"], abs=1e-3)
 
 
+def test_scannets_photos_are_as_large_as_its_depth_maps_unless_the_user_says_otherwise(place):
+    assert not any("640 x 480" in text for text in reproduced(place, "scannet")["differs"]), "rooms have a size"
+    for more, side in (((), 640), (("--set", "capture.ingest.max_side=64"), 64)):
+        rooms = ("--data", place / "rooms", "--preset", "fast", "--stride", "1")
+        document = reproduced(place, "scannet", *more, rooms=rooms)
+        assert any(text.endswith(f"at most {side} pixels wide or high here") for text in document["differs"])
+
+
 def test_a_parameters_values_share_what_does_not_depend_on_it(place):
     section = reproduced(place, "tau_depth")["sections"][0]
     rows = rows_of(section)

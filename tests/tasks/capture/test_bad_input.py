@@ -131,14 +131,6 @@ def pose_that_is_3_by_4(root):
     return root
 
 
-@case("10.txt", "NaN")
-def pose_with_nan(root):
-    matrix = made.pose(0)
-    matrix[0, 3] = np.nan
-    np.savetxt(made.scannet(root) / "pose" / "10.txt", matrix)
-    return root
-
-
 @case("10.txt", "not rigid")
 def pose_with_scale(root):
     np.savetxt(made.scannet(root) / "pose" / "10.txt", made.pose(0) @ np.diag([1.01, 1.01, 1.01, 1]))

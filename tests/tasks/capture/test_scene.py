@@ -72,9 +72,13 @@ def test_scannet_has_metric_poses_and_half_a_pixel_is_added_to_its_centres(tmp_p
     assert [p.parent.name for p in scene.valid] == ["valid"] * 3
 
 
-def test_scannet_views_whose_tracking_was_lost_are_skipped(tmp_path):
+@pytest.mark.parametrize("lost", [-np.inf, np.nan, "one number"])
+def test_scannet_views_whose_tracking_was_lost_are_skipped(tmp_path, lost):
     made.scannet(tmp_path)
-    np.savetxt(tmp_path / "pose" / "10.txt", np.full((4, 4), -np.inf))
+    pose = np.full((4, 4), lost) if lost != "one number" else made.pose(0)
+    if lost == "one number":
+        pose[0, 3] = np.nan
+    np.savetxt(tmp_path / "pose" / "10.txt", pose)
     scene = open_scene(tmp_path)
     assert scene.names == ("2", "11") and scene.skipped == ("10",)
     assert len(scene.depths) == len(scene.ground_truth) == len(scene.valid) == 2

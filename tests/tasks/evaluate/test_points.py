@@ -165,6 +165,14 @@ def test_points_take_the_id_that_most_of_the_views_give_them() -> None:
     assert lifted(_cloud(np.zeros((4, 3))), views, truth).instance.tolist() == [5, 7, -1, -1]
 
 
+def test_ids_of_views_begin_at_one_and_have_no_gap_for_it() -> None:
+    seen = Visibility("a", np.int32([0, 1]), np.int32([0, 1]), np.ones(2, np.float32), 1, 3)
+    cloud = _cloud(np.arange(6).reshape(2, 3))
+    for ids, gaps in (([1, 2, 0], 0), ([1, 3, 0], 1), ([2, 3, 0], 1)):
+        truth = lifted(cloud, [seen], [LabelMap("a", np.uint16([ids]))])
+        assert evaluate_points(cloud, _labels([1, 2]), (), truth).values["id_gaps"] == gaps
+
+
 def _scan(folder: Path, groups: list[list[int]], finer: list[list[int]] | None = None) -> dict[str, FileRef]:
     """Six vertices of segments 0, 0, 1, 1, 2, 3 in files as ScanNet has them."""
     rows = "".join(f"{i} {2 * i} 0 1 2 3 255\n" for i in range(6))

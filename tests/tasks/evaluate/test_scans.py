@@ -109,6 +109,8 @@ def test_replicas_vertices_take_the_object_of_most_of_their_faces(tmp_path: Path
     assert truth.instance.tolist() == [4, 4, 2, 2, 2, 2, -1, -1]
     assert truth.names == ("", "", "chair", "", "wall") and truth.stuff.tolist() == [4]
     assert truth.points[5].tolist() == [2, 1, 0]
+    with pytest.raises(InputError, match="--compat is for ScanNet"):
+        scan_truth(tmp_path / "room_0", _reference, compat=True)
 
 
 def test_damaged_files_of_replica_are_named(tmp_path: Path) -> None:
@@ -132,6 +134,15 @@ def test_things_and_stuff_have_a_quality_of_their_own() -> None:
         "pq_things": pytest.approx(0.6),
         "pq_stuff": 0.0,
     }
+
+
+def test_what_lies_mostly_where_nothing_is_annotated_is_no_false_positive_of_either_kind() -> None:
+    truth = np.repeat([0, 0, 1, -1], [90, 10, 100, 300])
+    predicted = np.repeat([1, 3, 2, 3], [90, 10, 100, 300])
+    assert quality_by_kind(truth, predicted, np.int32([1])) == {"pq_things": pytest.approx(0.9), "pq_stuff": 1.0}
+    # With as much of it annotated as not it counts.
+    few = quality_by_kind(truth[:210], predicted[:210], np.int32([1]))
+    assert few == {"pq_things": pytest.approx(0.6), "pq_stuff": 1.0}
 
 
 def test_a_generated_rooms_scan_says_what_its_points_are(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The pool of masks of one view."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -73,6 +74,13 @@ def test_union_rule_promotes_the_coarse_mask_and_keeps_what_stands_alone():
     assert origin.tolist() == [0, 2]
     np.testing.assert_array_equal(merged[0], squares((0, 10, 0, 14))[0])
     np.testing.assert_array_equal(merged[1], dense[2])
+
+
+@pytest.mark.parametrize(("grid", "count"), [([0, 0], 2), ([0, 1], 1), ([1, 1], 1), ([1, 2], 1)])
+def test_masks_of_any_grid_but_the_coarsest_are_united_also_where_that_one_has_none(grid, count):
+    dense = squares((0, 10, 0, 10), (0, 10, 6, 14))
+    merged, _ = merge_union(dense, np.array(grid, np.int32), duplicate=0.95, overlap=0.3)
+    assert len(merged) == count and np.array_equal(merged.any(axis=0), dense.any(axis=0))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 8))

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
+from view_masks import as_fields
 
 from ss_flow.running import Surroundings, running
-from ss_flow.tasks.artifacts import REFINED, Appearances, Gaussians
+from ss_flow.tasks.artifacts import Appearances, Gaussians
 from ss_flow.tasks.gaussians.initialise import concatenate, extents, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainResult
@@ -170,11 +171,25 @@ def test_of_more_views_than_steps_as_many_are_trained_on_evenly_spread(built, mo
 
 def test_retraining_happens_only_where_refinement_changed_a_mask(built):
     instance = built.scene.instance(2)
-    assert retrain(built.views, instance, built.ball, params=TRAIN) is built.ball
-    changed = replace(instance, origin=np.where(np.arange(VIEWS) == 3, REFINED, 0).astype(np.uint8))
-    assert retrain(built.views, changed, built.ball, params=replace(TRAIN, retrain_share=0.0)) is built.ball
-    result = retrain(built.views, changed, built.ball, params=replace(TRAIN, retrain_share=0.1))
-    assert not same(result, built.ball) and len(result)
+    again = replace(TRAIN, retrain_share=0.1)
+    assert retrain(built.views, instance, instance, built.ball, params=again) is built.ball
+    smaller = np.array(instance.dense())
+    smaller[3, :, ::2] = False
+    without_one = built.scene.instance(2, views=tuple(range(1, VIEWS)))
+    for changed in (replace(instance, **as_fields(smaller)), without_one):
+        assert retrain(built.views, changed, instance, built.ball, params=TRAIN) is built.ball, "a share of 0"
+        result = retrain(built.views, changed, instance, built.ball, params=again)
+        assert not same(result, built.ball) and len(result)
+
+
+def test_what_was_first_trained_on_dilated_masks_is_trained_again_on_the_masks_themselves(built):
+    instance = built.scene.instance(2)
+    params = replace(TRAIN, min_iterations=40, max_iterations=40, retrain_share=1.0, warm_start=False)
+    dilated = replace(params, dilation=1)
+    first = reconstruct(built.views, instance, params=dilated)
+    assert not same(first, reconstruct(built.views, instance, params=params))
+    result = retrain(built.views, instance, instance, first, params=dilated)
+    assert same(result, reconstruct(built.views, instance, params=params))
 
 
 def test_a_refinement_that_ruins_the_pair_is_undone_with_a_warning(built, monkeypatch):
