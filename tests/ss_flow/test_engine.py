@@ -572,8 +572,8 @@ def test_of_long_values_why_shows_where_they_differ():
 
 def test_why_compares_a_call_with_that_one_of_its_label_that_it_differs_from_least(store):
     def flow(limit):
-        xs = toy.source(values=(1.0, 2.0))
-        return {"a": toy.clip(xs[0], limit=limit), "b": toy.clip(xs[1], limit=limit), "c": toy.clip(xs[1], limit=7.0)}
+        xs = toy.source(values=(1.0, 2.0, 3.0))
+        return {"a": toy.clip(xs[0], limit=limit), "b": toy.clip(xs[1], limit=limit), "c": toy.clip(xs[2], limit=7.0)}
 
     run(store, lambda: flow(3.0))
     report = run(store, lambda: flow(4.0))
