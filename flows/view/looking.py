@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64
-from ss_flow.tasks.geometry.cameras import camera_extent, camera_of, cameras_by_view, pixels_in_view
+from ss_flow.tasks.geometry.cameras import camera_extent, camera_of, cameras_by_view, pixels_in_view, up_of
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
@@ -42,7 +42,7 @@ def start_view(cameras: Cameras, points: Float32) -> Viewpoint:
     ahead = float(np.median(shown[view])) if len(shown[view]) else max(camera_extent([camera]), 1.0)
     forward = camera.world_to_camera[2, :3]
     fov = 2 * np.arctan(camera.height / 2 / camera.fy)
-    return Viewpoint(camera.center, camera.center + ahead * forward, up_of(cameras), float(fov))
+    return Viewpoint(camera.center, camera.center + ahead * forward, up_of(cameras.world_to_camera), float(fov))
 
 
 def view_of_object(cameras: Cameras, points: Float32, fov: float) -> tuple[Float64, Float64]:
@@ -73,13 +73,6 @@ def move_to(client: ClientHandle, position: Float64, look_at: Float64) -> None:
     with client.atomic():
         client.camera.position = position  # takes what it looks at along
         client.camera.look_at = look_at
-
-
-def up_of(cameras: Cameras) -> Float64:
-    """[3] the direction that is up in most photos, of length 1."""
-    up = -cameras.world_to_camera[:, 1, :3].mean(axis=0)
-    length = float(np.linalg.norm(up))
-    return up / length if length > 0.1 else -cameras.world_to_camera[0, 1, :3]
 
 
 def _some(points: Float32) -> Float32:

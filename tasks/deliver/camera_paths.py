@@ -10,7 +10,7 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Cameras, Float64, Gaussians
 from ss_flow.tasks.capture.layout_nerfstudio import read_cameras
 from ss_flow.tasks.deliver.point_view import orbit_camera
-from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, looking, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, looking, pixels_in_view, up_of
 
 _TOWARDS_SURFACE = 0.1
 """How much the places that the cameras look at count for the middle of an orbit, against the meeting of their axes."""
@@ -69,8 +69,7 @@ def round_scene(scene: Gaussians, cameras: Cameras, *, frames: int) -> tuple[Cam
     A capture from inside a room keeps inside; the lens is the first view's.
     """
     views = cameras_by_view(cameras)
-    up = -cameras.world_to_camera[:, 1, :3].mean(axis=0)
-    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    up = up_of(cameras.world_to_camera)
     target = _looked_at(scene, views)
     offsets = np.array([view.center for view in views]) - target
     height = float((offsets @ up).mean())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, UInt8
-from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, up_of
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
 _SKY = (244, 245, 247)
@@ -57,9 +57,7 @@ def _side(up: Float64, cameras: Cameras | None) -> Float64:
 
 def _up(centred: Float64, cameras: Cameras | None) -> Float64:
     if cameras is not None and len(cameras):
-        mean = -cameras.world_to_camera[:, 1, :3].mean(axis=0)
-        if np.linalg.norm(mean) > 0.1:
-            return mean / np.linalg.norm(mean)
+        return up_of(cameras.world_to_camera)
     axis = np.linalg.eigh(centred.T @ centred)[1][:, 0]
     along = centred @ axis
     low, high = np.percentile(along, (2, 98))

@@ -14,7 +14,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.geometry.cameras import Camera, looking
+from ss_flow.tasks.geometry.cameras import Camera, looking, up_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.sampling import sphere
 
@@ -112,7 +112,7 @@ def cameras_beside(
     chosen = [int((ring @ seen.mean(axis=0)).argmax())]
     while len(chosen) < min(count, len(ring)):
         chosen.append(int((ring @ ring[chosen].T).max(axis=1).argmin()))
-    up = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+    up = up_of([camera.world_to_camera for camera in cameras])
     distance = max(float(np.median(distances)), 1.5 * radius)
     focal = float(np.median([camera.fx for camera in cameras]))
     return [_looking(centre, distance * ring[i], up, radius, focal) for i in chosen]

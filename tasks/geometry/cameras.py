@@ -71,6 +71,25 @@ def cameras_by_view(cameras: Cameras) -> tuple[Camera, ...]:
     return tuple(camera_of(cameras, view) for view in range(len(cameras)))
 
 
+_AGREED = 0.1
+"""Length of the mean of unit directions from which they agree; 1 = parallel."""
+
+
+def up_of(poses: Float64 | Sequence[Float64]) -> Float64:
+    """[3] the direction of length 1 that is up in most photos.
+
+    poses: [K, 4, 4] world to camera, K > 0. Photos are taken upright. Where the pictures' upper borders point all ways,
+    as in photos straight down on a table from all its sides, up is where they look away from; where they look all
+    ways, too, the first one says what is up.
+    """
+    _, down, forward = np.asarray(poses)[:, :3, :3].mean(axis=0)
+    for away in (down, forward):
+        length = float(np.linalg.norm(away))
+        if length >= _AGREED:
+            return np.asarray(-away / length)
+    return np.asarray(-poses[0][1, :3])
+
+
 def looking(eye: Float64, forward: Float64, up: Float64) -> Float64:
     """[4, 4] world-to-camera of an upright camera.
 

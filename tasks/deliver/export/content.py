@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, Gaussians, Int32, UInt8
 from ss_flow.tasks.gaussians.initialise import SH_ZERO
+from ss_flow.tasks.geometry.cameras import up_of
 
 
 @dataclass(frozen=True)
@@ -82,12 +83,11 @@ def instances_of(gaussians: Gaussians) -> Int32:
 def y_up(cameras: Cameras) -> Float64:
     """[4] the rotation, x y z w, that turns the world so that y points up (photos are taken upright).
 
-    Of all such rotations the one by the smallest angle; none where the photos do not agree on a direction.
+    Of all such rotations the one by the smallest angle; none where there are no photos.
     """
-    up = -cameras.world_to_camera[:, 1, :3].mean(axis=0) if len(cameras) else np.zeros(3)
-    if np.linalg.norm(up) < 0.1:
+    if not len(cameras):
         return np.array([0.0, 0.0, 0.0, 1.0])
-    up /= np.linalg.norm(up)
+    up = up_of(cameras.world_to_camera)
     axis, cosine = np.cross(up, (0.0, 1.0, 0.0)), float(up[1])
     if cosine < -1 + 1e-9:  # upside down: half a turn about any level axis
         return np.array([1.0, 0.0, 0.0, 0.0])

@@ -9,7 +9,7 @@ import pytest
 from made_gaussians import made_cameras, made_gaussians
 
 from ss_flow.tasks.deliver.camera_paths import along, round_instance, round_scene
-from ss_flow.tasks.geometry.cameras import project
+from ss_flow.tasks.geometry.cameras import looking, project
 
 CIRCLE = made_cameras(tuple((3 * np.cos(a), 3 * np.sin(a), 1.0) for a in np.linspace(0, 5, 8)))
 
@@ -74,3 +74,14 @@ def test_views_side_by_side_still_have_something_to_go_round():
     path = round_scene(made_gaussians(400, 0), parallel, frames=4)
     uv, depth = project(np.zeros((1, 3)), path[0])
     assert depth[0] > 1 and np.isfinite(uv).all()
+
+
+def test_an_orbit_round_what_was_photographed_straight_down_from_all_sides_is_a_level_circle():
+    eyes = ((1.0, 0, 4), (0, 1.0, 4), (-1.0, 0, 4), (0, -1.0, 4))
+    cameras = made_cameras(eyes)
+    for pose, eye in zip(cameras.world_to_camera, eyes, strict=True):
+        pose[:] = looking(np.array(eye), np.array([0.0, 0, -1]), np.array([-eye[0], -eye[1], 0]))
+    path = round_scene(made_gaussians(400, 0), cameras, frames=8)
+    centers = np.array([camera.center for camera in path])
+    np.testing.assert_allclose(centers[:, 2], 4, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(centers[:, :2] - centers[:, :2].mean(axis=0), axis=1), 1, atol=0.1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ss_flow.tasks.geometry.cameras import looking
+from ss_flow.tasks.geometry.cameras import looking, up_of
 
 
 @pytest.mark.parametrize("forward", [(1, 0, 0), (0.6, 0, -0.8), (0, 0, 1), (0, 0, -1)])
@@ -19,3 +19,25 @@ def test_a_camera_stands_upright_and_looks_ahead(forward):
     right, down = pose[0, :3], pose[1, :3]
     if abs(forward[2]) < 1:  # straight up or down, no direction is upright
         assert right @ up == pytest.approx(0) and down @ up < 0
+
+
+def posed(*turns: tuple[tuple[float, ...], tuple[float, ...]]) -> np.ndarray:
+    """World to camera by where each looks and what is up in its picture."""
+    return np.array([looking(np.zeros(3), np.array(forward, float), np.array(up, float)) for forward, up in turns])
+
+
+AHEAD, BACK, UP, DOWN, LEFT, RIGHT = (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1), (0, 1, 0), (0, -1, 0)
+
+
+@pytest.mark.parametrize(
+    ("poses", "up"),
+    [
+        (posed((AHEAD, UP), (LEFT, UP), (BACK, UP)), UP),
+        (posed((DOWN, AHEAD), (DOWN, LEFT), (DOWN, BACK), (DOWN, RIGHT)), UP),
+        (posed((AHEAD, UP), (AHEAD, DOWN)), BACK),
+        (posed((AHEAD, LEFT), (BACK, RIGHT)), LEFT),
+    ],
+    ids=["upright", "straight down from all sides", "opposite", "opposite and facing each other"],
+)
+def test_up_is_what_photos_agree_on_else_where_they_look_away_from_else_the_first_ones(poses, up):
+    np.testing.assert_allclose(up_of(poses), up, atol=1e-12)

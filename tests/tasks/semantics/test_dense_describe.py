@@ -72,6 +72,16 @@ def test_views_lie_on_a_half_sphere_and_show_the_whole_object():
         np.testing.assert_allclose(project(middle[None], view)[0], [[280, 280]], atol=1e-3)
 
 
+def test_views_of_two_photos_with_opposite_ups_are_still_cameras():
+    upright = made_cameras(((0, -3, 0),) * 2)
+    poses = upright.world_to_camera.copy()
+    poses[1, :2] *= -1
+    views = around(block(), replace(upright, world_to_camera=poses), DenseDescribeParams())
+    for view in views:
+        rotation = view.world_to_camera[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+
+
 def test_a_gaussian_gets_what_the_patches_show_where_it_is(monkeypatch, network):
     monkeypatch.setattr(step, "patch_encoder_of", lambda model: Colours())
     own = block()
