@@ -61,8 +61,9 @@ def mesh_glb(meshes: tuple[TriangleMesh, ...], cameras: Cameras, *, names: Mappi
             "COLOR_0": buffer.add(linear.astype("<f4"), _VERTEX_DATA),
         }
         indices = buffer.add(mesh.triangles.astype("<u4").ravel(), _INDICES, _UNSIGNED)
-        entries.append({"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]})
-        nodes.append(node_of(mesh.instance_id, names, len(entries) - 1))
+        nodes.append(node_of(mesh.instance_id, names, len(entries)))
+        primitive = {"attributes": attributes, "indices": indices, "material": 0}
+        entries.append({"name": nodes[-1]["name"], "primitives": [primitive]})
     if not entries:
         return glb(scene_of([], cameras), buffer)
     material = {
