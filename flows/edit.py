@@ -79,7 +79,8 @@ def open_edit(source: Path, script: Mapping[str, Any], store: Store, folder: Pat
             f"source, {document['edit']['source']}."
         )
     run = finished_run(source, document, store, _NEEDED)
-    steps, objects = check(script, Objects.of(run.instances, run.results.one("scene")), folder)
+    begun = Objects.of(run.instances, run.results.one("scene"), run.results.one("cameras"))
+    steps, objects = check(script, begun, folder)
     return Edit(run, rooted(script, folder), steps, objects)
 
 

@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.flows.results import open_finished
+from ss_flow.tasks.artifacts import Cameras, Gaussians
 from ss_flow.tasks.deliver.instances_json import instance_file, placed
 from ss_flow.tasks.deliver.palette import instance_color
+from ss_flow.tasks.edit.operations import Vector, vector
+from ss_flow.tasks.geometry.cameras import up_of
 from ss_flow.tasks.geometry.clustering import rows_by_label
 
 Entry = dict[str, Any]
@@ -37,13 +40,15 @@ class Objects:
     groups: list[Entry]
     next_id: int
     """Ids are never used twice."""
+    up: Vector | None = None
+    """The direction, of length 1, that is up in the photos; None where that is not known."""
     gone: set[int] = field(default_factory=set)
     """Labels of dense points that show what is no longer there."""
     changed: set[int] = field(default_factory=set)
     """Ids whose parts are to be looked up anew."""
 
     @classmethod
-    def of(cls, document: Mapping[str, Any], scene: Gaussians) -> Objects:
+    def of(cls, document: Mapping[str, Any], scene: Gaussians, cameras: Cameras | None = None) -> Objects:
         """Those of an instances.json and its Gaussians; the background is not among them."""
         entries = {entry["id"]: entry for entry in document["instances"]}
         points = {i: {p["part_id"]: p["num_points"] for p in e["parts"]} for i, e in entries.items()}
@@ -51,7 +56,8 @@ class Objects:
         for instance, part in np.unique(np.stack([scene.instance_id, scene.part_id]), axis=1).T.tolist():
             parts.setdefault(instance, {})[part] = points.get(instance, {}).get(part, 0)
         used = [0, *entries, *parts, *(group["id"] for group in document["groups"])]
-        return cls(entries, parts, {i: {i} for i in (0, *entries)}, list(document["groups"]), max(used) + 1)
+        dense = {i: {i} for i in (0, *entries)}
+        return cls(entries, parts, dense, list(document["groups"]), max(used) + 1, _up(cameras))
 
     def names(self) -> list[str]:
         return [entry["name"] for entry in self.entries.values()]
@@ -226,6 +232,21 @@ def _unseen(entry: Entry) -> Entry:
     """What is known of an object that no photo shows where it is."""
     parts = [part | {"num_points": 0} for part in entry["parts"]]
     return entry | {"parts": parts, "views": [], "num_points": 0, "parent": None}
+
+
+def _up(cameras: Cameras | None) -> Vector | None:
+    return None if cameras is None else vector(up_of(cameras.world_to_camera))
+
+
+def up_of_run(folder: Path) -> Vector | None:
+    """The direction that is up in the photos of a run; None where its store is not at hand, as in a folder that was
+    handed on."""
+    try:
+        run = open_finished(folder)
+        run.require(("cameras",))
+    except InputError:
+        return None
+    return _up(run.results.one("cameras"))
 
 
 def object_of_run(folder: Path, called: int | str) -> tuple[Entry, list[int], Path]:

@@ -12,15 +12,16 @@ from typing import Any, TypeVar, cast
 
 from ss_flow.cache.canonical import digest_file
 from ss_flow.errors import InputError
-from ss_flow.flows.edit_objects import Objects, object_of_run
+from ss_flow.flows.edit_objects import Objects, object_of_run, up_of_run
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import EditedScene
 from ss_flow.tasks.edit import operations
-from ss_flow.tasks.edit.operations import Motion, Vector
+from ss_flow.tasks.edit.operations import Motion, Vector, smallest_turn
 
 T = TypeVar("T")
 _REQUIRED = cast(Any, object())
 _VERSION = 1
+_NO_TURN: tuple[Vector, float] = ((0.0, 0.0, 1.0), 0.0)
 _MOVING = ("duplicate", "transform", "recolour", "replace", "split")
 """Operations that need Gaussians to work on."""
 
@@ -168,7 +169,7 @@ class _Call:
 
     def motion(self) -> Motion:
         """move, rotate, scale and pivot."""
-        turn = self.take("rotate", _turn, ((0.0, 0.0, 1.0), 0.0))
+        turn = self.take("rotate", _turn, _NO_TURN)
         return Motion(
             move=self.take("move", _vector, (0.0, 0.0, 0.0)),
             axis=turn[0],
@@ -234,10 +235,12 @@ def _replace(call: _Call) -> Step:
     call.objects.remove((instance,))
     new_id = call.objects.put_in(entry, parts, call.new_name(entry["name"]))
     ref = FileRef(file.absolute(), digest_file(file))
+    own, theirs = call.objects.up, up_of_run(call.folder / run)
+    turn = smallest_turn(theirs, own) if own and theirs else _NO_TURN
 
     def apply(scene: EditedScene) -> EditedScene:
         other = operations.read_object(file=ref)
-        return operations.put_in_place(scene, other, instance=instance, new_id=new_id, scale=scale)
+        return operations.put_in_place(scene, other, instance=instance, new_id=new_id, scale=scale, turn=turn)
 
     return call.step(apply, (instance,), fill=fill)
 

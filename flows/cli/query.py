@@ -27,7 +27,7 @@ from ss_flow.flows.cli.context import (
 )
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.query import NEEDED, described_parts
-from ss_flow.flows.results import FinishedRun, id_image, read_run
+from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
 from ss_flow.tasks.deliver.output import check_place, replacing
 from ss_flow.tasks.semantics.describe import DescribeParams
@@ -154,7 +154,7 @@ def query_params(document: dict[str, Any]) -> QueryParams:
 
 def _document(found: QueryResult, instances: dict[str, Any], *, parts: bool) -> dict[str, Any]:
     """What --json prints; with `parts`, each row says which part of its instance it is."""
-    names = {entry["id"]: entry["name"] for entry in instances["instances"]}
+    names = {BACKGROUND: "background"} | {entry["id"]: entry["name"] for entry in instances["instances"]}
     rows = [
         {
             "id": int(found.instance_id[i]),

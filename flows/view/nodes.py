@@ -20,8 +20,10 @@ if TYPE_CHECKING:
 
 Colors = Literal["photos", "objects"]
 _MARK = (255, 140, 0)
-_TINT = 0.4
-"""How far the colours of what is selected go towards that of the mark."""
+_TINT = 0.8
+"""How far the colours of what is selected go towards the mark's, which takes their light and shade. With less, what is
+blue would become as grey as a wall."""
+_LUMA = (0.299, 0.587, 0.114)
 _WITHIN = (2, 98)
 """Percentiles of the centres that a box goes round, since a few Gaussians lie far off."""
 _GIZMO = 0.6
@@ -144,5 +146,6 @@ def _colors(instance: int, gaussians: Gaussians, colors: Colors, *, is_selected:
     if colors == "objects":
         own = 0.25 * own + 0.75 * np.array(instance_color(instance))
     if is_selected:
-        own = (1 - _TINT) * own + _TINT * np.array(_MARK)
-    return np.rint(own).astype(np.uint8)
+        light = own @ np.array(_LUMA)[:, None] / 255
+        own = (1 - _TINT) * own + _TINT * (0.65 + 0.6 * light) * np.array(_MARK)
+    return np.rint(own.clip(0, 255)).astype(np.uint8)

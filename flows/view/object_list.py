@@ -54,12 +54,12 @@ class ObjectList:
         self.text = gui.add_text("Search", "", hint="What to look for, such as: red mug, not the lamp")
         tau = search.params.tau_corr if search is not None else 0.02
         self.tau = gui.add_slider(
-            "tau_corr",
+            "Tolerance",
             min=0.001,
             max=max(0.3, tau),
             step=0.001,
             initial_value=tau,
-            hint="How much further than the best an object may be and still match",
+            hint="How much further than the best an object may be and still match: --tau-corr",
         )
         self.answer = gui.add_markdown("" if search is not None else "This run has no descriptors to search.")
         self.text.disabled = self.tau.disabled = search is None

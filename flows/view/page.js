@@ -74,7 +74,10 @@ void main() {
     vec3 own = texelFetch(palette, ivec2(int(instance) % 256, int(instance) / 256), 0).rgb;
     tint.rgb = own * (0.55 + 0.6 * dot(tint.rgb, vec3(0.299, 0.587, 0.114)));
   }
-  if (int(instance) == selected) tint.rgb = mix(tint.rgb, vec3(1.0, 0.62, 0.1), 0.45);
+  if (int(instance) == selected) { // light and shade stay: a part of the way, blue would become the grey of a wall
+    float light = dot(tint.rgb, vec3(0.299, 0.587, 0.114));
+    tint.rgb = mix(tint.rgb, vec3(1.0, 0.62, 0.1) * (0.65 + 0.6 * light), 0.8);
+  }
 
   mat3 turned = axes * rotation(second.x);
   vec3 s = exp(bytes(second.y).xyz / 16.0 - 10.0);
@@ -249,6 +252,16 @@ class Orbit {
   }
 }
 
+const KEYS = {
+  ArrowLeft: (orbit) => orbit.turn(-0.1, 0),
+  ArrowRight: (orbit) => orbit.turn(0.1, 0),
+  ArrowUp: (orbit) => orbit.turn(0, -0.1),
+  ArrowDown: (orbit) => orbit.turn(0, 0.1),
+  "+": (orbit) => orbit.zoom(0.9),
+  "=": (orbit) => orbit.zoom(0.9), // where + takes Shift
+  "-": (orbit) => orbit.zoom(1 / 0.9),
+};
+
 function control(canvas, orbit, changed, clicked) {
   const fingers = new Map();
   let travelled = 0;
@@ -277,6 +290,13 @@ function control(canvas, orbit, changed, clicked) {
     canvas.addEventListener(kind, (event) => {
       if (fingers.delete(event.pointerId) && kind === "pointerup" && !fingers.size && travelled < 4) clicked(event);
     });
+  canvas.addEventListener("keydown", (event) => {
+    const act = KEYS[event.key];
+    if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    act(orbit);
+    changed();
+  });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
@@ -311,16 +331,24 @@ async function start() {
 
   function show(wanted) { // wanted: whether to show an instance
     for (const [id, row] of rows) {
-      splats.shown[id] = wanted(id);
-      row.classList.toggle("hidden", !wanted(id));
-      row.querySelector(".eye").textContent = wanted(id) ? "hide" : "show";
+      const is = wanted(id), eye = row.querySelector(".eye"); // asked once: it may ask what is shown
+      splats.shown[id] = is;
+      row.classList.toggle("hidden", !is);
+      eye.textContent = is ? "hide" : "show";
+      eye.setAttribute("aria-label", `${is ? "Hide" : "Show"} ${row.querySelector(".name").textContent}`);
     }
+    const alone = [...rows.keys()].filter((id) => splats.shown[id]).length === 1;
+    for (const [id, row] of rows)
+      row.querySelector(".only").setAttribute("aria-pressed", alone && Boolean(splats.shown[id]));
     redraw();
   }
 
   function select(id) {
     splats.selected = id;
-    for (const [other, row] of rows) row.classList.toggle("selected", other === id);
+    for (const [other, row] of rows) {
+      row.classList.toggle("selected", other === id);
+      row.querySelector(".name").setAttribute("aria-pressed", other === id);
+    }
     rows.get(id)?.scrollIntoView({ block: "nearest" });
     redraw(false);
   }
@@ -333,11 +361,14 @@ async function start() {
     row.querySelector(".name").textContent = object.name;
     row.querySelector(".about").textContent = object.about;
     row.querySelector("img").src = object.thumbnail;
+    row.querySelector(".go").title = `Go to ${object.name}`;
+    row.querySelector(".go").setAttribute("aria-label", `Go to ${object.name}`);
+    row.querySelector(".only").setAttribute("aria-label", `Show ${object.name} only`);
     row.querySelector(".swatch").style.background = `rgb(${object.color})`;
     click(".name", () => select(splats.selected === object.id ? -1 : object.id));
     click(".eye", () => show((id) => (id === object.id ? !splats.shown[id] : splats.shown[id])));
     click(".only", () => show(isOnly(object.id) ? () => 1 : (id) => id === object.id));
-    click("img", () => {
+    click(".go", () => {
       orbit.lookAt(object.center, object.size);
       redraw();
     });
@@ -356,14 +387,19 @@ async function start() {
   document.getElementById("search").addEventListener("input", (event) => {
     const words = event.target.value.toLowerCase();
     for (const object of scene.objects) rows.get(object.id).hidden = !object.name.toLowerCase().includes(words);
+    document.getElementById("none").hidden = [...rows.values()].some((row) => !row.hidden);
   });
   control(canvas, orbit, redraw, (event) => {
     const box = canvas.getBoundingClientRect(), ratio = canvas.width / box.width;
     const [x, y] = [event.clientX - box.x, event.clientY - box.y].map((place) => Math.floor(place * ratio));
     select(splats.pick(orbit.view(), x, y));
   });
+  canvas.addEventListener("webglcontextlost", () => tell("The graphics card was lost; load the page again."));
   new ResizeObserver(() => redraw(false)).observe(canvas);
-  redraw();
+  select(-1);
+  show(() => 1);
 }
 
-start().catch((error) => { document.getElementById("problem").textContent = error.message; });
+function tell(problem) { document.getElementById("problem").textContent = problem; }
+
+start().catch((error) => tell(error.message));

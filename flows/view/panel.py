@@ -112,7 +112,7 @@ class Panel:
             self._group(gui, label, {name: act[name] for name in names})
         self._name = gui.add_text("Name", "")
         self._color = gui.add_rgb("Colour", (208, 32, 32))
-        self.factor = gui.add_number("Factor", 1.0, min=0.01, max=100.0, step=0.05)
+        self.factor = gui.add_number("Scale factor", 1.0, min=0.01, max=100.0, step=0.05)
         self._fill = gui.add_checkbox(
             "Fill the holes", False, hint="What leaves its place has its surroundings continued; shown by ss-flow edit"
         )

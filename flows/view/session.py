@@ -16,7 +16,7 @@ from ss_flow.errors import InputError
 from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check
 from ss_flow.flows.results import BACKGROUND
-from ss_flow.tasks.artifacts import EditedScene, Float64, Gaussians
+from ss_flow.tasks.artifacts import Cameras, EditedScene, Float64, Gaussians
 from ss_flow.tasks.edit.operations import edited, joined, some_rows
 from ss_flow.tasks.geometry.clustering import rows_by_label
 
@@ -57,16 +57,24 @@ class Session:
     """
 
     def __init__(
-        self, scene: Gaussians, instances: Mapping[str, Any], folder: Path, operations: Sequence[Operation] = ()
+        self,
+        scene: Gaussians,
+        instances: Mapping[str, Any],
+        folder: Path,
+        operations: Sequence[Operation] = (),
+        cameras: Cameras | None = None,
     ) -> None:
         """instances: the document instances.json. folder: what relative paths in operations start from. operations:
-        those of a script to go on with. Raises InputError when one of them is refused."""
+        those of a script to go on with. cameras: they tell what is upright, for objects of other runs.
+
+        Raises InputError when an operation is refused.
+        """
         whole = edited(scene, filled=0)
         pieces = {
             instance: Piece(rows.astype(np.int64), some_rows(whole, rows))
             for instance, rows in rows_by_label(scene.instance_id).items()
         }
-        self._begun = Objects.of(instances, scene)
+        self._begun = Objects.of(instances, scene, cameras)
         self._folder = folder
         self._states = [State((), self._begun, pieces, len(scene))]
         self._place = 0

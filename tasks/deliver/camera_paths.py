@@ -15,6 +15,9 @@ from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, looking, pix
 _TOWARDS_SURFACE = 0.1
 """How much the places that the cameras look at count for the middle of an orbit, against the meeting of their axes."""
 
+_ONE_SIDED_DEG = 120.0
+"""Views leave a side out where they leave a gap larger than this between their directions."""
+
 _WIDER = 0.8
 """Shortens the lens of an orbit round an instance, so that no end of it is cut off."""
 
@@ -66,7 +69,8 @@ def round_instance(own: Gaussians, cameras: Cameras, *, frames: int, elevation_d
 def round_scene(scene: Gaussians, cameras: Cameras, *, frames: int) -> tuple[Camera, ...]:
     """Cameras on a level circle at the input views' mean height and distance, that look at what these look at.
 
-    A capture from inside a room keeps inside; the lens is the first view's.
+    A capture from inside a room keeps inside; the lens is the first view's. Where the input views leave a side out, the
+    cameras swing over the arc that they cover, and back.
     """
     views = cameras_by_view(cameras)
     up = up_of(cameras.world_to_camera)
@@ -79,11 +83,23 @@ def round_scene(scene: Gaussians, cameras: Cameras, *, frames: int) -> tuple[Cam
     east = start / np.linalg.norm(start)
     north = np.cross(up, east)
     found = []
-    for angle in 2 * np.pi * np.arange(frames) / frames:
+    for angle in _azimuths(np.arctan2(level @ north, level @ east), frames):
         center = target + height * up + radius * (np.cos(angle) * east + np.sin(angle) * north)
         forward = (target - center) / max(float(np.linalg.norm(target - center)), 1e-9)
         found.append(replace(views[0], world_to_camera=looking(center, forward, up)))
     return tuple(found)
+
+
+def _azimuths(taken: Float64, frames: int) -> Float64:
+    """[frames] angles of one round, or of a swing over the covered arc. taken: those of the input views; in radians."""
+    turn = 2 * np.pi * np.arange(frames) / frames
+    ordered = np.sort(taken)
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    widest = int(gaps.argmax())
+    if gaps[widest] <= np.radians(_ONE_SIDED_DEG):
+        return turn
+    arc = 2 * np.pi - gaps[widest]
+    return ordered[widest] + gaps[widest] + arc * (1 - np.cos(turn)) / 2
 
 
 def _looked_at(scene: Gaussians, views: tuple[Camera, ...]) -> Float64:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import PointLabels
 from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, data_uri
+from ss_flow.tasks.deliver.edit_words import EditWords
 from ss_flow.tasks.deliver.timeline import timeline
 
 _KINDS = {
@@ -115,10 +116,11 @@ def report_html(
 ) -> str:
     """The report of a run.
 
-    run: the document of run.json ("status", "scene", "params", "models", "metrics", "nodes", "warnings", "failures";
-    any may be missing). pictures: named "VIEW/KIND" with the kinds photo, masks_split, masks, render, depth, which are
-    shown in one row a view, or by their caption. instances: the document of instances.json. Those that fill most of the
-    views come first, walls and floors after things, and crumbs are folded away.
+    run: the document of run.json ("status", "scene", "params", "models", "metrics", "nodes", "warnings", "failures",
+    "edit"; any may be missing). pictures: named "VIEW/KIND" with the kinds photo, masks_split, masks, render, depth,
+    which are shown in one row a view ("VIEW/KIND, NOTE" adds to the caption), or by their caption. instances: the
+    document of instances.json. Those that fill most of the views come first, walls and floors after things, and crumbs
+    are folded away.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -135,6 +137,7 @@ def report_html(
     return environment.from_string(template).render(
         scene=title_of(PurePath(str(run.get("scene") or ""))),
         status=run.get("status") or "unknown",
+        edit=EditWords.of(run["edit"]) if "edit" in run else None,
         models=_flat(run.get("models") or {}),
         metrics=_metrics(run.get("metrics") or {}),
         stages=_stages(run.get("metrics") or {}),
@@ -166,17 +169,18 @@ def title_of(scene: PurePath) -> str:
 
 
 def _views(pictures: Sequence[Picture]) -> tuple[list[dict[str, Any]], list[dict[str, str]]]:
-    rows: dict[str, dict[str, str]] = {}
+    rows: dict[str, dict[str, dict[str, str]]] = {}
     others = []
     for picture in pictures:
-        view, _, kind = picture.name.rpartition("/")
+        view, _, last = picture.name.rpartition("/")
+        kind, comma, note = last.partition(", ")
         if view and kind in _KINDS:
-            rows.setdefault(view, {})[kind] = data_uri(picture.content)
+            shown = {"caption": _KINDS[kind] + comma + note, "uri": data_uri(picture.content)}
+            rows.setdefault(view, {})[kind] = shown
         else:
             others.append({"caption": picture.name, "uri": data_uri(picture.content)})
     views = [
-        {"name": view, "pictures": [{"caption": _KINDS[kind], "uri": found[kind]} for kind in _KINDS if kind in found]}
-        for view, found in rows.items()
+        {"name": view, "pictures": [found[kind] for kind in _KINDS if kind in found]} for view, found in rows.items()
     ]
     return views, others
 

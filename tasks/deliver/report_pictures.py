@@ -10,7 +10,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, LabelMap, UInt8
 from ss_flow.tasks.deliver.compressed import Picture, compressed
 from ss_flow.tasks.deliver.draw import draw
-from ss_flow.tasks.deliver.palette import instance_colors
+from ss_flow.tasks.deliver.palette import depth_colors, instance_colors
 from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 
@@ -27,8 +27,8 @@ def report_pictures(
     maps: Sequence[LabelMap],
     scene: Gaussians,
 ) -> tuple[Picture, ...]:
-    """Draw three views, each as "VIEW/photo", "VIEW/masks_split", "VIEW/masks", "VIEW/render" and "VIEW/depth", then
-    "Instances", the Gaussians in the colours of their instances, and "Cameras".
+    """Draw three views, each as "VIEW/photo", "VIEW/masks_split", "VIEW/masks", "VIEW/render" and "VIEW/depth, WHAT IT
+    MEANS", then "Instances", the Gaussians in the colours of their instances, and "Cameras".
 
     All lists are in the order of the frames. An empty scene has no renderings.
     """
@@ -41,7 +41,8 @@ def report_pictures(
             yield f"{frame.name}/masks", draw(maps[k], frame=frame)
             if len(scene):
                 yield f"{frame.name}/render", draw(scene, cameras=cameras, view=k)
-            yield f"{frame.name}/depth", draw(depths[k])
+            picture, note = _depth(depths[k], "m" if cameras.metric else "units")
+            yield f"{frame.name}/depth, {note}", picture
         if len(scene):
             colors = instance_colors(int(scene.instance_id.max()) + 1)[scene.instance_id]
             spacing = 2 * float(np.exp(np.median(scene.log_scales)))
@@ -49,3 +50,12 @@ def report_pictures(
         yield "Cameras", draw(cameras)
 
     return tuple(Picture(name, compressed(picture)) for name, picture in drawn())
+
+
+def _depth(value: DepthMap, unit: str) -> tuple[UInt8, str]:
+    """A depth map in colours, and what they mean."""
+    colors, low, high = depth_colors(value.depth)
+    known = float((value.depth > 0).mean())
+    if not known:
+        return colors, f"{value.source}, nothing known"
+    return colors, f"{low:.3g} to {high:.3g} {unit}, near = red; {value.source}, {100 * known:.0f} % known"

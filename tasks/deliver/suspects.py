@@ -23,6 +23,8 @@ _SAME_SPACE = 0.5
 """IoU of their boxes from which two objects collide."""
 _APART = 6.0
 """Objects lie in pieces where these are farther apart than so many spacings of the dense points."""
+_HARDLY_THERE = 0.1
+"""Gaussians for each dense point, below which an object was hardly reconstructed."""
 _PIECE = 0.2
 """Share of an object's points that a piece must hold."""
 
@@ -44,6 +46,9 @@ def suspects(
     for i, one in own.items():
         if len(one.views) < few:
             reasons[i].append(f"few views: it is seen in {len(one.views)} of {num_views}")
+        if (count := entries[i]["num_gaussians"]) < _HARDLY_THERE * len(one.points):
+            many = "1 Gaussian" if count == 1 else f"{count} Gaussians"
+            reasons[i].append(f"hardly anything of it was reconstructed: {many} for {len(one.points):,} points")
         if one.confidence < _UNSURE:
             reasons[i].append(f"low confidence: {one.confidence:.0%}")
         if i in things and (pieces := _pieces(one.points, _APART * spacing)) > 1:

@@ -108,17 +108,25 @@ def read_object(*, file: FileRef) -> Gaussians:
 
 @task(name="edit.replace")
 def put_in_place(
-    scene: EditedScene, other: Gaussians, *, instance: int, new_id: int, scale: float | None
+    scene: EditedScene,
+    other: Gaussians,
+    *,
+    instance: int,
+    new_id: int,
+    scale: float | None,
+    turn: tuple[Vector, float],
 ) -> EditedScene:
     """The scene with another object, under a new id, in the place of an instance.
 
     The mean of its centres comes to lie where that of the instance was. scale: factor on its size; None makes the
-    diagonal of its box (trimmed by 0.5 % on every side) that of the instance.
+    diagonal of its box (trimmed by 0.5 % on every side) that of the instance. turn: axis and degrees of a rotation into
+    the scene's axes, which comes first.
     """
     old = scene.instance_id == instance
+    other = moved(edited(other, filled=0), Motion(axis=turn[0], degrees=turn[1]))
     factor = box_diagonal(scene.means[old]) / max(box_diagonal(other.means), 1e-12) if scale is None else scale
     way = _centre(scene.means[old]) - _centre(other.means)
-    placed = moved(edited(other, filled=0), Motion(move=_vector(way), scale=float(factor)))
+    placed = moved(other, Motion(move=vector(way), scale=float(factor)))
     renamed = replace(placed, instance_id=np.full(len(placed), new_id, np.int32))
     return joined([some_rows(scene, ~old), renamed])
 
@@ -134,6 +142,15 @@ def relabel(scene: EditedScene, *, rows: tuple[tuple[int, int, int, int], ...]) 
         own = (scene.instance_id == old) & (scene.part_id == old_part)
         instance_id[own], part_id[own] = new, new_part
     return replace(scene, instance_id=instance_id, part_id=part_id)
+
+
+def smallest_turn(one: Vector, other: Vector) -> tuple[Vector, float]:
+    """Axis and degrees of the smallest rotation that takes one direction to another; both of length 1."""
+    axis, cosine = np.cross(one, other), float(np.dot(one, other))
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:  # the same or opposite: about any axis across
+        axis = np.cross(one, np.eye(3)[np.argmin(np.abs(one))])
+    return vector(axis), float(np.degrees(np.arctan2(sine, cosine)))
 
 
 def moved(part: EditedScene, motion: Motion) -> EditedScene:
@@ -188,6 +205,7 @@ def _centre(means: NDArray[np.float32]) -> Float64:
     return means.mean(axis=0, dtype=np.float64)
 
 
-def _vector(values: Float64) -> Vector:
+def vector(values: Float64) -> Vector:
+    """[3] as a parameter."""
     x, y, z = values.tolist()
     return x, y, z

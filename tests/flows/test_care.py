@@ -64,7 +64,7 @@ def test_what_runs_need_stays_and_a_run_after_a_collection_is_all_hits(warm):
 
 
 def test_only_the_latest_runs_of_a_scene_are_kept_on_request(warm):
-    latest = again(warm, "--set", "propagate.min_new_points=11")
+    latest = again(warm, "--set", "propagate.at_once.min_points=6")
     assert latest.computed() == {"split.propagate": 1}
     age_all(warm.store)
     assert removed(gc(warm.store, "--keep-runs", "2")) == {}
@@ -75,7 +75,7 @@ def test_only_the_latest_runs_of_a_scene_are_kept_on_request(warm):
     assert told.document() | {"dry_run": False} == done.document()
     keys, objects = entries(warm.store)
     assert keys == keys_of(latest) and objects == named_by(warm.store, keys)
-    assert again(warm, "--set", "propagate.min_new_points=11").computed() == {}
+    assert again(warm, "--set", "propagate.at_once.min_points=6").computed() == {}
     assert again(warm).computed() == {"split.propagate": 1}
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tiny_runs import bytes_of, ss_flow
 
+from ss_flow.cache.store import Store
 from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
+from ss_flow.tasks.geometry.cameras import up_of
 
 SCENE_FILES = ("scene.ply", "scene_labeled.ply", "instances.json")
 PICTURES = "edit.pictures.before_and_after"
@@ -91,6 +95,29 @@ def test_an_object_of_another_run_takes_the_place_of_one(warm, tmp_path):
     assert told == [replacing | {"run": str((place.parent / "other").resolve())}]
     again, _ = edit(warm, *told, out="elsewhere/edited")  # whose script stands in another folder
     assert again.computed() == {}
+
+
+def test_an_object_of_a_run_with_other_axes_comes_upright(warm, tmp_path):
+    own = biggest(warm.out)
+    document = json.loads((warm.out / "run.json").read_text())
+    store = Store(warm.store)
+    cameras = store.get(document["results"]["cameras"])
+    onto_its_side = np.eye(4)
+    onto_its_side[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # the world turned by 90 degrees about x
+    turned = replace(cameras, world_to_camera=cameras.world_to_camera @ onto_its_side)
+    other = tmp_path / "other"
+    shutil.copytree(warm.out, other)
+    document["results"]["cameras"] = store.put(turned)
+    (other / "run.json").write_text(json.dumps(document))
+    called, place = edit(warm, {"op": "replace", "instance": own, "run": str(other), "by": own, "name": "new"})
+    assert called.code == 0, called.err
+    entries = {e["name"]: e for e in json.loads((place / "instances.json").read_text())["instances"]}
+    new = read_gaussians(place / entries["new"]["file"]).means
+    old = read_gaussians(other / f"instances/{own:04d}.ply").means
+    here, there = (up_of(c.world_to_camera) for c in (cameras, turned))
+    high = [(m - m.mean(axis=0)) @ up for m, up in ((new, here), (old, there))]
+    scale = np.std(high[0]) / np.std(high[1])
+    np.testing.assert_allclose(high[0], scale * high[1], atol=1e-4)
 
 
 def test_a_bad_script_runs_nothing_and_writes_nothing(warm):

@@ -34,6 +34,7 @@ def test_the_background_is_ranked_only_on_request(tiny):
     usual = ss_flow("query", tiny.out, "white", "--json", "--cache", tiny.store).document()["instances"]
     assert [row["id"] for row in asked if row["id"]] == [row["id"] for row in usual]
     assert len(asked) == len(usual) + 1
+    assert [row["name"] for row in asked if not row["id"]] == ["background"]
 
 
 def test_the_object_of_a_colour_is_found(tiny):

@@ -295,7 +295,7 @@ def test_every_operation_is_clicked_through_and_the_script_gives_the_scene_that_
     hands.fill("Name", "toolbox")
     hands.press("Rename", lambda: session.state.objects.name(first) == "toolbox")
     hands.press("Recolour", lambda: session.state.done[-1]["op"] == "recolour")
-    hands.fill("Factor", "1.5")
+    hands.fill("Scale factor", "1.5")
     hands.until(lambda: hands.viewer.panel.factor.value == 1.5)  # a browser tells typed numbers a moment later
     hands.press("Scale", lambda: session.state.done[-1].get("scale") == 1.5)
     hands.press("Duplicate", lambda: session.state.done[-1]["op"] == "duplicate" and session.selected != (first,))

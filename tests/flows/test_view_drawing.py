@@ -21,8 +21,10 @@ from ss_flow.flows.view.drawing import (
     label_colors,
 )
 from ss_flow.flows.view.looking import start_view, view_of_object
+from ss_flow.flows.view.nodes import _colors
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.gaussians.densification import rotations
+from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 
 viser = pytest.importorskip("viser", reason="needs the extra `view`")
@@ -158,3 +160,17 @@ def test_an_empty_list_and_a_figure_have_no_place(scene):
     with pytest.raises(InputError, match="empty list"):
         draw(scene, "/nothing", [], Around())
     assert not is_spatial([Metrics({})])
+
+
+def test_what_is_selected_is_marked_in_orange_and_keeps_its_light_and_shade():
+    dark_and_bright_blue = np.float32([[0.05, 0.1, 0.4], [0.3, 0.5, 1.0]])
+    gaussians = initialise(
+        np.zeros((2, 3), np.float32),
+        np.rint(255 * dark_and_bright_blue).astype(np.uint8),
+        np.ones(2, np.int32),
+        1.0,
+        np.zeros(2, np.int32),
+    )
+    marked = _colors(1, gaussians, "photos", is_selected=True).astype(int)
+    assert (marked[:, 0] > 1.5 * marked[:, 2]).all()
+    assert marked[1].sum() > 1.1 * marked[0].sum()

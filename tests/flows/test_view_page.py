@@ -115,6 +115,8 @@ def test_the_page_shows_what_our_rasterizer_renders(page, run):
     assert ours[unhidden].std() > 0.05
 
 
+TYPED = "(box => {{ box.value = {}; box.dispatchEvent(new Event('input')) }})(document.getElementById('search'))"
+"""Type a text into the search box."""
 DRAWN = "new Promise(done => requestAnimationFrame(() => setTimeout(() => done(+document.body.dataset.drawn))))"
 """How many Gaussians are drawn, after the next frame."""
 
@@ -129,6 +131,8 @@ def test_objects_are_hidden_shown_and_isolated(page, run):
     first = int((seen == ids[0]).sum())
     page.click("li .eye")
     assert whole - first <= page.evaluate(DRAWN) < whole
+    assert page.evaluate("document.querySelector('li .eye').textContent") == "show"
+    assert page.evaluate("document.querySelector('li').classList.contains('hidden')")
     page.click("li .eye")
     assert page.evaluate(DRAWN) == whole
     page.click("li .only")
@@ -163,10 +167,71 @@ def test_labels_colour_the_scene_and_a_click_selects_the_object_under_it(page):
 @needs_browser
 def test_the_list_is_searched_by_name(page):
     name = page.evaluate("document.querySelector('li .name').textContent")
-    page.evaluate(
-        f"(box => {{ box.value = {json.dumps(name.upper())}; box.dispatchEvent(new Event('input')) }})"
-        "(document.getElementById('search'))"
-    )
+    page.evaluate(TYPED.format(json.dumps(name.upper())))
     left = page.evaluate("[...document.querySelectorAll('li:not([hidden]) .name')].map(one => one.textContent)")
     assert left and all(name in one for one in left)
     assert page.evaluate("document.querySelectorAll('li[hidden]').length") > 0
+    none = "document.getElementById('none').hidden"
+    assert page.evaluate(none)
+    page.evaluate(TYPED.format("'no such thing'"))
+    assert not page.evaluate(none)
+    page.evaluate(TYPED.format("''"))
+
+
+@needs_browser
+def test_the_page_is_for_keyboards_and_screen_readers_too(page):
+    name = page.evaluate("document.querySelector('li .name').textContent")
+    label = "document.querySelector('li {}').getAttribute('aria-label')"
+    assert page.evaluate(label.format("button.go")) == f"Go to {name}"
+    assert page.evaluate(label.format(".only")) == f"Show {name} only"
+    assert page.evaluate(label.format(".eye")) == f"Hide {name}"
+    page.click("li .only")
+    pressed = (
+        "[...document.querySelectorAll('li {}')].filter(one => one.getAttribute('aria-pressed') === 'true').length"
+    )
+    assert page.evaluate(pressed.format(".only")) == 1
+    assert page.evaluate("document.querySelectorAll('li .eye[aria-label^=\"Show \"]').length") == len(rows(page)) - 1
+    page.click("#all")
+    assert page.evaluate(pressed.format(".only")) == 0
+    is_selected = "String(document.querySelector('li').classList.contains('selected'))"
+    for _ in range(2):
+        page.click("li .name")
+        assert page.evaluate(f"document.querySelector('li .name').getAttribute('aria-pressed') === {is_selected}")
+    page.evaluate("document.querySelector('canvas').focus()")
+    assert page.evaluate("document.activeElement.tagName") == "CANVAS"
+    for key in ("ArrowLeft", "ArrowUp", "+", "-"):
+        before = page.screenshot()
+        page.evaluate(f"document.activeElement.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))")
+        page.evaluate(DRAWN)
+        assert page.screenshot() != before, key
+    page.click("#reset")
+
+
+@needs_browser
+def test_a_selected_object_keeps_its_light_and_shade_in_orange(page):
+    """A blue one, mixed with some orange, would have the grey of a wall."""
+    import cv2
+
+    def picture() -> np.ndarray:
+        page.evaluate(DRAWN)
+        return cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR_RGB)[:560, :680].astype(int)
+
+    for row in range(len(rows(page))):
+        plain = picture()
+        page.evaluate(f"document.querySelectorAll('li .name')[{row}].click()")
+        marked = picture()
+        page.evaluate(f"document.querySelectorAll('li .name')[{row}].click()")
+        changed = np.abs(marked - plain).sum(axis=2) > 60
+        if changed.sum() > 100:
+            red, _, blue = np.median(marked[changed], axis=0)
+            assert red > 1.5 * blue
+
+
+@needs_browser
+def test_a_lost_graphics_card_is_told_of(file):
+    with browser_page(600, 400) as page:
+        page.open(file.as_uri())
+        page.wait_for("document.body?.dataset.drawn")
+        lose = "document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+        page.evaluate(lose)
+        page.wait_for("document.getElementById('problem').textContent.includes('load the page again')")

@@ -81,8 +81,8 @@ def gltf(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str]) ->
         appearance = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
         appearance |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
         primitive = {"mode": _POINTS, "attributes": _attributes(own, buffer), "extensions": {_EXTENSION: appearance}}
-        meshes.append({"primitives": [primitive]})
         nodes.append(node_of(instance_id, names, mesh))
+        meshes.append({"name": nodes[-1]["name"], "primitives": [primitive]})
     document = {"extensionsUsed": [_EXTENSION], "meshes": meshes} if meshes else {}
     return glb({**document, **scene_of(nodes, cameras)}, buffer)
 

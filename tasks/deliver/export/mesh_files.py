@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +52,7 @@ def mesh_obj(mesh: TriangleMesh, *, name: str) -> FileContent:
 @task(name="deliver.export.mesh_glb")
 def mesh_glb(meshes: tuple[TriangleMesh, ...], cameras: Cameras, *, names: Mapping[str, str]) -> FileContent:
     """A .glb file with a node for each mesh that has triangles; names: of the instances, by their ids as text."""
-    buffer, nodes, entries = Buffer(), [], []
+    buffer, nodes, entries = Buffer(), [], list[dict[str, Any]]()
     # Colours are those of the photos: the material is not to be lit, and glTF's colours are linear.
     for mesh in (mesh for mesh in meshes if len(mesh.triangles)):
         display = mesh.colors / 255
@@ -61,8 +62,9 @@ def mesh_glb(meshes: tuple[TriangleMesh, ...], cameras: Cameras, *, names: Mappi
             "COLOR_0": buffer.add(linear.astype("<f4"), _VERTEX_DATA),
         }
         indices = buffer.add(mesh.triangles.astype("<u4").ravel(), _INDICES, _UNSIGNED)
-        entries.append({"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]})
-        nodes.append(node_of(mesh.instance_id, names, len(entries) - 1))
+        nodes.append(node_of(mesh.instance_id, names, len(entries)))
+        primitive = {"attributes": attributes, "indices": indices, "material": 0}
+        entries.append({"name": nodes[-1]["name"], "primitives": [primitive]})
     if not entries:
         return glb(scene_of([], cameras), buffer)
     material = {

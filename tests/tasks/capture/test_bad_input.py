@@ -479,8 +479,10 @@ def colmap_with_no_image(root):
 
 
 @case("groundtruth.txt", "is missing")
-def tum_without_poses(root):
-    (made.tum(root) / "groundtruth.txt").unlink()
+def tum_without_poses_or_depth(root):
+    made.tum(root)
+    for name in ("groundtruth.txt", "depth.txt"):
+        (root / name).unlink()
     return root
 
 

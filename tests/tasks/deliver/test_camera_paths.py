@@ -85,3 +85,21 @@ def test_an_orbit_round_what_was_photographed_straight_down_from_all_sides_is_a_
     centers = np.array([camera.center for camera in path])
     np.testing.assert_allclose(centers[:, 2], 4, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(centers[:, :2] - centers[:, :2].mean(axis=0), axis=1), 1, atol=0.1)
+
+
+def azimuths(path) -> np.ndarray:
+    return np.unwrap([np.arctan2(camera.center[1], camera.center[0]) for camera in path])
+
+
+@pytest.mark.parametrize("first", [0.0, 2.9])  # the second arc lies across the seam of the angles
+def test_an_orbit_of_what_was_taken_from_one_side_swings_over_that_side_and_back(first):
+    taken = first + np.radians([0, 17, 39])
+    cameras = made_cameras(tuple((3 * np.cos(a), 3 * np.sin(a), 1.0) for a in taken))
+    found = azimuths(round_scene(made_gaussians(400, 0), cameras, frames=12))
+    np.testing.assert_allclose([found[0], found[6]], [taken[0], taken[-1]], atol=0.05)
+    np.testing.assert_allclose(found[7:], found[5:0:-1], atol=1e-9)
+
+
+def test_an_orbit_goes_all_round_where_no_gap_is_large():
+    found = azimuths(round_scene(made_gaussians(400, 0), CIRCLE, frames=12))
+    np.testing.assert_allclose(np.diff(found), np.pi / 6, atol=0.1)

@@ -83,6 +83,7 @@ def test_gltf_holds_every_number_of_every_instance_exactly_and_names_its_node(co
     assert nodes.get(1, {"name": "red mug"})["name"] == "red mug"
     for instance_id, node in nodes.items():
         own = made.instance_id == instance_id
+        assert document["meshes"][node["mesh"]]["name"] == node["name"]
         (primitive,) = document["meshes"][node["mesh"]]["primitives"]
         found = {name: column(document, binary, a) for name, a in primitive["attributes"].items()}
         prefix = "KHR_gaussian_splatting"

@@ -147,3 +147,4 @@ def test_a_scene_of_meshes_names_its_nodes_and_their_instances(whole):
     document = json.loads(data.content.tobytes()[20 : 20 + size])
     assert [node["name"] for node in document["nodes"]] == ["scene", "object 3"]
     assert document["nodes"][1]["extras"] == {"instance_id": 3}
+    assert [mesh["name"] for mesh in document["meshes"]] == ["object 3"]

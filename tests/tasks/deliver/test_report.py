@@ -15,6 +15,7 @@ from ss_flow.tasks.geometry.images import encode_png
 
 PHOTO = np.random.default_rng(0).integers(0, 256, (60, 80, 3), np.uint8)
 FILE = compressed(PHOTO)
+HALF = np.repeat(np.uint16([[0, 1]]), 40, axis=1).repeat(60, axis=0)
 RUN = {
     "status": "degraded",
     "scene": "my <room> & more",
@@ -128,11 +129,64 @@ def test_three_views_spread_over_the_capture_are_drawn():
     f, i = np.zeros(0, np.float32), np.zeros(0, np.int32)
     nothing = Gaussians(f.reshape(0, 3), f.reshape(0, 4), f.reshape(0, 3), f, f.reshape(0, 1, 3), i, f, i)
     pictures = report_pictures(frames, cameras, depths, maps, maps, nothing)
-    kinds = ("photo", "masks_split", "masks", "depth")
+    kinds = ("photo", "masks_split", "masks", "depth, 1 to 1 m, near = red; sensor, 100 % known")
     assert [one.name for one in pictures] == [*(f"{v}/{kind}" for v in ("v1", "v4", "v7") for kind in kinds), "Cameras"]
     few = report_pictures(frames[:2], cameras, depths[:2], maps[:2], maps[:2], nothing)
     assert [one.name for one in few if one.name.endswith("photo")] == ["v0/photo", "v1/photo"]
     assert decompressed(pictures[0].content).shape == (h, w, 3)
+
+
+def test_what_the_colours_of_a_depth_map_mean_stands_in_its_caption():
+    frame, maps = Frame("v", 80, 60, encode_png(PHOTO), np.zeros(0, np.uint8), 80, 60), [LabelMap("v", HALF)]
+    cameras = Cameras(("v",), np.array([[80, 60]], np.int32), np.ones((1, 4)), np.eye(4)[None], False)
+    f, i = np.zeros(0, np.float32), np.zeros(0, np.int32)
+    nothing = Gaussians(f.reshape(0, 3), f.reshape(0, 4), f.reshape(0, 3), f, f.reshape(0, 1, 3), i, f, i)
+    known, unknown = (
+        report_pictures([frame], cameras, [DepthMap("v", depth, "mvs")], maps, maps, nothing)[3]
+        for depth in (np.float32(2 * HALF), np.zeros((60, 80), np.float32))
+    )
+    assert "<figcaption>Depth, 2 to 2 units, near = red; mvs, 50 % known</figcaption>" in report_html(
+        RUN, pictures=[known]
+    )
+    assert decompressed(known.content).shape == (60, 80, 3), "no legend in the picture"
+    assert unknown.name == "v/depth, mvs, nothing known"
+
+
+def test_a_report_of_an_edit_says_so_and_what_was_done():
+    operations = [
+        {"op": "remove", "instances": ["red mug", 5, 0], "fill": True, "comment": "in <the> way"},
+        {"op": "keep", "instances": "lamp"},
+        {"op": "duplicate", "instance": "lamp", "name": "lamp b", "move": [0.4, 0, 0]},
+        {"op": "transform", "instances": [3], "rotate": {"axis": [0, 0, 1], "degrees": 90}, "scale": 0.5},
+        {"op": "recolour", "instances": "lamp", "color": [208, 32, 32]},
+        {"op": "replace", "instance": "lamp", "run": "/home/someone/other", "by": 7, "scale": "fit"},
+        {"op": "relabel", "instance": "lamp b", "name": "torch", "kind": "stuff"},
+        {"op": "merge", "instances": ["a", "b"], "name": "c"},
+        {"op": "split", "instance": "c"},
+    ]
+    hole = {"operation": 1, "pixels": 12_000, "unmeasured": 1082, "open_after_filling": 61}
+    edit = {"source": "/home/someone/kitchen", "script": {"operations": operations}, "holes": [hole], "num_filled": 67}
+    html = report_html(RUN | {"edit": edit}, pictures=())
+    told = [line.strip() for line in re.findall(r"<li>(.*?)</li>", html.split("<ol>")[1].split("</ol>")[0])]
+    assert told == [
+        "Removed red mug, instance 5 and the background, filled the hole (in &lt;the&gt; way). Behind 1,082 of the"
+        " 12,000 pixels that showed it nothing was measured; after filling, behind 61.",
+        "Kept nothing but lamp.",
+        "Copied lamp as lamp b, moved by (0.4, 0, 0).",
+        "Changed instance 3, turned by 90° about (0, 0, 1), scaled by 0.5.",
+        "Recoloured lamp to #d02020.",
+        "Replaced lamp by instance 7 of other.",
+        "Relabelled lamp b as torch, stuff from now on.",
+        "Merged a and b as c.",
+        "Split c into its parts.",
+    ]
+    assert "the run <b>kitchen</b>" in html and "67 Gaussians fill holes" in html
+    assert "How it was made" not in html and "someone" not in html
+    assert "Edited" not in report_html(RUN, pictures=()) and "How it was made" in report_html(RUN, pictures=())
+
+
+def test_pictures_are_there_at_once_so_that_the_page_does_not_jump():
+    assert "lazy" not in report_html(RUN, pictures=[Picture("a/photo", FILE), Picture("Cameras", FILE)])
 
 
 def test_the_time_of_a_hit_is_not_counted():
@@ -166,7 +220,7 @@ def test_objects_are_pictured_by_how_much_they_matter_and_the_doubtful_ones_name
     assert "small mug (3) : few views: it is seen in 2 of 20; low <confidence>" in text
     doubts = re.search(r'<ul class="doubts">(.*?)</ul>', html, re.DOTALL)[1]
     assert base64.b64encode(FILE.tobytes()).decode() in doubts
-    pictured = re.findall(r'alt="(.*?)" loading', html)
+    pictured = re.findall(r'alt="(.+?)"><figcaption><b>', html)
     assert pictured == ["large box", "small mug"]
     assert "25.0 % of the pixels" in text and "less than 0.1 % of the pixels" in text
     assert "50.0 % of the dense points carry a label" in text and "Of 25.0 % the best label" in text

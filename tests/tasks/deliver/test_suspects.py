@@ -35,13 +35,16 @@ def _instance(number: int, points: np.ndarray, views: int = 20, confidence: floa
     )
 
 
-def _found(*instances: InstanceMasks, groups=(), tree=((), ()), kinds=None, crumbs=()) -> dict[int, str]:
+def _found(
+    *instances: InstanceMasks, groups=(), tree=((), ()), kinds=None, crumbs=(), gaussians=None
+) -> dict[int, str]:
     entries = [
         {
             "id": one.instance_id,
             "name": f"thing {one.instance_id}",
             "kind": (kinds or {}).get(one.instance_id, "thing"),
             "crumb": one.instance_id in crumbs,
+            "num_gaussians": (gaussians or {}).get(one.instance_id, len(one.points)),
         }
         for one in instances
     ]
@@ -59,6 +62,14 @@ def test_clean_objects_are_not_told_of() -> None:
     clean = [_instance(1, _block(0)), _instance(2, _block(1)), _instance(3, _block(2))]
     group = {"id": 9, "agreement": 0.3, "instances": [1, 2]}
     assert _found(*clean, groups=[group], tree=((1, 2, 3, 7), (1, 1, 0.6, 0.2))) == {}
+
+
+def test_what_was_hardly_reconstructed_is_told_of() -> None:
+    told = _found(*(_instance(i, _block(i)) for i in (1, 2, 3)), gaussians={1: 1, 2: 99, 3: 100})
+    assert told == {
+        1: "hardly anything of it was reconstructed: 1 Gaussian for 1,000 points",
+        2: "hardly anything of it was reconstructed: 99 Gaussians for 1,000 points",
+    }
 
 
 def test_few_views_and_low_confidence_are_told_with_their_figures() -> None:

@@ -51,6 +51,7 @@ def camera_at(world_to_camera: np.ndarray) -> Camera:
     return Camera(64, 48, 60.0, 60.0, 32.0, 24.0, world_to_camera)
 
 
+NO_TURN = ((0.0, 0.0, 1.0), 0.0)
 POSE = np.eye(4)
 POSE[2, 3] = 2.0
 
@@ -141,15 +142,37 @@ def test_another_object_takes_the_place_and_the_size_of_the_one_it_replaces(tmp_
     other = some_rows(scene_of(40, seed=5), np.ones(40, bool))
     write_gaussians(tmp_path / "other.ply", replace(other, means=other.means * 7 + 3), labelled=True)
     read = operations.read_object(file=FileRef(tmp_path / "other.ply", ""))
-    after = operations.put_in_place(scene, read, instance=1, new_id=8, scale=None)
+    after = operations.put_in_place(scene, read, instance=1, new_id=8, scale=None, turn=NO_TURN)
     old, new = scene.means[scene.instance_id == 1], after.means[after.instance_id == 8]
     assert len(new) == 40 and not (after.instance_id == 1).any()
     np.testing.assert_allclose(new.mean(axis=0), old.mean(axis=0), atol=1e-5)
     diagonals = [np.linalg.norm(np.ptp(np.quantile(m, (0.005, 0.995), axis=0), axis=0)) for m in (old, new)]
     assert diagonals[0] == pytest.approx(diagonals[1], rel=1e-5)
-    kept = operations.put_in_place(scene, read, instance=1, new_id=8, scale=1.0)
+    kept = operations.put_in_place(scene, read, instance=1, new_id=8, scale=1.0, turn=NO_TURN)
     own = kept.means[kept.instance_id == 8]
     np.testing.assert_allclose(own - own.mean(axis=0), read.means - read.means.mean(axis=0), atol=1e-5)
+
+
+@pytest.mark.parametrize("there", [(0.0, -1.0, 0.0), (0.6, 0.0, 0.8), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
+def test_an_object_from_a_world_whose_up_is_another_is_put_upright(there):
+    scene, other = scene_of(90, degree=0), scene_of(60, seed=5, degree=0)
+    here = (0.0, 0.0, 1.0)
+    turn = operations.smallest_turn(there, here)
+    after = operations.put_in_place(scene, other, instance=1, new_id=8, scale=1.0, turn=turn)
+    own = some_rows(after, after.instance_id == 8)
+    heights = (other.means - other.means.mean(axis=0)) @ np.array(there)
+    np.testing.assert_allclose((own.means - own.means.mean(axis=0)) @ np.array(here), heights, atol=1e-5)
+    turned = (
+        Rotation.from_quat(own.quaternions, scalar_first=True)
+        * Rotation.from_quat(other.quaternions, scalar_first=True).inv()
+    )
+    np.testing.assert_allclose(turned.apply(there), np.tile(here, (len(own), 1)), atol=1e-5)
+    fitted = operations.put_in_place(scene, other, instance=1, new_id=8, scale=None, turn=turn)
+    diagonals = [
+        np.linalg.norm(np.ptp(np.quantile(m, (0.005, 0.995), axis=0), axis=0))
+        for m in (scene.means[scene.instance_id == 1], fitted.means[fitted.instance_id == 8])
+    ]
+    assert diagonals[0] == pytest.approx(diagonals[1], rel=1e-4)
 
 
 def test_a_file_without_gaussians_replaces_nothing(tmp_path):
