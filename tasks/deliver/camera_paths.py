@@ -17,6 +17,8 @@ _TOWARDS_SURFACE = 0.1
 
 _ONE_SIDED_DEG = 120.0
 """Views leave a side out where they leave a gap larger than this between their directions."""
+_LEAST_SWING_DEG = 30.0
+"""A narrower swing, as where all views stand side by side, would show no depth."""
 
 _WIDER = 0.8
 """Shortens the lens of an orbit round an instance, so that no end of it is cut off."""
@@ -98,8 +100,9 @@ def _azimuths(taken: Float64, frames: int) -> Float64:
     widest = int(gaps.argmax())
     if gaps[widest] <= np.radians(_ONE_SIDED_DEG):
         return turn
-    arc = 2 * np.pi - gaps[widest]
-    return ordered[widest] + gaps[widest] + arc * (1 - np.cos(turn)) / 2
+    covered = 2 * np.pi - gaps[widest]
+    half = max(covered, np.radians(_LEAST_SWING_DEG)) / 2
+    return ordered[widest] + gaps[widest] + covered / 2 - half * np.cos(turn)
 
 
 def _looked_at(scene: Gaussians, views: tuple[Camera, ...]) -> Float64:
