@@ -23,6 +23,8 @@ _SAME_SPACE = 0.5
 """IoU of their boxes from which two objects collide."""
 _APART = 6.0
 """Objects lie in pieces where these are farther apart than so many spacings of the dense points."""
+_NAMED = 3
+"""Other objects that a reason names; more are counted."""
 _HARDLY_THERE = 0.1
 """Gaussians for each dense point, below which an object was hardly reconstructed."""
 _PIECE = 0.2
@@ -67,8 +69,10 @@ def _fragments(groups: Sequence[Mapping[str, Any]], names: Mapping[int, str]) ->
         if group["agreement"] < _NEARLY_ONE or len(members) < 2:
             continue
         for i in members:
-            others = ", ".join(names[other] for other in members if other != i)
-            found.setdefault(i, f"a fragment: {group['agreement']:.0%} of the views show it as one thing with {others}")
+            others = [names[other] for other in members if other != i]
+            more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+            among = f"{', '.join(others[:_NAMED])}{more}"
+            found.setdefault(i, f"a fragment: {group['agreement']:.0%} of the views show it as one thing with {among}")
     return list(found.items())
 
 

@@ -92,6 +92,9 @@ def test_what_nearly_half_of_the_views_show_as_one_thing_are_fragments_of_it() -
     told = _found(*(_instance(i, _block(i)) for i in (1, 2, 3)), groups=groups)
     assert told[1] == "a fragment: 44% of the views show it as one thing with thing 2", "the smallest group counts"
     assert told[3] == "a fragment: 41% of the views show it as one thing with thing 1, thing 2"
+    many = [{"id": 9, "agreement": 0.5, "instances": [1, 2, 3, 4, 5, 6]}]
+    told = _found(*(_instance(i, _block(i)) for i in range(1, 7)), groups=many)
+    assert told[6] == "a fragment: 50% of the views show it as one thing with thing 1, thing 2, thing 3 and 2 more"
 
 
 def test_what_hardly_half_of_the_views_show_as_one_thing_may_have_swallowed_a_neighbour() -> None:
