@@ -371,13 +371,11 @@ class Store:
 
 def _own(value: Any) -> Any:
     """The same with lists and tables of its own, which can be changed as nothing else of a frozen dataclass can."""
-    fields = {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}
-    changeable = {name: content for name, content in fields.items() if isinstance(content, dict | list)}
-    if not changeable:
-        return value
-    own = copy.copy(value)
-    for name, content in changeable.items():
-        object.__setattr__(own, name, copy.deepcopy(content))
+    own = value
+    for item in dataclasses.fields(value):
+        if isinstance(content := getattr(value, item.name), dict | list):
+            own = copy.copy(value) if own is value else own
+            object.__setattr__(own, item.name, copy.deepcopy(content))
     return own
 
 

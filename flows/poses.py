@@ -20,7 +20,7 @@ from ss_flow.tasks.capture.sfm import SfmParams, Unregistered, accepted, sfm, un
 
 def poses(frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] | None) -> Cameras:
     """Add the nodes of structure from motion; names: of the frames, where they are known beforehand."""
-    found, looks, matches = _compared(frames, params, names)
+    found, looks, matches = compared(frames, params, names)
     first = sfm(found, matches, gather([]), params=params.mapping)
     missing = unregistered(looks, first)
 
@@ -45,7 +45,7 @@ def poses_by_depth(
     names: tuple[str, ...],
 ) -> Cameras:
     """Add the nodes that find poses from what a sensor measured; unposed: the lenses of the frames."""
-    found, _, matches = _compared(frames, params.sfm, names)
+    found, _, matches = compared(frames, params.sfm, names)
     return placed_by_depth(
         found,
         unposed,
@@ -59,7 +59,7 @@ def poses_by_depth(
 
 def refined_poses(frames: tuple[Frame, ...], cameras: Cameras, params: CaptureParams) -> Cameras:
     """Add the nodes that refine the poses of the frames, which came with the capture."""
-    found, _, matches = _compared(frames, params.sfm, None)
+    found, _, matches = compared(frames, params.sfm, None)
     return refined_cameras(found, cameras, matches, params=params.refine, insist=params.refine_poses == "always")
 
 
@@ -100,7 +100,7 @@ def fitting_poses(
     return expand(cast(Any, looks), lambda count: look(0, count))
 
 
-def _compared(
+def compared(
     frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] | None
 ) -> tuple[tuple[Features, ...], tuple[Look, ...], tuple[Matches, ...]]:
     """Features, first looks and matches of photos."""

@@ -18,6 +18,7 @@ from ss_flow.graph import stored
 from ss_flow.runs import Run
 from ss_flow.tasks.deliver.compressed import Thumbnail
 from ss_flow.tasks.deliver.output import RUN_FILE
+from ss_flow.tasks.words import first_of
 
 BACKGROUND = 0
 _KNOWN = 8
@@ -120,10 +121,10 @@ class FinishedRun:
             entry = by_id.get(word) or by_name.get(word)
             if entry is None:
                 like = sorted(entries, key=lambda entry: word.lower() not in entry["name"].lower())
-                known = ", ".join(f"{entry['id']} ({entry['name']})" for entry in like[:_KNOWN])
-                more = f" and {len(like) - _KNOWN} more (instances.json)" if len(like) > _KNOWN else ""
+                known = first_of([f"{entry['id']} ({entry['name']})" for entry in like], _KNOWN)
+                where = " (instances.json)" if len(like) > _KNOWN else ""
                 raise InputError(
-                    f"--instance {word!r} is no instance of {self.folder}; there are 0 (background), {known}{more}."
+                    f"--instance {word!r} is no instance of {self.folder}; there are 0 (background), {known}{where}."
                 )
             if not entry["num_gaussians"]:
                 raise InputError(f"instance {entry['id']} ({entry['name']}) of {self.folder} has no Gaussians.")

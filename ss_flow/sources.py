@@ -49,6 +49,11 @@ class Module:
     stars: tuple[str, ...] = ()
     """The modules that all names are imported from, directly or not."""
 
+    def add(self, name: str, *statements: ast.stmt) -> None:
+        """Statements that tell what a name stands for, each once."""
+        known = self.definitions.setdefault(name, [])
+        known += [statement for statement in statements if statement not in known]
+
 
 @functools.cache
 def source_digest(name: str) -> str:
@@ -166,14 +171,12 @@ def module_without_stars(name: str) -> Module | None:
         called = (changing[name] for name in _called_at_once(statement) if name in changing)
         changed = [*_changed_names(statement), *itertools.chain(*itertools.chain(*called))]
         for name in dict.fromkeys([*_bound_at_top(statement), *(name for name in changed if name in bound)]):
-            known = module.definitions.setdefault(name, [])
-            known += [*(test for test in tests if test not in known), statement]
+            module.add(name, *tests, statement)
         nodes = ast.walk(statement) if isinstance(statement, _BLOCKS) else (statement,)
         for name, origins in imports_of(module, nodes).items():
             module.imports.setdefault(name, []).extend(origins)
             if tests:  # which of several it is
-                known = module.definitions.setdefault(name, [])
-                known += [test for test in tests if test not in known]
+                module.add(name, *tests)
     return module
 
 

@@ -22,6 +22,7 @@ from ss_flow.flows.view.search import Search
 from ss_flow.flows.view.session import Operation, Piece, Session, write_script
 from ss_flow.tasks.artifacts import Cameras, Float64
 from ss_flow.tasks.edit.operations import Motion
+from ss_flow.tasks.words import first_of
 
 if TYPE_CHECKING:
     import viser
@@ -292,7 +293,7 @@ class Panel:
         """What is selected, and how much there is to save."""
         selected, objects = self.session.selected, self.session.state.objects
         names = ["the background" if i == BACKGROUND else objects.name(i) for i in selected]
-        told = html.escape(", ".join(names[:4])) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+        told = html.escape(first_of(names, 4))
         count = len(self.session.state.done)
         edits = f"{count} edit{'' if count == 1 else 's'}" + (", not all saved" if self.unsaved else "")
         return f'<div style="padding:0.3em 0.8em"><b>{told or "Nothing selected"}</b><br><small>{edits}</small></div>'

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, CaptureChecks, DepthMap, Float32, Float64, Frame
-from ss_flow.tasks.capture.ingest import first_of
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, size_within
 from ss_flow.tasks.ranges import Fraction, NonNegative
+from ss_flow.tasks.words import first_of
 
 _SIDE = 160
 """Longer side of the images that are compared."""
@@ -78,10 +78,10 @@ def checks(
 ) -> CaptureChecks:
     """Compare each view with its two nearest neighbours, and warn of what does not fit.
 
-    Neighbours are the views whose cameras are nearest and look the same way. Told of are a scene so far from
-    the world's origin that numbers are coarse, duplicates, principal points far from the middle, depth of another
-    scale, poses that disagree with depth (all, or single ones), and, by the scale that fits, photos that show something
-    else than their neighbours, and exposures that change. All lists are in the order of the frames.
+    Neighbours are the views whose cameras are nearest and look the same way. Told of are a scene so far from the
+    world's origin that numbers are coarse, duplicates, principal points far from the middle, depth of another scale,
+    poses that disagree with depth (all, or single ones), and, by the scale that fits, photos that show something else
+    than their neighbours, and exposures that change. All lists are in the order of the frames.
     """
     views = [_view(frame, camera_of(cameras, row), depths[row]) for row, frame in enumerate(frames)]
     pairs: list[tuple[int, int]] = []

@@ -14,10 +14,10 @@ from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Frame, MaskSet
 from ss_flow.tasks.capture.id_images import frame_pixels
-from ss_flow.tasks.capture.ingest import first_of
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import is_number, read_json
 from ss_flow.tasks.masks.pool import mask_set
+from ss_flow.tasks.words import first_of
 
 _SCORES = ("predicted_iou", "score")
 

@@ -64,7 +64,7 @@ def _geometries(pycolmap: Any, matches: Sequence[Matches], rows: dict[str, int])
             geometry = pycolmap.TwoViewGeometry(
                 config=int(own.configuration[i]),
                 F=own.fundamental[i],
-                inlier_matches=own.pair[own.first[i] : own.first[i + 1]].astype(np.uint32),
+                inlier_matches=own.pairs_with(i).astype(np.uint32),
             )
             a, b = rows[own.name], rows[other]
             found[min(a, b), max(a, b)] = (a, b, geometry)

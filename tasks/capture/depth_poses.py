@@ -165,7 +165,7 @@ def _links(seen: list[_Seen], matches: Sequence[Matches]) -> _Links:
     links: _Links = {row: [] for row in range(len(seen))}
     for own in matches:
         for i, other in enumerate(own.others):
-            a, b = own.pair[own.first[i] : own.first[i + 1]].T
+            a, b = own.pairs_with(i).T
             links[row_of[own.name]].append((row_of[other], a, b))
             links[row_of[other]].append((row_of[own.name], b, a))
     return links

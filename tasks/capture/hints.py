@@ -11,9 +11,9 @@ from ss_flow.errors import InputError
 from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Clicks, Float64, Frame
-from ss_flow.tasks.capture.ingest import first_of
 from ss_flow.tasks.capture.lens import Lens, photo_lens, undistorted
 from ss_flow.tasks.capture.scene_files import Hint, Hints, Point, is_number, read_json
+from ss_flow.tasks.words import first_of
 
 
 def read_hints(path: Path, views: tuple[str, ...]) -> Hints:

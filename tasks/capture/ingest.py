@@ -6,7 +6,6 @@ Masks and depth follow the frames they belong to by name, so that frames may hav
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +20,8 @@ from ss_flow.tasks.capture.photo_files import Photo, decode, read_gray, read_pho
 from ss_flow.tasks.capture.scene_files import Pose
 from ss_flow.tasks.geometry.images import averaged_valid, encode_png
 from ss_flow.tasks.ranges import Count, JpegQuality
+from ss_flow.tasks.words import first_of
 
-_NAMED = 10
-"""Views that a warning names; more are counted."""
 _UPRIGHT = {2: "flip", 3: "180", 4: "flip 180", 5: "flip 270", 6: "90", 7: "flip 90", 8: "270"}
 
 
@@ -79,11 +77,6 @@ def warn_of_skipped(names: tuple[str, ...], why: str) -> None:
     if names:
         views = "1 view is" if len(names) == 1 else f"{len(names)} views are"
         warn(f"{views} left out, {why}: {first_of(names)}.")
-
-
-def first_of(names: Sequence[str]) -> str:
-    """Names in words, the first of them where there are many."""
-    return f"{', '.join(names[:_NAMED])}{f' and {len(names) - _NAMED} more' if len(names) > _NAMED else ''}"
 
 
 def frame_of(

@@ -32,9 +32,9 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     """The capture that a `transforms.json` describes.
 
     Its poses are camera-to-world with OpenGL's axes (y up, looking along -z); where all frames have depth, all may be
-    without. A unit of its depth files is
-    `depth_unit_scale_factor` world units (0.001 unless said). The scene counts as metric exactly when it has depth
-    maps: those of a sensor come in metres, while poses alone are mostly structure from motion's.
+    without. A unit of its depth files is `depth_unit_scale_factor` world units (0.001 unless said). The scene counts as
+    metric exactly when it has depth maps: those of a sensor come in metres, while poses alone are mostly structure from
+    motion's.
     Frames whose photo is not there are left out: such a file is often passed on with a part of its photos.
     Raises InputError when the file or another file that it lists is missing or makes no sense, or no photo is there.
     """

@@ -46,6 +46,10 @@ class Matches:
     pair: Int32
     """[M, 2] rows of the two photos' features, this one's first."""
 
+    def pairs_with(self, other: int) -> Int32:
+        """[m, 2] those of `pair` with one of the other photos, by its place in `others`."""
+        return self.pair[self.first[other] : self.first[other + 1]]
+
 
 @task(name="capture.match")
 def match(photo: Features, others: Sequence[Features], *, guided: bool = False, seed: int = 0) -> Matches:

@@ -166,7 +166,7 @@ def matches_that_fit(cameras: Cameras, photos: Sequence[Features], matches: Sequ
         for i, other in enumerate(own.others):
             if own.name not in points or other not in points:
                 continue
-            pair = own.pair[own.first[i] : own.first[i + 1]]
+            pair = own.pairs_with(i)
             fundamental = _fundamental(cameras, rows[own.name], rows[other])
             off = sampson_distance(fundamental, points[own.name][pair[:, 0]], points[other][pair[:, 1]])
             fit, total = fit + int((off < MAX_ERROR).sum()), total + len(pair)

@@ -10,10 +10,10 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame
-from ss_flow.tasks.capture.ingest import first_of
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
 from ss_flow.tasks.geometry.images import decode_valid, pixels_under
+from ss_flow.tasks.words import first_of
 
 
 @task(name="capture.sensor_depth")

@@ -9,6 +9,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Hierarchy, InstanceMasks
 from ss_flow.tasks.geometry.clustering import dbscan
+from ss_flow.tasks.words import first_of
 
 _FEW_VIEWS = 3
 _FEW_SHARE = 0.05
@@ -70,8 +71,7 @@ def _fragments(groups: Sequence[Mapping[str, Any]], names: Mapping[int, str]) ->
             continue
         for i in members:
             others = [names[other] for other in members if other != i]
-            more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
-            among = f"{', '.join(others[:_NAMED])}{more}"
+            among = first_of(others, _NAMED)
             found.setdefault(i, f"a fragment: {group['agreement']:.0%} of the views show it as one thing with {among}")
     return list(found.items())
 

@@ -26,13 +26,10 @@ from ss_flow.flows.capture import all_of
 from ss_flow.flows.cli.context import file_digests, references
 from ss_flow.flows.depths import measured
 from ss_flow.flows.params import CaptureParams, Params
-from ss_flow.flows.poses import matched, poses, poses_by_depth
-from ss_flow.graph import each
+from ss_flow.flows.poses import compared, poses, poses_by_depth
 from ss_flow.tasks.artifacts import Cameras, Float64
 from ss_flow.tasks.capture.colmap import load_pycolmap
-from ss_flow.tasks.capture.features import features
 from ss_flow.tasks.capture.ingest import cameras, frames
-from ss_flow.tasks.capture.pairs import look
 from ss_flow.tasks.capture.pose_fit import matches_that_fit
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.geometry.cameras import cameras_by_view
@@ -81,10 +78,8 @@ def line(place: Path, options: argparse.Namespace, params: CaptureParams, store:
         photos, valid = all_of(reference, scene.photos), all_of(reference, scene.valid)
         lenses = scene.lenses if options.depth else None
         own = frames(names=scene.names, photos=photos, valid=valid, lenses=lenses, params=params.ingest)
-        found = each(own, build=lambda frame: features(frame, params=params.sfm.features))
-        looks = each(found, build=lambda photo: look(photo, count=params.sfm.pairs.look_features))
         given = cameras(own, names=scene.names, lenses=scene.lenses, poses=scene.poses, metric=True, sparse=None)
-        matches = matched(found, looks, params.sfm, None)
+        found, _, matches = compared(own, params.sfm, None)
         if options.depth:
             placed = poses_by_depth(own, given, measured(scene, reference, own), params, scene.names)
         else:

@@ -79,7 +79,7 @@ def test_matches_of_two_views_lie_on_their_epipolar_lines(scene):
     found = match(photos[2], photos[:2])
     assert found.others == ("view0", "view1")
     for i, k in enumerate((0, 1)):
-        pairs = found.pair[found.first[i] : found.first[i + 1]]
+        pairs = found.pairs_with(i)
         assert len(pairs) > 100
         own, other = photos[2].points[pairs[:, 0]], photos[k].points[pairs[:, 1]]
         assert np.median(off_line(own, other, true_fundamental(cameras, 2, k))) < 1.0
