@@ -7,15 +7,18 @@ Conventions (said once, used everywhere):
 - Pixel centres lie at (i + 0.5, j + 0.5); the pixel that holds image point (u, v) is (floor(u), floor(v)).
 - Instance ids: 1..L, assigned once and never re-used; 0 is background or unlabelled.
 - Quaternions are (w, x, y, z). Images in memory are RGB.
+
+All in one module: the digest of an artifact names the module of its class, so one that moves is another artifact.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ss_flow.tasks.packed import PhotoMasks, ViewLists, ViewMasks
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -136,64 +139,10 @@ class CaptureChecks:
     """Views whose photo is that of an earlier one."""
 
 
-class PackedMasks:
-    """Masks of one size, a bit a pixel."""
-
-    height: int
-    width: int
-    packed: UInt8
-    """[N, ceil(H * W / 8)] row-major (`np.packbits`)."""
-
-    def dense(self) -> Bool:
-        """The masks as [N, H, W] booleans."""
-        bits = np.unpackbits(self.packed, axis=1, count=self.height * self.width)
-        return bits.reshape(-1, self.height, self.width).view(bool)
-
-    def mask(self, row: int) -> Bool:
-        """One of the masks: [H, W]."""
-        bits = np.unpackbits(self.packed[row], count=self.height * self.width)
-        return bits.reshape(self.height, self.width).view(bool)
-
-
-class ViewMasks:
-    """Masks of one thing, a bit a pixel, one in each of some views, whose frames may differ in size."""
-
-    views: tuple[str, ...]
-    """[V] names of the views that have a mask, in the order of the frames."""
-    sizes: Int32
-    """[V, 2] width and height of these views."""
-    packed: UInt8
-    """The masks one after the other, each row-major and filled up to a whole byte (`np.packbits`)."""
-
-    def bits(self, row: int) -> UInt8:
-        """[ceil(H * W / 8)] one of the masks."""
-        lengths = -(-self.sizes[: row + 1].prod(axis=1, dtype=np.int64) // 8)
-        end = int(lengths.sum())
-        return self.packed[end - int(lengths[-1]) : end]
-
-    def mask(self, row: int) -> Bool:
-        """One of the masks: [H, W]."""
-        width, height = self.sizes[row].tolist()
-        return np.unpackbits(self.bits(row), count=height * width).reshape(height, width).view(bool)
-
-    def dense(self) -> list[Bool]:
-        """The masks, [H, W] each."""
-        return [self.mask(row) for row in range(len(self.views))]
-
-    def areas(self) -> Int64:
-        """[V] pixels of each mask."""
-        return np.array([np.bitwise_count(self.bits(row)).sum() for row in range(len(self.views))], np.int64)
-
-
 @dataclass(frozen=True)
-class MaskSet(PackedMasks):
+class MaskSet(PhotoMasks):
     """The 2D instance masks that a segmenter found in one view (Split&Splat, M_k); they may overlap."""
 
-    name: str
-    height: int
-    width: int
-    packed: UInt8
-    """[N, ceil(H * W / 8)] one bit a pixel, row-major (`np.packbits`)."""
     predicted_iou: Float32
     """[N] the segmenter's own estimate of each mask's quality."""
     stability: Float32
@@ -206,7 +155,7 @@ class MaskSet(PackedMasks):
     """Name of the segmenter."""
 
     def __len__(self) -> int:
-        return len(self.packed)
+        return len(self.boxes)
 
     @property
     def quality(self) -> Float32:
@@ -347,23 +296,19 @@ class Clicks:
 
 
 @dataclass(frozen=True)
-class PromptedMasks(PackedMasks):
+class PromptedMasks(PhotoMasks):
     """Masks that the segmenter gave in one view when asked for certain labels."""
 
-    name: str
-    height: int
-    width: int
     label: Int32
     """[N] instance id of each mask, ascending."""
-    packed: UInt8
-    """[N, ceil(H * W / 8)] one bit a pixel, row-major (`np.packbits`)."""
     predicted_iou: Float32
     """[N] the segmenter's own estimate of each mask's quality."""
 
 
 @dataclass(frozen=True)
 class InstanceMasks(ViewMasks):
-    """One instance after Split: its points and view-consistent masks (Split&Splat, M~_{k,l}). Id 0 is background."""
+    """One instance after Split: its points and view-consistent masks, exclusive between instances (Split&Splat,
+    M~_{k,l}). Id 0 is background."""
 
     instance_id: int
     points: Float32
@@ -376,10 +321,6 @@ class InstanceMasks(ViewMasks):
     """[N] part of the instance, 0 = the whole."""
     confidence: float
     """Mean vote share, less what other labels contradict."""
-    views: tuple[str, ...]
-    sizes: Int32
-    packed: UInt8
-    """As in `ViewMasks`, exclusive between instances."""
     origin: UInt8
     """[V] where the mask came from: FOUND, PROMPTED, REFINED or DRAWN."""
     weak: bool
@@ -388,15 +329,11 @@ class InstanceMasks(ViewMasks):
 
 @dataclass(frozen=True)
 class PartMasks(ViewMasks):
-    """One part of an instance, where the finished scene shows it."""
+    """One part of an instance, where the finished scene shows it; exclusive between parts."""
 
     instance_id: int
     part_id: int
     """1.. within the instance, as `Gaussians.part_id`."""
-    views: tuple[str, ...]
-    sizes: Int32
-    packed: UInt8
-    """As in `ViewMasks`, exclusive between parts."""
 
 
 FOUND, PROMPTED, REFINED, DRAWN = 0, 1, 2, 3
@@ -489,26 +426,6 @@ class DenseDescriptors:
     """[N] NO_VECTOR, FROM_PICTURES, or FROM_NEIGHBOURS where no picture shows the Gaussian."""
     network: str
     """Name of the network."""
-
-
-class ViewLists:
-    """Some of a scene's views for each row, one list after the other."""
-
-    first: Int32
-    """[R + 1] where the views of each row begin in `view`."""
-    view: Int32
-    """[A] places of views in the scene's order, ascending for each row."""
-
-    def views(self, row: int) -> list[int]:
-        """The views of a row."""
-        found: list[int] = self.view[self.first[row] : self.first[row + 1]].tolist()
-        return found
-
-    @staticmethod
-    def arrays(views: Sequence[Sequence[int]]) -> dict[str, Int32]:
-        """The two arrays by their names; views: of each row, ascending."""
-        first = np.append(0, np.cumsum([len(of_row) for of_row in views])).astype(np.int32)
-        return {"first": first, "view": np.array([view for of_row in views for view in of_row], np.int32)}
 
 
 @dataclass(frozen=True)

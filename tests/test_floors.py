@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = {"cache": "ss_flow.cache", "ss_flow": "ss_flow", "tasks": "ss_flow.tasks", "flows": "ss_flow.flows"}
 ORDER = list(FLOORS)
 ROOMS = (
+    {"packed"},
     {"artifacts", "ranges", "words", "processor", "device"},
     {"geometry"},
     {"models", "gaussians", "masks"},

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32, ViewLists
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
 from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view
 from ss_flow.tasks.geometry.plane_sweep import typical_depth, view_scores
+from ss_flow.tasks.packed import ViewLists
 from ss_flow.tasks.ranges import Count
 
 _NEARER_AND_FARTHER = (0.5, 0.7, 1.0, 1.4, 2.0)

@@ -10,7 +10,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Frame, LabelMap, UInt8
 from ss_flow.tasks.deliver.compressed import Thumbnail, compressed
 from ss_flow.tasks.geometry.images import decode_rgb
-from ss_flow.tasks.masks.packing import bounds
+from ss_flow.tasks.packed import bounds
 
 _SIDE = 128
 _MARGIN = 0.15

@@ -17,9 +17,9 @@ from ss_flow.tasks.evaluate.objects import change_elsewhere
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, near_border
-from ss_flow.tasks.masks.packing import bounds
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.lpips import distance
+from ss_flow.tasks.packed import bounds
 
 _BAND = 5
 """Pixels on either side of an instance's border."""

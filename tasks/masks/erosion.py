@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Int32, MaskSet, PromptedMasks
-from ss_flow.tasks.masks.packing import bounds
 from ss_flow.tasks.masks.pool import canonical_order, exclusive
+from ss_flow.tasks.packed import bounds
 from ss_flow.tasks.ranges import Fraction, Natural, NonNegative
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, MaskSet
 from ss_flow.tasks.masks.overlap import intersections, suppress
-from ss_flow.tasks.masks.packing import bounds, pack_masks
+from ss_flow.tasks.packed import Masks, bounds
 
 _CRUMB = 0.1
 """Pieces of a drawn mask below this share of its largest one are no part of it."""
@@ -22,11 +22,10 @@ def canonical_order(masks: Bool) -> Int32:
     if not len(masks):
         return np.zeros(0, np.int32)
     count, width = len(masks), masks.shape[2]
-    packed = pack_masks(masks)
     keys = []
     for index in range(count):
         row, column = np.divmod(np.flatnonzero(masks[index]), width)
-        keys.append((-len(row), int(row.sum()), int(column.sum()), packed[index].tobytes()))
+        keys.append((-len(row), int(row.sum()), int(column.sum()), np.packbits(masks[index]).tobytes()))
     return np.array(sorted(range(count), key=keys.__getitem__), np.int32)
 
 
@@ -135,7 +134,7 @@ def mask_set(name: str, masks: Bool, predicted_iou: Float32, source: str, *, con
         name=name,
         height=masks.shape[1],
         width=masks.shape[2],
-        packed=pack_masks(kept),
+        **vars(Masks.of(kept)),
         predicted_iou=predicted_iou[order].astype(np.float32),
         stability=np.ones(len(kept), np.float32),
         grid=np.zeros(len(kept), np.int32),
@@ -188,7 +187,7 @@ def masks_by_id(ids: NDArray[np.integer], name: str) -> MaskSet:
         name=name,
         height=ids.shape[0],
         width=ids.shape[1],
-        packed=pack_masks(ids[None] == present[:, None, None]),
+        **vars(Masks.of(ids == i for i in present)),
         predicted_iou=np.ones(count, np.float32),
         stability=np.ones(count, np.float32),
         grid=np.zeros(count, np.int32),

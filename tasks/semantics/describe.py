@@ -13,9 +13,9 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Descriptors, Frame, InstanceMasks, PartDescriptors, PartMasks, UInt8
 from ss_flow.tasks.geometry.images import shared_rgb
 from ss_flow.tasks.masks.erosion import ErosionParams, erode
-from ss_flow.tasks.masks.packing import bounds
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
+from ss_flow.tasks.packed import bounds
 from ss_flow.tasks.ranges import Count, Fraction, Natural, Positive
 from ss_flow.tasks.semantics.encoders import encoder_of
 from ss_flow.tasks.semantics.sides import mean_direction
@@ -61,7 +61,6 @@ def describe(
     """
     model = encoder_of(encoder)
     by_name = {frame.name: i for i, frame in enumerate(frames)}
-    masks = instance.dense()
     area = instance.areas()
     large = np.argsort(-area, kind="stable")[: params.max_views]
     least = np.maximum(1, params.min_area * instance.sizes.prod(axis=1))
@@ -75,7 +74,7 @@ def describe(
                 f"Frame {frame.name} is {frame.width} x {frame.height} pixels and the mask of instance "
                 f"{instance.instance_id} has {width} x {height}; both must have one size."
             )
-        mask = erode(masks[row], params.erosion)
+        mask = erode(instance.mask(row), params.erosion)
         if not mask.any():
             continue
         used.append(row)

@@ -8,11 +8,11 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, PartMasks, UInt8
+from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, PartMasks
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of
-from ss_flow.tasks.masks.packing import joined
+from ss_flow.tasks.packed import Masks
 
 _SOLID = 0.5
 """Alpha from which a pixel shows anything."""
@@ -29,7 +29,7 @@ def part_masks(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> 
     if not len(scene):
         return ()
     row_of = {name: row for row, name in enumerate(cameras.names)}
-    found: dict[tuple[int, int], list[tuple[str, tuple[int, int], UInt8]]] = {}
+    found: dict[tuple[int, int], dict[str, Masks]] = {}
     for done, shown in enumerate(maps):
         height, width = shown.ids.shape
         seen = render(scene, camera_of(cameras, row_of[shown.name]).scaled(width, height))
@@ -38,11 +38,10 @@ def part_masks(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> 
         part = np.where(same, scene.part_id[top], 0)
         both = np.stack([shown.ids[part > 0], part[part > 0]], axis=1)
         for instance, number in np.unique(both, axis=0).tolist():
-            mask = np.packbits((shown.ids == instance) & (part == number))
-            found.setdefault((instance, number), []).append((shown.name, (width, height), mask))
+            mask = Masks.of([(shown.ids == instance) & (part == number)])
+            found.setdefault((instance, number), {})[shown.name] = mask
         progress(done + 1, len(maps), shown.name)
-    result = []
-    for (instance, number), seen_in in sorted(found.items()):
-        views, sizes, masks = zip(*seen_in, strict=True)
-        result.append(PartMasks(instance, number, views, *joined(sizes, masks)))
-    return tuple(result)
+    return tuple(
+        PartMasks(**vars(Masks.joined(list(masks.values()))), views=tuple(masks), instance_id=instance, part_id=number)
+        for (instance, number), masks in sorted(found.items())
+    )

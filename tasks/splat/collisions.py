@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, ViewLists
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32
+from ss_flow.tasks.packed import ViewLists
 
 SOLID_OPACITY = 0.1
 """Fainter Gaussians say nothing of where a group is."""

@@ -15,7 +15,7 @@ from ss_flow.tasks.geometry.clustering import dbscan, nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
 from ss_flow.tasks.geometry.images import shared_rgb
 from ss_flow.tasks.geometry.sampling import first_of_each_cube
-from ss_flow.tasks.masks.packing import bounds
+from ss_flow.tasks.packed import bounds
 
 _Rows = NDArray[np.intp]
 

@@ -30,7 +30,7 @@ from ss_flow.tasks.geometry.cameras import camera_extent
 from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.masks.packing import dilated, joined
+from ss_flow.tasks.masks.packing import dilated
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive, Range
 from ss_flow.tasks.splat.consensus import agreed, completed
 
@@ -150,7 +150,7 @@ def retrain(
     instance: with the refined masks. first: with those of the first training. gaussians: of the first training; they
     come back as they are where it saw the same masks, or where `retrain_share` is 0. The rest as for `reconstruct`.
     """
-    seen_already = not params.dilation and _same_masks(first, instance)
+    seen_already = not params.dilation and first.views == instance.views and first.same(instance)
     if seen_already or not params.retrain_share or instance.weak or not len(instance.points) or not instance.views:
         return gaussians
     scene = views.compared(visibility)
@@ -158,10 +158,6 @@ def retrain(
     initial = gaussians if params.warm_start and len(gaussians) else _from_points(instance, params)
     steps = max(1, round(params.retrain_share * params.iterations(instance)))
     return _trained(scene, instance, initial, params, steps)
-
-
-def _same_masks(a: InstanceMasks, b: InstanceMasks) -> bool:
-    return a.views == b.views and np.array_equal(a.packed, b.packed)
 
 
 def _completed(scene: SceneViews, instance: InstanceMasks, params: ReconstructParams) -> InstanceMasks:
@@ -234,9 +230,8 @@ def _evenly(instance: InstanceMasks, most: int) -> InstanceMasks:
     if len(instance.views) <= most:
         return instance
     rows = np.linspace(0, len(instance.views) - 1, most).round().astype(int)
-    sizes, packed = joined(instance.sizes[rows], [instance.bits(row) for row in rows.tolist()])
     views = tuple(instance.views[row] for row in rows)
-    return replace(instance, views=views, sizes=sizes, packed=packed, origin=instance.origin[rows])
+    return replace(instance, **vars(instance.rows(rows)), views=views, origin=instance.origin[rows])
 
 
 def _channels(scene: SceneViews, instance: InstanceMasks, params: ReconstructParams) -> Iterable[Int32]:

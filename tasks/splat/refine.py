@@ -21,11 +21,12 @@ from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
-from ss_flow.tasks.masks.packing import grown, joined
+from ss_flow.tasks.masks.packing import grown
 from ss_flow.tasks.masks.pool import without_speckles
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, Sam
+from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
 
 Prompt = Callable[[Float32], tuple[Bool, float]]
@@ -121,7 +122,7 @@ def refine(
     solid = _solid(gaussians, params)
     segmenter = Sam(model) if model else None
     held = {name: row for row, name in enumerate(instance.views)}
-    names, shapes, masks, origins = [], [], [], []
+    names, masks, origins = [], [], []
     for view, frame in enumerate(views.frames):
         row = held.get(frame.name)
         old = None if row is None else instance.mask(row)
@@ -129,23 +130,20 @@ def refine(
         prompt = segmenter.image(embeddings[view], few=True).predict_prompt if segmenter else None
         new = _replacement(scene, view, solid, old, drawn, params, prompt)
         if new is not None:
-            masks.append(np.packbits(new))
+            masks.append(Masks.of([new]))
             origins.append(REFINED)
         elif row is not None:
-            masks.append(instance.bits(row))
+            masks.append(instance.rows([row]))
             origins.append(int(instance.origin[row]))
         if new is not None or row is not None:
             names.append(frame.name)
-            shapes.append((frame.width, frame.height))
         progress(view + 1, len(views.frames), frame.name)
     if not names:
         return instance
-    sizes, packed = joined(shapes, masks)
     return replace(
         instance,
+        **vars(Masks.joined(masks)),
         views=tuple(names),
-        sizes=sizes,
-        packed=packed,
         origin=np.array(origins, np.uint8),
         weak=instance.weak and len(names) < params.min_views,
     )
@@ -181,10 +179,9 @@ def rendered(
         shown &= decode_valid(views.frames[view])
         if shown.any():
             rows.append(row)
-            masks.append(np.packbits(shown))
-    sizes, packed = joined(instance.sizes[rows], masks)
+            masks.append(Masks.of([shown]))
     shown_in = tuple(instance.views[row] for row in rows)
-    return replace(instance, views=shown_in, sizes=sizes, packed=packed, origin=instance.origin[rows])
+    return replace(instance, **vars(Masks.joined(masks)), views=shown_in, origin=instance.origin[rows])
 
 
 def render_mask(

@@ -10,20 +10,12 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import (
-    REFINED,
-    Cameras,
-    Float32,
-    InstanceMasks,
-    Int32,
-    LabelMap,
-    Visibility,
-)
+from ss_flow.tasks.artifacts import REFINED, Cameras, Float32, InstanceMasks, Int32, LabelMap, Visibility
 from ss_flow.tasks.gaussians.views import SceneViews, Views
 from ss_flow.tasks.geometry.images import at_diagonal, decode_valid
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.masks.packing import joined
 from ss_flow.tasks.masks.painting import nearest_labels, paint_labels
+from ss_flow.tasks.packed import Masks
 
 _REACH = 8.0
 """How far from a pixel a point may lie that decides it, in pixels of an image with a diagonal of 800."""
@@ -126,7 +118,7 @@ def exclusive(instance: InstanceMasks, maps: tuple[LabelMap, ...]) -> InstanceMa
     Masks that differ from those in `instance` are marked as refined.
     """
     old = {name: row for row, name in enumerate(instance.views)}
-    views, shapes, masks, origins = [], [], [], []
+    views, masks, origins = [], [], []
     for label_map in maps:
         mask = label_map.ids == instance.instance_id
         if not mask.any():
@@ -134,8 +126,6 @@ def exclusive(instance: InstanceMasks, maps: tuple[LabelMap, ...]) -> InstanceMa
         row = old.get(label_map.name)
         same = row is not None and np.array_equal(mask, instance.mask(row))
         views.append(label_map.name)
-        shapes.append((mask.shape[1], mask.shape[0]))
-        masks.append(np.packbits(mask))
+        masks.append(Masks.of([mask]))
         origins.append(instance.origin[row] if same else REFINED)
-    sizes, packed = joined(shapes, masks)
-    return replace(instance, views=tuple(views), sizes=sizes, packed=packed, origin=np.array(origins, np.uint8))
+    return replace(instance, **vars(Masks.joined(masks)), views=tuple(views), origin=np.array(origins, np.uint8))

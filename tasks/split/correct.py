@@ -11,9 +11,9 @@ from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Clicks, Float64, Int32, MaskSet, PointCloud, PointLabels, Visibility
 from ss_flow.tasks.geometry.images import at_diagonal
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView, nearest_labels, paint_labels
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree
+from ss_flow.tasks.packed import Masks
 
 _REACH = 6.0
 """How far from a click the point that it means may fall, in pixels of an image with a diagonal of 800."""
@@ -126,7 +126,7 @@ def part_masks(
     rows = np.array(origin)[order]
     return replace(
         masks,
-        packed=pack_masks(found[order]),
+        **vars(Masks.of(found[order])),
         predicted_iou=masks.predicted_iou[rows],
         stability=masks.stability[rows],
         grid=masks.grid[rows],

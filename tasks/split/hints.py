@@ -13,22 +13,14 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import (
-    Bool,
-    Clicks,
-    MaskSet,
-    PointCloud,
-    PointLabels,
-    PromptedMasks,
-    Visibility,
-)
+from ss_flow.tasks.artifacts import Bool, Clicks, MaskSet, PointCloud, PointLabels, PromptedMasks, Visibility
 from ss_flow.tasks.masks.erosion import ErosionParams
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView, paint_labels
 from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import EmbeddedPhoto
+from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.reprompt import Prompt, RepromptParams, prompt, spread_prompts
 from ss_flow.tasks.split.votes.votes import Votes
@@ -56,7 +48,7 @@ def clicked(
     if not apart:
         return found
     masks = found.dense()
-    return replace(found, packed=pack_masks(masks & (masks.sum(axis=0) < 2)))
+    return replace(found, **vars(Masks.of(masks & (masks.sum(axis=0) < 2))))
 
 
 @task()

@@ -34,6 +34,7 @@ from ss_flow.tasks.masks.painting import (
 )
 from ss_flow.tasks.masks.pool import smoothed
 from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
+from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 
 _DENSE = 2.5
@@ -83,24 +84,21 @@ def reproject(
     by_name = {extra.name: extra for extra in prompted}
     num_labels = int(labels.label.max(initial=0))
     held, against = np.zeros(num_labels + 1), np.zeros(num_labels + 1)
-    views: list[dict[int, tuple[np.ndarray, int]]] = []
+    views: list[dict[int, tuple[Masks, int]]] = []
     for k, (view, pool) in enumerate(zip(visibility, masks, strict=True)):
         progress(k, len(masks), view.name)
         painted = paint_for_selection(view, labels.label, params.selection)
         shown, origin = _masks_of_view(painted, view, pool, by_name.get(view.name), params)
         ids = stack_exclusive(shown, view.height, view.width)
-        views.append({int(i): (np.packbits(ids == i), origin.get(int(i), FOUND)) for i in np.unique(ids)})
+        views.append({int(i): (Masks.of([ids == i]), origin.get(int(i), FOUND)) for i in np.unique(ids)})
         for total, part in zip((held, against), contradicted(painted, ids, num_labels), strict=True):
             total += part
     agreed = 1 - against / np.maximum(held, 1)
     names = tuple(view.name for view in visibility)
-    sizes = np.array([(view.width, view.height) for view in visibility], np.int32)
     found = []
     for label in np.union1d([0], labels.label).tolist():
         rows = labels.label == label
-        shown_in = [k for k, view in enumerate(views) if label in view]
-        # Taken out of `views`, so that no more than one label's masks are held twice.
-        taken = [views[k].pop(label) for k in shown_in]
+        shown_in = {name: view[label] for name, view in zip(names, views, strict=True) if label in view}
         share = labels.confidence[rows]
         found.append(
             InstanceMasks(
@@ -110,10 +108,9 @@ def reproject(
                 point_confidence=share,
                 point_part=parts.part[rows],
                 confidence=float(share.mean(dtype=np.float64)) * float(agreed[label]) if share.size else 0.0,
-                views=tuple(names[k] for k in shown_in),
-                sizes=sizes[shown_in],
-                packed=np.concatenate([np.zeros(0, np.uint8), *(mask for mask, _ in taken)]),
-                origin=np.array([kind for _, kind in taken], np.uint8),
+                views=tuple(shown_in),
+                **vars(Masks.joined([mask for mask, _ in shown_in.values()])),
+                origin=np.array([kind for _, kind in shown_in.values()], np.uint8),
                 weak=label > 0 and len(shown_in) < params.min_views,
             )
         )

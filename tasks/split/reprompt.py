@@ -10,13 +10,13 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Float64, Int32, MaskSet, PointLabels, PromptedMasks, Visibility
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView, agreement, labels_in_front
 from ss_flow.tasks.masks.pool import without_speckles
 from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Sam
+from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 
 
@@ -104,6 +104,6 @@ def prompt(photo: EmbeddedPhoto, prompts: dict[int, Prompt], model: Model, speck
         height=frame.height,
         width=frame.width,
         label=np.array(sorted(prompts), np.int32),
-        packed=pack_masks(masks),
+        **vars(Masks.of(masks)),
         predicted_iou=predicted,
     )

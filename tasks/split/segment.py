@@ -15,11 +15,11 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, MaskSet
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.masks.overlap import drop_duplicates, mask_iou, suppress
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree, merge_union, whole_pictures, without_speckles
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, PromptedImage, Sam
+from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
 
 
@@ -147,15 +147,15 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
     rows = rows[canonical_order(masks[rows])]
     masks, found = masks[rows], found[rows]
     return MaskSet(
-        frame.name,
-        frame.height,
-        frame.width,
-        pack_masks(masks),
-        found.predicted_iou,
-        found.stability,
-        found.grid,
-        mask_tree(masks, params.contained),
-        model.name,
+        **vars(Masks.of(masks)),
+        name=frame.name,
+        height=frame.height,
+        width=frame.width,
+        predicted_iou=found.predicted_iou,
+        stability=found.stability,
+        grid=found.grid,
+        parent=mask_tree(masks, params.contained),
+        source=model.name,
     )
 
 

@@ -13,8 +13,8 @@ from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size, pixels_under
 from ss_flow.tasks.masks.overlap import drop_duplicates
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree
+from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, NonNegative, Positive
 from ss_flow.tasks.split.regions.graph_segmentation import (
     RegionGraph,
@@ -159,13 +159,13 @@ def _finish(frame: Frame, valid: Bool, found: _Masks, params: SegmentRgbdParams)
     rows = rows[canonical_order(full[rows])]
     full, found = full[rows], found[rows]
     return MaskSet(
-        frame.name,
-        frame.height,
-        frame.width,
-        pack_masks(full),
-        found.quality,
-        found.stability,
-        found.grid,
-        mask_tree(full, params.contained),
-        "rgbd-graph",
+        **vars(Masks.of(full)),
+        name=frame.name,
+        height=frame.height,
+        width=frame.width,
+        predicted_iou=found.quality,
+        stability=found.stability,
+        grid=found.grid,
+        parent=mask_tree(full, params.contained),
+        source="rgbd-graph",
     )

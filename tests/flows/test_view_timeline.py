@@ -12,7 +12,7 @@ from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run
 from ss_flow.flows.view.timeline import Round, Timeline, rounds, stages
-from ss_flow.tasks.artifacts import ViewLists
+from ss_flow.tasks.packed import ViewLists
 from ss_flow.tasks.splat.collisions import MergePlan
 
 viser = pytest.importorskip("viser", reason="needs the extra `view`")

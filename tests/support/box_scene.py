@@ -9,7 +9,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, MaskSet, Visibility
 from ss_flow.tasks.geometry.cameras import camera_of, looking
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.packed import Masks
 
 WIDTH, HEIGHT, VIEWS = 96, 72, 6
 BOXES = np.array(
@@ -86,7 +86,7 @@ def mask_set(masks: np.ndarray, name: str = "0") -> MaskSet:
         name=name,
         height=height,
         width=width,
-        packed=pack_masks(masks.astype(bool)) if count else np.zeros((0, (height * width + 7) // 8), np.uint8),
+        **vars(Masks.of(masks.astype(bool))),
         predicted_iou=np.ones(count, np.float32),
         stability=np.ones(count, np.float32),
         grid=np.zeros(count, np.int32),
@@ -106,7 +106,7 @@ def true_masks() -> tuple[MaskSet, ...]:
 
 def permuted(masks: MaskSet, order: np.ndarray) -> MaskSet:
     """The same masks in another order."""
-    return replace(masks, packed=masks.packed[order])
+    return replace(masks, **vars(masks.rows(order)))
 
 
 def row_of_points(points: list[int], width: int = 8) -> tuple[Visibility, Bool]:

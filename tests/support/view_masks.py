@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Int32, UInt8
-from ss_flow.tasks.masks.packing import joined
+from ss_flow.tasks.packed import Masks
 
 
-def sizes_and_bits(masks: Sequence[np.ndarray] | np.ndarray) -> tuple[Int32, UInt8]:
-    """Masks [H, W], one a view, as `sizes` and `packed`."""
-    return joined([(mask.shape[1], mask.shape[0]) for mask in masks], [np.packbits(mask) for mask in masks])
-
-
-def as_fields(masks: Sequence[np.ndarray] | np.ndarray) -> dict[str, np.ndarray]:
-    """The same by name, for `dataclasses.replace`."""
-    return dict(zip(("sizes", "packed"), sizes_and_bits(masks), strict=True))
+def as_fields(masks: Iterable[np.ndarray]) -> dict[str, np.ndarray]:
+    """Masks [H, W], one a view, by name, for a constructor or `dataclasses.replace`."""
+    return vars(Masks.of(masks))

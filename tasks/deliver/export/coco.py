@@ -13,7 +13,7 @@ from ss_flow.running import progress
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Bool
 from ss_flow.tasks.deliver.export.content import FileContent
-from ss_flow.tasks.masks.packing import bounds
+from ss_flow.tasks.packed import bounds
 
 
 @task(name="deliver.export.coco")

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from view_masks import sizes_and_bits
+from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import (
     Cameras,
@@ -21,8 +21,9 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.deliver.draw import draw
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.masks.packing import pack_masks
+from ss_flow.tasks.masks.pool import masks_by_id
 from ss_flow.tasks.models.colour_words import TERMS
+from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.semantics.query import query
 
 H, W = 48, 64
@@ -48,9 +49,9 @@ def labels_of(label: np.ndarray) -> PointLabels:
 def instance_of(masks: np.ndarray, views: list[int]) -> InstanceMasks:
     n = len(views)
     return InstanceMasks(
-        2, POINTS, CLOUD.colors, np.ones(500, np.float32), np.zeros(500, np.int32), 0.9,
-        tuple(("left", "b", "c", "right")[k] for k in views), *sizes_and_bits(masks.reshape(n, H, W)),
-        np.zeros(n, np.uint8), False,
+        **as_fields(masks.reshape(n, H, W)), views=tuple(("left", "b", "c", "right")[k] for k in views), instance_id=2,
+        points=POINTS, colors=CLOUD.colors, point_confidence=np.ones(500, np.float32),
+        point_part=np.zeros(500, np.int32), confidence=0.9, origin=np.zeros(n, np.uint8), weak=False,
     )  # fmt: skip
 
 
@@ -67,8 +68,9 @@ def test_masks_are_painted_and_small_ones_lie_on_top():
     small[10:20, 5:15] = True
     both = np.stack([small, HALF])
     masks = MaskSet(
-        "left", H, W, pack_masks(both), *(np.ones(2, np.float32),) * 2, *(np.zeros(2, np.int32),) * 2, "own"
-    )
+        **vars(Masks.of(both)), name="left", height=H, width=W, predicted_iou=np.ones(2, np.float32),
+        stability=np.ones(2, np.float32), grid=np.zeros(2, np.int32), parent=np.zeros(2, np.int32), source="own",
+    )  # fmt: skip
     picture = draw(masks)
     assert picture.shape == (H, W, 3)
     assert tuple(picture[15, 10]) == instance_color(1) and tuple(picture[40, 10]) == instance_color(2)
@@ -174,7 +176,7 @@ def test_a_long_list_is_cut_and_an_empty_one_says_so():
         CLOUD.__class__(POINTS[:0], CLOUD.colors[:0], 1.0, 0.0),
         NO_GAUSSIANS,
         Cameras((), np.zeros((0, 2), np.int32), np.zeros((0, 4)), np.zeros((0, 4, 4)), False),
-        MaskSet("e", H, W, np.zeros((0, H * W // 8), np.uint8), NONE_F, NONE_F, NONE_I, NONE_I, "own"),
+        masks_by_id(np.zeros((H, W), np.int32), "e"),
         Visibility("e", NONE_I, NONE_I, NONE_F, H, W),
         Metrics({}),
         Hierarchy(NONE_I, NONE_I, NONE_F, np.zeros(0, bool)),

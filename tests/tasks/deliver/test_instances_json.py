@@ -1,6 +1,7 @@
 import json
 
 import numpy as np
+from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import Gaussians, Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.instances_json import instance_file, instances_document
@@ -10,13 +11,14 @@ from ss_flow.tasks.semantics.name import InstanceNames
 NOTHING = np.zeros(0, np.uint8)
 
 
-def instance(instance_id: int, points, views=(0, 2), weak: bool = False, shown: int = 0b11110000) -> InstanceMasks:
+def instance(instance_id: int, points, views=(0, 2), weak: bool = False, shown: int = 4) -> InstanceMasks:
     points = np.asarray(points, np.float32).reshape(-1, 3)
     n, v = len(points), len(views)
     return InstanceMasks(
-        instance_id, points, np.zeros((n, 3), np.uint8), np.ones(n, np.float32), np.arange(n, dtype=np.int32),
-        0.87654321, tuple("abc"[k] for k in views), np.full((v, 2), (4, 2), np.int32), np.full(v, shown, np.uint8),
-        np.zeros(v, np.uint8), weak,
+        **as_fields(np.arange(8).reshape(1, 2, 4).repeat(v, axis=0) < shown), views=tuple("abc"[k] for k in views),
+        instance_id=instance_id, points=points, colors=np.zeros((n, 3), np.uint8),
+        point_confidence=np.ones(n, np.float32), point_part=np.arange(n, dtype=np.int32), confidence=0.87654321,
+        origin=np.zeros(v, np.uint8), weak=weak,
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.suspects import suspects
@@ -28,8 +29,7 @@ def _instance(number: int, points: np.ndarray, views: int = 20, confidence: floa
         point_part=zeros,
         confidence=confidence,
         views=tuple(f"v{i}" for i in range(views)),
-        sizes=np.full((views, 2), (8, 1), np.int32),
-        packed=np.full(views, 255, np.uint8),
+        **as_fields(np.ones((views, 1, 8), bool)),
         origin=np.zeros(views, np.uint8),
         weak=False,
     )

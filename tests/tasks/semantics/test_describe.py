@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from view_masks import sizes_and_bits
+from view_masks import as_fields
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, InstanceMasks, PartMasks
@@ -36,8 +36,9 @@ def scene(*views: tuple[np.ndarray, tuple[int, int, int]]) -> tuple[tuple[Frame,
     names = tuple(frame.name for frame in frames)
     points = np.zeros((1, 3), np.float32)
     instance = InstanceMasks(
-        7, points, np.zeros((1, 3), np.uint8), np.ones(1, np.float32), np.zeros(1, np.int32), 1.0, names,
-        *sizes_and_bits(masks), np.zeros(len(views), np.uint8), False,
+        **as_fields(masks), views=names, instance_id=7, points=points, colors=np.zeros((1, 3), np.uint8),
+        point_confidence=np.ones(1, np.float32), point_part=np.zeros(1, np.int32), confidence=1.0,
+        origin=np.zeros(len(views), np.uint8), weak=False,
     )  # fmt: skip
     return tuple(frames), instance
 
@@ -52,7 +53,7 @@ def test_a_red_object_on_grey_is_red():
 
 def test_a_part_is_described_as_an_instance_with_its_masks_is():
     frames, instance = scene((square(40, 30, 40), RED))
-    part = PartMasks(7, 2, instance.views, instance.sizes, instance.packed)
+    part = PartMasks(instance.sizes, instance.boxes, instance.packed, instance.views, 7, 2)
     found, whole = describe_part(frames, part), describe(frames, instance)
     assert (found.instance_id, found.part_id, found.views) == (7, 2, whole.views)
     assert np.array_equal(found.embedding, whole.embedding)

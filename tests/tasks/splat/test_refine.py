@@ -103,16 +103,16 @@ def moved(instance: InstanceMasks, pixels: int, **fields) -> InstanceMasks:
 def test_a_mask_stays_unless_the_segmenters_agrees_better(small, box, monkeypatch):
     truth = small.instance(1)
     same = refined(small, box, truth, monkeypatch, lambda view, _: small.ids[view] == 1)
-    np.testing.assert_array_equal(same.packed, truth.packed)
+    assert same.same(truth)
     assert not same.origin.any()
 
     shifted = lambda view, _: np.roll(small.ids[view] == 1, 6, axis=1)  # noqa: E731
     worse = refined(small, box, truth, monkeypatch, shifted, margin=0.1)
-    np.testing.assert_array_equal(worse.packed, truth.packed)
+    assert worse.same(truth)
 
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
     better = refined(small, box, moved(truth, 6), monkeypatch, right, margin=0.1)
-    np.testing.assert_array_equal(better.packed, truth.packed)
+    assert better.same(truth)
     assert (better.origin == REFINED).all()
 
 
@@ -122,7 +122,7 @@ def test_a_mask_of_the_photo_gives_way_only_by_a_margin_and_one_drawn_from_point
     nearly = moved(small.instance(1), 1)
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
     kept = refined(small, box, nearly, monkeypatch, right, margin=0.1)
-    np.testing.assert_array_equal(kept.packed, nearly.packed)
+    assert kept.same(nearly)
     for instance, params in (
         (replace(nearly, origin=np.full(VIEWS, DRAWN, np.uint8)), {}),
         (nearly, {"margin": 0.0}),
@@ -148,9 +148,9 @@ def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small,
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
     for limit, expected in ((1.5, part), (0.0, truth)):
         found = refined(small, box, part, monkeypatch, right, margin=0.1, max_change=limit)
-        np.testing.assert_array_equal(found.packed, expected.packed)
+        assert found.same(expected)
     drawn = replace(part, origin=np.full(VIEWS, DRAWN, np.uint8))
-    np.testing.assert_array_equal(refined(small, box, drawn, monkeypatch, right).packed, truth.packed)
+    assert refined(small, box, drawn, monkeypatch, right).same(truth)
 
 
 def test_the_segmenter_is_not_asked_where_no_answer_could_be_taken(small, box, monkeypatch):
@@ -182,7 +182,7 @@ def test_an_answer_that_the_segmenter_itself_doubts_is_not_taken(small, box, mon
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
     few = moved(small.instance(1, views=(0, 1)), 6)
     doubted = refined(small, box, few, monkeypatch, right)
-    np.testing.assert_array_equal(doubted.packed, few.packed)
+    assert doubted.same(few)
     assert len(refined(small, box, few, monkeypatch, right, pred_iou=0.7).views) == VIEWS
     monkeypatch.setattr(Scripted, "score", -0.1)  # a network may predict that, too
     assert len(refined(small, box, few, monkeypatch, right, pred_iou=0.0).views) == VIEWS
@@ -255,7 +255,7 @@ def test_faint_and_huge_gaussians_do_not_draw(small, box):
     part = small.instance(1, views=(0, 3))
     cluttered = Gaussians(**fields)
     clean = refined(small, box, part)
-    np.testing.assert_array_equal(refined(small, cluttered, part).packed, clean.packed)
+    assert refined(small, cluttered, part).same(clean)
     for allowed in ({"min_opacity": 0.0}, {"max_scale": 0.0}):
         drawn = refined(small, cluttered, part, min_support=0.0, cut_occluded=False, **allowed)
         assert drawn.areas()[drawn.origin == REFINED].sum() > 1.02 * clean.areas()[clean.origin == REFINED].sum()

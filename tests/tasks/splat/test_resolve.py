@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball_and_box import VIEWS, SmallScene
-from view_masks import as_fields, sizes_and_bits
+from view_masks import as_fields
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import REFINED, Cameras, Frame, InstanceMasks, LabelMap
@@ -20,9 +20,10 @@ CAMERAS = Cameras(
 def masks_of(instance_id: int, masks: dict[int, list[str]]) -> InstanceMasks:
     dense = np.array([[[c == "x" for c in row] for row in rows] for rows in masks.values()], bool)
     return InstanceMasks(
-        instance_id, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32),
-        np.zeros(0, np.int32), 1.0, tuple("ab"[view] for view in masks),
-        *sizes_and_bits(dense), np.zeros(len(masks), np.uint8), False,
+        **as_fields(dense), views=tuple("ab"[view] for view in masks), instance_id=instance_id,
+        points=np.zeros((0, 3), np.float32), colors=np.zeros((0, 3), np.uint8),
+        point_confidence=np.zeros(0, np.float32), point_part=np.zeros(0, np.int32), confidence=1.0,
+        origin=np.zeros(len(masks), np.uint8), weak=False,
     )  # fmt: skip
 
 

@@ -15,10 +15,10 @@ from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.erosion import ErosionParams
-from ss_flow.tasks.masks.packing import pack_masks
 from ss_flow.tasks.masks.painting import PaintedView
 from ss_flow.tasks.models.catalogue import Model, find
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
+from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.embed import embed
@@ -55,7 +55,14 @@ def clicks_on(ids: np.ndarray, labels: dict[int, int], name: str) -> Clicks:
 def prompted(masks: dict[int, np.ndarray], height: int, width: int, name: str = "0") -> PromptedMasks:
     dense_masks = np.array(list(masks.values()), bool).reshape(len(masks), height, width)
     scores = np.full(len(masks), 0.75, np.float32)
-    return PromptedMasks(name, height, width, np.array(list(masks), np.int32), pack_masks(dense_masks), scores)
+    return PromptedMasks(
+        **vars(Masks.of(dense_masks)),
+        name=name,
+        height=height,
+        width=width,
+        label=np.array(list(masks), np.int32),
+        predicted_iou=scores,
+    )
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -156,7 +163,7 @@ def test_a_view_with_clicks_on_all_that_it_sees_keeps_the_masks_of_these_clicks(
     ids, seen = every_pixel(0)
     own = prompted({i: ids == i for i in (1, 2, 3)}, HEIGHT, WIDTH)
     found = spread_in(seen, own, ids.ravel())
-    assert sorted(map(bytes, found.packed)) == sorted(map(bytes, own.packed))
+    assert sorted(map(bytes, found.dense())) == sorted(map(bytes, own.dense()))
     assert (np.diff(found.dense().sum(axis=(1, 2))) <= 0).all()
     assert found.predicted_iou.tolist() == [0.75] * 3 and found.source == "absent"
 
