@@ -43,6 +43,8 @@ from ss_flow.tasks.semantics.query import QueryResult
 _MOST_ON_A_SHEET = 24
 _NARROW = 320
 """Pixels below which the legend of a depth map takes two lines."""
+_FIRST_TO_LAST = np.array([[0.13, 0.38, 0.82], [0.82, 0.19, 0.19]])
+"""Blue and red: a dark page inverts the drawing and keeps its hues, so light and dark would not tell."""
 _ORIGINS = {FOUND: "", PROMPTED: " (re-prompted)", REFINED: " (refined)", DRAWN: " (from points)"}
 _TERM_COLORS = dict(grey="#8a8a8a", white="#e8e8e4", green="#2e8b45", yellow="#eac520", brown="#7b4a21", pink="#f08cb4")
 
@@ -252,9 +254,9 @@ def _(value: Cameras, context: Context) -> UInt8:
     east /= np.linalg.norm(east)
     plane = np.stack([east, np.cross(up, east)], axis=1)
     seen, looks = centers @ plane, poses[:, 2, :3] @ plane
-    figure = blank(900, 800)
-    axes = figure.add_axes((0.1, 0.08, 0.85, 0.84))
-    axes.set_facecolor("white")
+    figure = blank(560, 500)  # about as wide as a report shows it, so that its words keep their size
+    axes = figure.add_axes((0.11, 0.11, 0.85, 0.81))
+    axes.set_facecolor("none")
     background = context.points.points if context.points is not None else value.sparse_points
     if len(background):
         thinned = background[:: max(1, len(background) // 20_000)] @ plane
@@ -264,11 +266,15 @@ def _(value: Cameras, context: Context) -> UInt8:
         low, high = seen.min(axis=0), seen.max(axis=0)
     order = np.linspace(0, 1, len(value))
     axes.plot(*seen.T, color=FAINT, linewidth=0.6, zorder=2)
-    axes.quiver(*seen.T, *looks.T, order, cmap="viridis", width=0.004, scale=22, zorder=3)
+    colors = np.stack([1 - order, order], axis=1) @ _FIRST_TO_LAST
+    axes.quiver(*seen.T, *looks.T, color=colors, width=0.004, scale=22, zorder=3)
     low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
     pad = 0.08 * max(float((high - low).max()), 1e-6)
-    axes.set(xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad), aspect="equal")
-    axes.set_title(f"{len(value)} cameras from above, first dark to last light", fontsize=11, color=INK, loc="left")
+    box = np.array(axes.bbox.size)  # filled whatever the way's shape: beside a narrow one the title would be cut off
+    reach = box * float(np.max(((high - low) / 2 + pad) / box))
+    ends = (low + high) / 2 + np.outer((-1, 1), reach)
+    axes.set(xlim=ends[:, 0], ylim=ends[:, 1], aspect="equal")
+    axes.set_title(f"{len(value)} cameras from above, first blue to last red", fontsize=11, color=INK, loc="left")
     axes.set_xlabel("metres" if value.metric else "world units", fontsize=9, color=INK)
     axes.tick_params(labelsize=8, colors=INK)
     axes.spines[["top", "right"]].set_visible(False)

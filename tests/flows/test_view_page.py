@@ -228,6 +228,22 @@ def test_a_selected_object_keeps_its_light_and_shade_in_orange(page):
 
 
 @needs_browser
+def test_the_page_is_dark_for_who_wants_that_and_its_help_stays_off_the_edges_of_a_telephone(file):
+    ground = "Number(getComputedStyle(document.querySelector('aside')).backgroundColor.match(/[0-9]+/)[0])"
+    with browser_page(600, 400) as page:
+        page.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
+        page.open(file.as_uri())
+        page.wait_for("document.body?.dataset.drawn")
+        for scheme, is_dark in (("light", False), ("dark", True)):
+            page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+            assert (page.evaluate(ground) < 64) == is_dark
+        left, right = page.evaluate(
+            "(r => [r.left, r.right])(document.querySelector('main p').getBoundingClientRect())"
+        )
+        assert left >= 12 and right <= 390 - 12
+
+
+@needs_browser
 def test_a_lost_graphics_card_is_told_of(file):
     with browser_page(600, 400) as page:
         page.open(file.as_uri())

@@ -164,6 +164,15 @@ def test_a_list_becomes_a_sheet_over_the_photos_of_its_views():
     assert bare.shape == over.shape and over[:200].std() > bare[:200].std()
 
 
+def test_cameras_of_a_straight_way_go_from_blue_to_red_in_a_drawing_no_wider_than_a_report_shows_it():
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = -1  # straight to the right
+    picture = draw(Cameras(("a", "b"), np.full((2, 2), 9, np.int32), np.ones((2, 4)), poses, True)).astype(int)
+    assert picture.shape[1] <= 560
+    blue, red = (np.argwhere(picture[..., a] - picture[..., b] > 60).mean(axis=0) for a, b in ((2, 0), (0, 2)))
+    assert np.abs(blue - red).max() > 100
+
+
 def test_a_long_list_is_cut_and_an_empty_one_says_so():
     frames = (FRAME,) * 30
     assert draw(frames).shape == draw(frames[:24]).shape

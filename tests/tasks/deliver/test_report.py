@@ -295,6 +295,12 @@ def test_pictures_are_kept_in_the_smaller_form():
     assert np.abs(decompressed(compressed(smooth)).astype(int) - smooth).mean() < 12
 
 
+def test_the_drawing_of_the_cameras_is_inverted_on_a_dark_page_and_photos_are_not():
+    html = report_html({}, pictures=[Picture("a/photo", FILE), Picture("Cameras", FILE)])
+    inverted = re.findall(r'img\[alt="(.*?)"\] { filter: invert', html.partition("(prefers-color-scheme: dark)")[2])
+    assert inverted == ["Cameras"] and len(re.findall(r'<img [^>]*alt="Cameras"', html)) == 1
+
+
 @pytest.mark.parametrize("kind", ["png", "jpeg"])
 def test_the_page_holds_the_files_as_they_are(kind):
     content = encode_png(PHOTO) if kind == "png" else FILE
