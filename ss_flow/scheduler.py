@@ -189,7 +189,7 @@ class Scheduler:
     def _why(self, node: Call, key: str, parts: Components) -> str:
         known = self._flows[node.flow].previous(node.label)
         if not known:
-            return "never computed for this scene"
+            return f"{'never computed' if self._dry else 'computed for the first time'} for this scene"
         if key in known:
             return "its result is no longer in the store"
         records = [self._store.action(one, whole=False) for one in known[:COMPARED]]

@@ -35,8 +35,8 @@ class StoreOptions:
     """Where results are kept."""
 
     cache: OptionalText = None
-    """Folder of the store, or s3://BUCKET/PREFIX; by default SS_FLOW_CACHE, or else ss-flow in the user's cache
-    folder."""
+    """Folder of the store, or s3://BUCKET/PREFIX; by default SS_FLOW_CACHE, or else ss-flow/store in the user's
+    cache folder."""
 
     @property
     def location(self) -> str | Path:

@@ -28,6 +28,8 @@ from ss_flow.tasks.geometry.images import suffix_of
 MANIFEST = "export.json"
 _ADDED = {"labelled-ply": "-labelled", "mesh-glb": "-mesh"}
 """What the default names of formats have before a suffix that is another's too."""
+_MOST_IN_A_NAME = 3
+"""Of the chosen instances, in the default name of their file."""
 _ALSO_NEEDED = {"coco": ("ingest", "masks"), "colmap": ("ingest", "masks"), "nerfstudio": ("ingest",)}
 """Results of a run that only some formats are made of: an edited run has no masks."""
 
@@ -48,7 +50,7 @@ class Export:
     """For meshes: "closed" closes by a guess what no view shows."""
     out: OptionalPath = None
     """The file or folder to write; by default in ss-flow-export: NAME of the result with the format's suffix, as in
-    NAME.ply; NAME-labelled.ply and NAME-mesh.glb; and NAME-FORMAT for a folder."""
+    NAME.ply; NAME-labelled.ply and NAME-mesh.glb; NAME-0004.ply with --instance 4; and NAME-FORMAT for a folder."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""
     json: bool = False
@@ -64,12 +66,13 @@ class Export:
         by_instance = several or self.format == "coco" or self.format in formats.SURFACES
         ids = run.ids(self.instance) if self.instance else run.all_ids() if by_instance else None
         folder = several or workspace
-        ending = f"-{self.format}" if folder else _ADDED.get(self.format, "") + formats.suffix_of(self.format)
-        out = self.out or Path("ss-flow-export") / f"{run.name}{ending}"
+        out = self.out or Path("ss-flow-export") / f"{run.name}{self._ending(ids or (), folder=folder)}"
         _check_place(out, folder=folder)
         self._check_suffix(out, folder=folder)
         if workspace:
             return self._write_workspace(out, run)
+        if self.format != "coco" and not len(run.results.one("scene")):
+            raise InputError(f"{run.folder} has no Gaussians, so there is nothing to export as {self.format}.")
         pixels = _masks_and_photos(run) if self.format == "coco" else ((), ())
 
         def build() -> dict[str, Any]:
@@ -100,6 +103,15 @@ class Export:
             raise InputError("--each is for formats of Gaussians and meshes; coco tells all instances in one file.")
         if self.jobs < 0:
             raise InputError(f"--jobs {self.jobs} is out of range; it must be 0 (one a core) or more.")
+
+    def _ending(self, ids: tuple[int, ...], *, folder: bool) -> str:
+        """What the default name has after that of the result: chosen instances must not replace the whole."""
+        if folder:
+            return f"-{self.format}"
+        chosen = ""
+        if self.instance and self.format != "coco":
+            chosen = "".join(f"-{i:04d}" for i in ids) if len(ids) <= _MOST_IN_A_NAME else "-selected"
+        return chosen + _ADDED.get(self.format, "") + formats.suffix_of(self.format)
 
     def _check_suffix(self, out: Path, *, folder: bool) -> None:
         """Raises InputError for a file that would be taken for one of another format by its name."""
@@ -160,10 +172,9 @@ class Export:
         words = console(json=False)
         for failure in failures:
             words.print(f"[red]failed[/] {escape(failure['label'])}: {escape(failure['error'])}")
-        size = sum(file["bytes"] for file in files) / 1e6
-        words.print(
-            escape(f"{status}: {out} ({self.format}, {len(files)} file{'s' * (len(files) != 1)}, {size:.1f} MB)")
-        )
+        size = sum(file["bytes"] for file in files)
+        told = f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.1f} kB"
+        words.print(escape(f"{status}: {out} ({self.format}, {len(files)} file{'s' * (len(files) != 1)}, {told})"))
         return STATUS_EXIT[status]
 
 

@@ -30,6 +30,7 @@ from ss_flow.flows.query import NEEDED, described_parts
 from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
 from ss_flow.tasks.deliver.output import check_place, replacing
+from ss_flow.tasks.models.colour_words import ColourWords, words_ignored
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
 
@@ -135,16 +136,20 @@ class Query:
         if not found.accepted:
             out.print(f"nothing in the scene matches {found.text!r} ({found.encoder}); the nearest are:")
         part = ["part"] if self.parts else []
-        table = Table("", "id", *part, "name", "score", "delta", box=None)
+        table = Table("", "id", *part, "name", "score", "delta", "", box=None)
         rows = document["instances"]
         shown = rows[: max(ROWS, 1 + max((i for i, row in enumerate(rows) if row["matched"]), default=0))]
         for row in shown:
             mark = "[green]match[/]" if row["matched"] else ""
             place = [str(row[column]) for column in ("id", *part)]
-            table.add_row(mark, *place, row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}")
+            where = "in masks only" if row["num_gaussians"] == 0 else ""  # export and render cannot show it
+            table.add_row(mark, *place, row["name"], f"{row['score']:.3f}", f"{row['delta']:.3f}", where)
         print_table(table, out)
         if len(shown) < len(rows):
             out.print(f"{len(rows) - len(shown)} more are farther off; --json names all.")
+        if found.encoder == ColourWords.name and (ignored := words_ignored(found.text)):
+            without = ", ".join(f'"{word}"' for word in ignored)
+            out.print(f"Only colour words were understood, not {without}; `ss-flow models list` shows what reads more.")
 
 
 def query_params(document: dict[str, Any]) -> QueryParams:
@@ -153,8 +158,12 @@ def query_params(document: dict[str, Any]) -> QueryParams:
 
 
 def _document(found: QueryResult, instances: dict[str, Any], *, parts: bool) -> dict[str, Any]:
-    """What --json prints; with `parts`, each row says which part of its instance it is."""
+    """What --json prints; with `parts`, each row says which part of its instance it is.
+
+    num_gaussians is that of the whole instance; the background's is not known (null).
+    """
     names = {BACKGROUND: "background"} | {entry["id"]: entry["name"] for entry in instances["instances"]}
+    sizes = {entry["id"]: entry["num_gaussians"] for entry in instances["instances"]}
     rows = [
         {
             "id": int(found.instance_id[i]),
@@ -163,6 +172,7 @@ def _document(found: QueryResult, instances: dict[str, Any], *, parts: bool) -> 
             "score": round(float(found.score[i]), 4),
             "delta": round(float(found.delta[i]), 4),
             "matched": bool(found.matched[i]),
+            "num_gaussians": sizes.get(int(found.instance_id[i])),
         }
         for i in range(len(found.instance_id))
     ]
@@ -224,7 +234,5 @@ def _on_photos(run: FinishedRun, parts: Sequence[PartMasks], names: Sequence[str
 
 def encoder_name(store: Store, descriptors: Sequence[str]) -> str:
     """The network that described the instances, which must also read the text."""
-    from ss_flow.tasks.models.colour_words import ColourWords
-
     name = store.get(descriptors[0]).encoder if descriptors else ColourWords.name
     return "none" if name == ColourWords.name else str(name)

@@ -68,6 +68,11 @@ class ModelsFetch:
         from ss_flow.tasks.models.fetch import fetch
 
         shown = console(json=False)
+        if here := catalogue.searched_before_cache(self.name):
+            shown.print(
+                escape(f"{self.name} is in {here}, which is searched first; nothing was downloaded"), soft_wrap=True
+            )
+            return 0
         columns = ("{task.description}", BarColumn(), DownloadColumn(), TimeRemainingColumn())
         with Progress(*columns, console=shown, transient=True, disable=not shown.is_terminal) as display:
             row = display.add_task(self.name, total=None)

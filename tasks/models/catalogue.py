@@ -218,6 +218,19 @@ def _paths(entry: ModelEntry, folders: Sequence[Path]) -> list[Path] | None:
     return None
 
 
+def searched_before_cache(name: str) -> Path | None:
+    """The folder of a model's downloads where it is found before `cache_folder()`; None where it is not.
+
+    Raises InputError when the catalogue has no such name.
+    """
+    entry = entry_of(name)
+    own = cache_folder() / name
+    for path, file in zip(_paths(entry, default_folders()) or [], entry.files, strict=False):
+        if not file.package and path.parent != own:
+            return path.parent
+    return None
+
+
 def in_package(file: FileEntry) -> Path | None:
     """A file that an installed package holds, without importing the package."""
     found = importlib.util.find_spec(file.package)

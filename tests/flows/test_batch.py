@@ -66,7 +66,10 @@ def test_a_batch_gives_the_bytes_of_single_runs_and_a_bad_scene_fails_alone(tiny
     assert "broken/depth/0001.png" in rows[1]["error"] and "does not exist" in nowhere["error"]
     # Each scene has a run of its own, ...
     assert ss_flow("status", tiny.scene, "--cache", store).out.startswith(f"{tiny.scene}: done, started")
-    assert ss_flow("why", "dense", den, "--cache", store).out == "split.dense: never computed for this scene\n"
+    assert (
+        ss_flow("why", "dense", den, "--cache", store).out
+        == "split.dense: computed for the first time for this scene\n"
+    )
     # ... and once the damage is mended, only that one is run.
     shutil.copy(den / "depth/0001.png", broken / "depth/0001.png")
     runs = len(list((store / "roots/runs").iterdir()))

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from tiny_runs import bytes_of, ss_flow
 
+from ss_flow.cache.store import Store
 from ss_flow.tasks.capture.scene import open_scene
+from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
 
 
@@ -122,8 +124,29 @@ def test_without_a_place_no_format_replaces_the_export_of_another(tiny, tmp_path
         answer = export(tiny, "--format", format, *more, "--json")
         assert answer.code == 0, answer.err
         places.append(answer.document()["out"].removeprefix(f"ss-flow-export/{tiny.out.name}"))
-    assert places[:4] == [".ply", "-labelled.ply", ".glb", "-mesh.glb"]
+    assert places[:4] == [".ply", "-labelled.ply", ".glb", f"-{ids_of(tiny)[0]:04d}-mesh.glb"]
     assert places[4:] == ["-mesh-obj", "-mesh-ply", "-colmap", "-nerfstudio", "-ply"]
+
+
+def test_without_a_place_chosen_instances_have_their_ids_in_the_name_and_leave_the_whole_scene(
+    tiny, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert export(tiny, "--format", "splat").code == 0
+    whole = bytes_of(tmp_path)
+    ids = [0, *ids_of(tiny)]
+    for count in (1, 3, 4):
+        asked = [word for i in reversed(ids[:count]) for word in ("--instance", str(i))]
+        answer = export(tiny, "--format", "splat", *asked, "--json")
+        named = "selected" if count == 4 else "-".join(f"{i:04d}" for i in ids[:count])
+        assert answer.document()["out"] == f"ss-flow-export/{tiny.out.name}-{named}.splat"
+    assert len(bytes_of(tmp_path)) == 4 and bytes_of(tmp_path).items() > whole.items()
+
+
+def test_a_small_file_is_told_in_thousands_of_bytes(tiny, tmp_path):
+    told = export(tiny, "--format", "ply", "--instance", str(ids_of(tiny)[0]), "--out", tmp_path / "a.ply").out
+    size = (tmp_path / "a.ply").stat().st_size
+    assert size < 1e6 and f"1 file, {size / 1e3:.1f} kB)" in told
 
 
 def test_a_glb_is_not_written_under_the_name_of_gltfs_other_form(tiny, tmp_path):
@@ -144,6 +167,30 @@ def test_the_background_is_an_instance_when_it_is_asked_for(tiny, tmp_path):
     assert answer.code == 0, answer.err
     rows = read_columns(tiny.out / "scene_labeled.ply")
     assert len(read_columns(tmp_path / "a.ply")) == np.count_nonzero(rows["instance_id"] == 0)
+
+
+def with_scene(run, change) -> None:
+    """Have the run's scene be another."""
+    record = run.out / "run.json"
+    document, store = json.loads(record.read_text()), Store(run.store)
+    document["results"]["scene"] = store.put(change(store.get(document["results"]["scene"])))
+    record.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("format", ["spz", "mesh-ply"])
+def test_a_background_without_gaussians_is_not_written(warm, tmp_path, format):
+    with_scene(warm, lambda scene: select(scene, scene.instance_id != 0))
+    answer = export(warm, "--format", format, "--instance", "0", "--out", tmp_path / "a")
+    assert answer.code == 2 and f"the background of {warm.out} has no Gaussians" in answer.err
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("more", [["spz"], ["gltf", "--each"], ["mesh-glb"]])
+def test_a_scene_without_gaussians_is_not_written(warm, tmp_path, more):
+    with_scene(warm, lambda scene: select(scene, np.zeros(len(scene), bool)))
+    answer = export(warm, "--format", *more, "--out", tmp_path / "a")
+    assert answer.code == 2 and f"{warm.out} has no Gaussians" in answer.err
+    assert not (tmp_path / "a").exists()
 
 
 @pytest.mark.parametrize(

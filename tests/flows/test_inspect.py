@@ -47,11 +47,14 @@ def test_status_of_a_run_that_was_cut_short_says_how_much_there_is_to_do(warm):
 
 
 def test_why_says_that_nothing_was_known_on_the_first_run(tiny):
-    assert ss_flow("why", "propagate", "--cache", tiny.store).out == "split.propagate: never computed for this scene\n"
+    assert (
+        ss_flow("why", "propagate", "--cache", tiny.store).out
+        == "split.propagate: computed for the first time for this scene\n"
+    )
     told = ss_flow("why", "split.visibility", "--cache", tiny.store).out
-    assert told == "split.visibility: never computed for this scene (5 of them)\n"
+    assert told == "split.visibility: computed for the first time for this scene (5 of them)\n"
     one = ss_flow("why", "visibility[0002]", "--cache", tiny.store).out
-    assert one == "split.visibility[0002]: never computed for this scene\n"
+    assert one == "split.visibility[0002]: computed for the first time for this scene\n"
 
 
 def test_why_looks_further_back_where_the_latest_run_is_of_something_else(warm):
@@ -62,8 +65,8 @@ def test_why_looks_further_back_where_the_latest_run_is_of_something_else(warm):
     header = run.header | {"scene": "/edited", "started": run.header["started"] + 60}
     (later / "run.json").write_text(json.dumps(header))
     event = {"event": "finished", "label": "edit.begin", "step": "edit.begin", "key": "k", "outputs": [], "inputs": {}}
-    (later / "events.jsonl").write_text(json.dumps(event | {"why": "never computed for this scene", "seconds": 0}))
-    assert ss_flow("why", "edit.begin", "--cache", warm.store).out == "edit.begin: never computed for this scene\n"
+    (later / "events.jsonl").write_text(json.dumps(event | {"why": "for a reason", "seconds": 0}))
+    assert ss_flow("why", "edit.begin", "--cache", warm.store).out == "edit.begin: for a reason\n"
     told = ss_flow("why", "propagate", "--cache", warm.store).out.splitlines()
     assert told[0].startswith(f"the latest run has no such step; in that of {warm.scene}, started ")
     assert told[1].startswith("split.propagate: ")

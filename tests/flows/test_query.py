@@ -76,6 +76,27 @@ def test_all_that_match_are_named_and_the_others_counted(tiny, monkeypatch):
     assert f"{len(many) - len(matching)} more are farther off; --json names all." in told
 
 
+def test_an_instance_without_gaussians_is_said_to_be_in_masks_only(warm):
+    file = warm.out / "instances.json"
+    document = json.loads(file.read_text())
+    document["instances"][0] |= {"num_gaussians": 0, "file": None}
+    file.write_text(json.dumps(document))
+    sizes = {entry["id"]: entry["num_gaussians"] for entry in document["instances"]}
+    asked = ("query", warm.out, "white", "--background", "--cache", warm.store)
+    rows = ss_flow(*asked, "--json").document()["instances"]
+    assert {row["id"]: row["num_gaussians"] for row in rows} == {0: None, **sizes}
+    lines = [line for line in ss_flow(*asked).out.splitlines() if "in masks only" in line]
+    assert len(lines) == list(sizes.values()).count(0) and document["instances"][0]["name"] in "".join(lines)
+
+
+def test_words_that_colour_words_do_not_understand_are_named(tiny):
+    asked = ("query", tiny.out, "white mug, not the red one", "--cache", tiny.store)
+    told = ss_flow(*asked)
+    assert 'Only colour words were understood, not "mug"; `ss-flow models list`' in told.out
+    assert json.loads(ss_flow(*asked, "--json").out)  # nothing beside the document
+    assert "Only colour words" not in ss_flow("query", tiny.out, "something white", "--cache", tiny.store).out
+
+
 def test_what_nothing_matches_is_said(tiny):
     present = colours(tiny)
     absent = next(c for c in ("purple", "pink", "orange", "green", "blue", "yellow", "red") if c not in present)

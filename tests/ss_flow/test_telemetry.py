@@ -38,7 +38,7 @@ def test_a_run_is_one_trace_with_a_span_for_every_computed_step(store):
     failed = next(span for span in rest if span["name"].endswith("half[1]"))
     assert failed["status"] == {"code": 2, "message": "ValueError: negative"}
     assert attributes(whole)["ss_flow.computed"] == "2"
-    assert attributes(rest[0])["ss_flow.why"] == "never computed for this scene"
+    assert attributes(rest[0])["ss_flow.why"] == "computed for the first time for this scene"
 
 
 def test_what_was_reused_is_counted_and_has_no_span(store):

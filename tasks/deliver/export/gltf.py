@@ -1,4 +1,4 @@
-"""glTF with `KHR_gaussian_splatting`: a node for each instance, so that any scene graph can move or hide it."""
+"""glTF with `KHR_gaussian_splatting`: one mesh with all Gaussians, and the parts of files that meshes share with it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Gaussians
 from ss_flow.tasks.deliver.export.content import FileContent, base_colors, degree_of, instances_of, y_up
-from ss_flow.tasks.gaussians.initialise import select
 
 _EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _POINTS, _VERTEX_DATA = 5126, 0, 34962
@@ -65,26 +64,38 @@ def scene_of(nodes: list[dict[str, Any]], cameras: Cameras) -> dict[str, Any]:
 
 def node_of(instance_id: int, names: Mapping[str, str], mesh: int) -> dict[str, Any]:
     """The node of an instance; names: of the instances, by their ids as text."""
-    name = names.get(str(instance_id), f"object {instance_id}" if instance_id else "background")
-    return {"name": name, "mesh": mesh, "extras": {"instance_id": instance_id}}
+    return {"name": _name_of(instance_id, names), "mesh": mesh, "extras": {"instance_id": instance_id}}
+
+
+def _name_of(instance_id: int, names: Mapping[str, str]) -> str:
+    return names.get(str(instance_id), f"object {instance_id}" if instance_id else "background")
 
 
 @task(name="deliver.export.gltf")
 def gltf(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str]) -> FileContent:
-    """A .glb file with all that the Gaussians hold, in float32; labels are nodes, part ids are lost.
+    """A .glb file with all that the Gaussians hold, in float32 and in their order; part ids are lost.
+
+    They are one mesh, whatever the instances: viewers sort the Gaussians of a mesh by depth, but not those of several
+    meshes among each other, so that objects vanish behind the background. Of one instance, the node has its name and
+    `extras.instance_id`. Of several, the attribute `_INSTANCE_ID` (float32, as glTF allows no 32-bit integers there)
+    tells that of each Gaussian, and `extras.instances` of the node the id and name of each.
 
     names: of the instances, by their ids as text.
     """
-    buffer, nodes, meshes = Buffer(), [], []
-    for mesh, instance_id in enumerate(instances_of(gaussians).tolist()):
-        own = select(gaussians, gaussians.instance_id == instance_id)
-        appearance = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-        appearance |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-        primitive = {"mode": _POINTS, "attributes": _attributes(own, buffer), "extensions": {_EXTENSION: appearance}}
-        nodes.append(node_of(instance_id, names, mesh))
-        meshes.append({"name": nodes[-1]["name"], "primitives": [primitive]})
-    document = {"extensionsUsed": [_EXTENSION], "meshes": meshes} if meshes else {}
-    return glb({**document, **scene_of(nodes, cameras)}, buffer)
+    buffer, ids = Buffer(), instances_of(gaussians).tolist()
+    if not ids:
+        return glb(scene_of([], cameras), buffer)
+    attributes = _attributes(gaussians, buffer)
+    node = node_of(ids[0], names, 0)
+    if len(ids) > 1:
+        attributes["_INSTANCE_ID"] = buffer.add(gaussians.instance_id.astype("<f4"), _VERTEX_DATA)
+        known = [{"id": instance_id, "name": _name_of(instance_id, names)} for instance_id in ids]
+        node |= {"name": "instances", "extras": {"instances": known}}
+    appearance = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    appearance |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
+    primitive = {"mode": _POINTS, "attributes": attributes, "extensions": {_EXTENSION: appearance}}
+    mesh = {"name": node["name"], "primitives": [primitive]}
+    return glb({"extensionsUsed": [_EXTENSION], "meshes": [mesh], **scene_of([node], cameras)}, buffer)
 
 
 def _attributes(own: Gaussians, buffer: Buffer) -> dict[str, int]:

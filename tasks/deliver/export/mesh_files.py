@@ -43,7 +43,8 @@ def mesh_ply(mesh: TriangleMesh) -> FileContent:
 def mesh_obj(mesh: TriangleMesh, *, name: str) -> FileContent:
     """An OBJ file; colours stand behind the coordinates (0..1), where most readers find them."""
     rows = zip(*mesh.vertices.T.tolist(), *np.round(mesh.colors / 255, 4).T.tolist(), strict=True)
-    lines = [f"o {name}"]
+    one_line = " ".join(name.split()).rstrip("\\")  # a backslash at its end would join it with the next line
+    lines = [f"o {one_line}"]
     lines += [f"v {x:.7g} {y:.7g} {z:.7g} {red:g} {green:g} {blue:g}" for x, y, z, red, green, blue in rows]
     lines += [f"f {a} {b} {c}" for a, b, c in (mesh.triangles + 1).tolist()]
     return FileContent.of("\n".join(lines).encode(), b"\n")

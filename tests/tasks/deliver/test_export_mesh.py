@@ -127,6 +127,11 @@ def test_open3d_reads_back_what_was_written(whole, tmp_path, suffix):
     np.testing.assert_allclose(np.asarray(read.vertex_colors)[rows], whole.colors[whole.triangles] / 255, atol=1e-3)
 
 
+def test_a_name_is_one_line_of_an_obj(whole):
+    lines = bytes(mesh_obj(whole, name="red\n  mug \\").content).decode().splitlines()
+    assert lines[0] == "o red mug " and lines[1].startswith("v ")
+
+
 def test_trimesh_reads_back_the_scene_with_an_object_a_node(whole, tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="trimesh is not here")
     (tmp_path / "a.glb").write_bytes(mesh_glb((whole,), ROUND, names={"3": "red ball"}).content.tobytes())

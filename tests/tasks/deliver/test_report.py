@@ -242,6 +242,7 @@ def test_stages_stand_side_by_side():
     metrics = {"split": {"miou": 0.5, "pq": 0.25}, "refined": {"miou": 0.625}, "splat": {"miou": 0.75, "pq": 0.125}}
     text = Page(report_html({"metrics": metrics}, pictures=())).text
     assert "After Split Refined masks After Splat mIoU 0.500 0.625 0.750 PQ 0.250 0.125" in text
+    assert "As fractions; the terminal prints the same in percent." in text
 
 
 def test_of_another_run_only_what_differs_is_told():

@@ -88,6 +88,27 @@ def test_columns_that_are_missing_are_named(tmp_path, drop, complaint):
         read_gaussians(write_columns(tmp_path / "a.ply", columns))
 
 
+def with_mode(file: Path, mode: str) -> Path:
+    write_gaussians(file, made_gaussians(3, 0))
+    file.write_bytes(file.read_bytes().replace(b"SplatRenderMode: default", b"SplatRenderMode: " + mode.encode()))
+    return file
+
+
+def test_a_scene_that_was_trained_with_anti_aliasing_is_read_with_a_warning(tmp_path):
+    with pytest.warns(UserWarning, match=r"a\.ply was trained with anti-aliasing .* written as plain 3DGS"):
+        assert len(read_gaussians(with_mode(tmp_path / "a.ply", "mip"))) == 3
+
+
+def test_a_scene_of_plain_gaussians_is_read_without_one(tmp_path, recwarn):
+    read_gaussians(with_mode(tmp_path / "a.ply", "default"))
+    assert not recwarn.list
+
+
+def test_a_scene_whose_header_says_that_it_is_flat_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"a\.ply holds flat Gaussians \(2DGS: SplatRenderMode\)"):
+        read_gaussians(with_mode(tmp_path / "a.ply", "2dgs"))
+
+
 def test_harmonics_under_other_names_are_named(tmp_path):
     columns = columns_of(3, 9, 0)
     columns["f_rest_20"] = columns.pop("f_rest_4")

@@ -6,7 +6,7 @@ from hypothesis.extra.numpy import arrays
 from matplotlib.colors import CSS4_COLORS, to_rgb
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.models.colour_words import TERMS, ColourWords, colours_in, nearest_shade, shares
+from ss_flow.tasks.models.colour_words import TERMS, ColourWords, colours_in, nearest_shade, shares, words_ignored
 
 ENCODER = ColourWords()
 
@@ -117,8 +117,21 @@ def test_colours_are_found_in_a_text(text, terms):
 
 
 def test_a_text_without_a_colour_is_refused_with_advice():
-    with pytest.raises(InputError, match=r'"the mug" names no colour.*CLIP'):
+    with pytest.raises(InputError, match=r'"the mug" names no colour.*`ss-flow models list`\) and run again'):
         ENCODER.encode_texts(["the mug"])
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("the red mug, not the blue one", ("mug",)),
+        ("Crimson velvet chair and a red velvet seat", ("velvet", "chair", "seat")),
+        ("something red", ()),
+        ("rote Tür red", ("rote", "tür")),
+    ],
+)
+def test_the_words_that_say_nothing_to_the_encoder_are_named_once_each(text, words):
+    assert words_ignored(text) == words
 
 
 def test_the_negatives_are_the_colours_that_the_text_does_not_name():
