@@ -21,6 +21,7 @@ from ss_flow.tasks.capture.lens import found_lens, without_distortion
 from ss_flow.tasks.capture.matches import FIRST_FOCAL, Matches
 from ss_flow.tasks.capture.pairs import Look, PairParams
 from ss_flow.tasks.capture.pose_fit import matches_that_fit
+from ss_flow.tasks.capture.turning import refuse_turning
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Positive
 
@@ -93,8 +94,9 @@ def sfm(
     than a straight one.
     The unit of length is arbitrary (`metric` is False). Photos without a pose are missing from the result, which may be
     all; `registered` drops them, and takes out the distortion that `Cameras.radial` states. Mapping runs on one thread
-    with fixed seeds, so that two runs agree to the bit.
+    with fixed seeds, so that two runs agree to the bit. Raises InputError where photos were taken from one place.
     """
+    refuse_turning(photos, matches)
     best = _mapped(photos, matches, again, params, seed)
     if _bend(best) <= _BENT:
         return best
