@@ -273,6 +273,16 @@ def test_float_depth_is_in_world_units_and_what_is_not_finite_is_unknown(tmp_pat
     assert not found[0, :3].any() and (found[1:] == 2.5).all()
 
 
+def test_the_largest_number_of_sixteen_bits_is_no_depth(tmp_path):
+    made.scannet(tmp_path)
+    values = np.full((12, 16), 1000, np.uint16)
+    values[0, :3] = 65535
+    made.write(tmp_path / "depth" / "2.png", values)
+    scene = open_scene(tmp_path)
+    found = read_depth(scene, ingested(scene))[0].depth
+    assert not found[0, :3].any() and (found[1:] == 1).all()
+
+
 def test_ready_masks_become_one_mask_an_id_at_the_frames_size(tmp_path):
     made.photos(tmp_path)
     ids = np.zeros((24, 32), np.uint16)
