@@ -114,7 +114,7 @@ def frame_of(
     else:
         encoded = np.frombuffer(photo.data, np.uint8)
     packed = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
-    return Frame(name, w, h, encoded, packed, width, height)
+    return Frame(name, w, h, encoded, packed, width, height, photo.focal)
 
 
 def _turned(image: np.ndarray, turn: str) -> np.ndarray:

@@ -46,7 +46,8 @@ class MappingParams:
     """Parallax of the two photos that a model starts from, in degrees; further models start from half and a quarter of
     it, where photos have no place yet."""
     camera_model: Literal["SIMPLE_RADIAL", "SIMPLE_PINHOLE"] = "SIMPLE_RADIAL"
-    """"SIMPLE_RADIAL" (one focal length, one radial coefficient) or "SIMPLE_PINHOLE", shared by photos of one size."""
+    """"SIMPLE_RADIAL" (one focal length, one radial coefficient) or "SIMPLE_PINHOLE", shared by photos of one
+    size and of one focal length in EXIF."""
     max_point_error: Positive = 2.0
     """Sparse points with a larger mean reprojection error are dropped, in pixels."""
     min_track: Count = 3
@@ -125,9 +126,9 @@ def _mapped(
     pycolmap = load_pycolmap()
     model = getattr(pycolmap.CameraModelId, params.camera_model)
 
-    def lens(photo: Features, _: int) -> tuple[tuple[int, int], Any]:
+    def lens(photo: Features, _: int) -> tuple[tuple[int, int, float], Any]:
         size = (photo.width, photo.height)
-        return size, pycolmap.Camera.create_from_model_id(1, model, FIRST_FOCAL * max(size), *size)
+        return (*size, photo.focal), pycolmap.Camera.create_from_model_id(1, model, FIRST_FOCAL * max(size), *size)
 
     database, kept = fill_database(photos, (*matches, *again), lens)
     manager = pycolmap.ReconstructionManager()
@@ -191,8 +192,8 @@ def accepted(
         fit, total = matches_that_fit(enough[best], photos, matches)
         warn(
             f"The poses that were found are probably wrong: {1 - fit / total:.0%} of the matches between photos do not "
-            "fit them, where 3 % is usual. Things that repeat or move, and photos from nearly one place, mislead; more "
-            "photos from other places help, or give poses (COLMAP, nerfstudio)."
+            "fit them, where 3 % is usual. Things that repeat or move, two lenses or a zoom, and photos from nearly "
+            "one place mislead; more photos from other places help, or give poses (COLMAP, nerfstudio)."
         )
     return enough[best]
 
