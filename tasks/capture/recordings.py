@@ -14,7 +14,7 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame, UInt8
 from ss_flow.tasks.capture.ingest import IngestParams, frame_of, warn_of_skipped
 from ss_flow.tasks.capture.layout_scannet import read_sens_index
-from ss_flow.tasks.capture.photo_files import inspect
+from ss_flow.tasks.capture.photo_files import inspect, pixels_of
 from ss_flow.tasks.capture.sensor_depth import in_world_units, registered_depth
 from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
@@ -147,7 +147,9 @@ def sens_frames(
             start, length, _, _ = index.offsets[entry]
             file.seek(start)
             where = f"{recording.path}, frame {entry},"
-            result.append(frame_of(name, inspect(file.read(length), where), where, None, index.color_lens, params))
+            photo = inspect(file.read(length), where)
+            pixels = pixels_of(photo, where)
+            result.append(frame_of(name, photo, pixels, where, None, index.color_lens, params))
             progress(i + 1, len(entries), name)
     return tuple(result)
 
