@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ss_flow.tasks.capture.checks import CheckParams
 from ss_flow.tasks.capture.colours import ColourParams
 from ss_flow.tasks.capture.completion import CompletionParams
 from ss_flow.tasks.capture.depth import AgreementParams, SweepParams
 from ss_flow.tasks.capture.given_scene import GivenSceneParams
 from ss_flow.tasks.capture.ingest import IngestParams
+from ss_flow.tasks.capture.misfits import CheckParams
 from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.neighbors import NeighborParams
 from ss_flow.tasks.capture.pose_fit import PoseFitParams

@@ -43,6 +43,8 @@ class Frame:
     source_width: int
     source_height: int
     """Size of the input photo; larger than `width`, `height` when it was scaled down on the way in."""
+    focal: float = 0.0
+    """Focal length that the input photo's EXIF tells, in millimetres; 0 where it tells none."""
 
 
 @dataclass(frozen=True)

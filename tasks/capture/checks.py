@@ -7,7 +7,7 @@ is changed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, CaptureChecks, DepthMap, Float32, Float64, Frame
+from ss_flow.tasks.capture.misfits import CheckParams, coarse, told
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, size_within
-from ss_flow.tasks.ranges import Fraction, NonNegative
-from ss_flow.tasks.words import first_of
 
 _SIDE = 160
 """Longer side of the images that are compared."""
@@ -47,29 +46,10 @@ _TIED = 1 / 3
 Slow changes are told as less than they are."""
 _OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """Between a camera's axes in OpenGL and in OpenCV."""
-_COARSEST = 1e-3
-"""A step between two float32 numbers at the cameras, as a share of the median depth, above which pictures suffer: a
-generated room, moved away, is drawn with a PSNR of 56 dB to what it was at steps of 1 mm, and of 36 dB at 8 mm."""
+_MIRRORS = [np.diag(signs) for signs in ([1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, 1.0])]
+"""Along y, z and x of the camera and of the world."""
 _SAME_PICTURE = 1.0
 """Mean difference of grey values, of 255, below which two photos are the same."""
-
-
-@dataclass(frozen=True)
-class CheckParams:
-    """From when on the views of a capture are told to misfit."""
-
-    max_depth_error: NonNegative = 0.025
-    """Relative difference of neighbours' depth, the median over all views, above which poses and depth disagree."""
-    max_view_error: NonNegative = 4.0
-    """A view is told of whose difference is so many times the median of all views', and above a hundredth."""
-    min_scale_gain: Fraction = 0.3
-    """Share of that difference which another scale of the depth must take away to be told of."""
-    min_likeness: Fraction = 0.35
-    """How much less than the median of all views' a photo's correlation with its neighbours may be."""
-    max_exposure: NonNegative = 1.35
-    """Factor between the darkest and the brightest exposure, 5th to 95th percentile, above which it is told of."""
-    max_center: Fraction = 0.08
-    """How far the principal point may lie from the photo's middle, as a share of its longer side."""
 
 
 @task(name="capture.checks")
@@ -111,84 +91,12 @@ def checks(
     known = error[np.isfinite(error)]
     misfit = bool(pairs) and scale == 1 and not (len(known) and np.median(known) <= params.max_depth_error)
     exchanged = _exchanged(views, cameras, params) if misfit else ""
-    for text in (*_coarse(views), *_told(result, cameras, params, compared=bool(pairs), exchanged=exchanged)):
+    centers = np.array([view.camera.center for view in views]).reshape(-1, 3)
+    measured = np.concatenate([np.zeros(0, np.float32), *(view.depth[view.depth > 0] for view in views)])
+    depth = float(np.median(measured)) if len(measured) else np.nan
+    for text in (*coarse(centers, depth), *told(result, cameras, params, compared=bool(pairs), exchanged=exchanged)):
         warn(text)
     return result
-
-
-def _coarse(views: Sequence[_View]) -> Iterable[str]:
-    """What is to be said of cameras that stand far from the origin: points and Gaussians are float32."""
-    depth = np.concatenate([np.zeros(0, np.float32), *(view.depth[view.depth > 0] for view in views)])
-    farthest = max((float(np.abs(view.camera.center).max()) for view in views), default=0.0)
-    step = float(np.spacing(np.float32(farthest)))
-    if len(depth) and step > _COARSEST * np.median(depth):
-        yield (
-            f"The cameras stand up to {farthest:,.0f} world units from the origin along an axis, where numbers have "
-            f"steps of {step:.2g}, too coarse for depth of {np.median(depth):.3g} (median): subtract one offset from "
-            "all poses, as the mean of the cameras' places, and from given points."
-        )
-
-
-def _told(
-    found: CaptureChecks, cameras: Cameras, params: CheckParams, *, compared: bool, exchanged: str
-) -> Iterable[str]:
-    """What is to be said, with figures. compared: whether any view has others beside it. exchanged: what would make
-    poses fit that do not."""
-    names = np.array(found.names)
-    if found.duplicates:
-        number = f"{len(found.duplicates)} of {len(names)}"
-        yield f"Photos that repeat an earlier one: {number}, {first_of(found.duplicates)}."
-    off = np.abs(cameras.intrinsics[:, 2:] - cameras.sizes / 2).max(axis=1) / cameras.sizes.max(axis=1)
-    if len(off) and off.max() > params.max_center:
-        worst = int(off.argmax())
-        cx, cy = cameras.intrinsics[worst, 2:]
-        width, height = cameras.sizes[worst]
-        yield (
-            f"The principal point of {(off > params.max_center).sum()} of {len(off)} views lies far from the middle, "
-            f"that of {names[worst]} at ({cx:.0f}, {cy:.0f}) of {width} x {height} pixels; are its intrinsics "
-            "exchanged, or those of a photo of another size?"
-        )
-    known = found.depth_error[np.isfinite(found.depth_error)]
-    usual = float(np.median(known)) if len(known) else None
-    if found.depth_scale != 1:
-        now = "hardly any of it is met now" if usual is None else f"median {usual:.1%} now"
-        factor = float(f"{found.depth_scale:.2g}")  # the steps in which it was searched tell no more digits
-        yield (
-            f"Depth fits the poses {factor:g} times as large: neighbours' depth then differs clearly less ({now}); is "
-            "its unit right?"
-        )
-    elif usual is not None and usual > params.max_depth_error:
-        yield (
-            f"Depth carried from view to view differs by {usual:.1%} (median): poses, intrinsics and depth disagree"
-            f"{exchanged}."
-        )
-    elif usual is None and compared:
-        yield (
-            "No view's depth is met in the views beside it: poses, intrinsics and depth disagree, or nothing overlaps"
-            f"{exchanged}."
-        )
-    if np.isnan(found.likeness).all() or exchanged:  # by such poses the wrong pixels are compared
-        return
-    with np.errstate(invalid="ignore"):
-        odd = found.depth_error > max(params.max_view_error * (usual or 0), 0.01)
-        strange = found.likeness < np.nanmedian(found.likeness) - params.min_likeness
-    if strange.any():
-        worst = int(np.nanargmin(found.likeness))
-        yield (
-            f"Photos that differ from what their neighbours show: {strange.sum()} of {len(names)}, "
-            f"{first_of(names[strange].tolist())} (correlation {found.likeness[worst]:.2f}, usually "
-            f"{np.nanmedian(found.likeness):.2f}); turned, or elsewhere?"
-        )
-    if found.depth_scale == 1 and (odd & ~strange).any():
-        worst = int(np.nanargmax(np.where(odd & ~strange, found.depth_error, np.nan)))
-        yield (
-            f"The poses of {(odd & ~strange).sum()} of {len(names)} views do not fit their depth (difference to "
-            f"neighbours {found.depth_error[worst]:.1%}, usually {usual:.1%}): "
-            f"{first_of(names[odd & ~strange].tolist())}."
-        )
-    low, high = np.quantile(found.exposure, (0.05, 0.95))
-    if high / low > params.max_exposure:
-        yield f"The photos' exposure changes by a factor of {high / low:.2f} between nearby views."
 
 
 def _exchanged(views: Sequence[_View], cameras: Cameras, params: CheckParams) -> str:
@@ -196,16 +104,22 @@ def _exchanged(views: Sequence[_View], cameras: Cameras, params: CheckParams) ->
 
     Only how cameras lie to each other counts, so the axes of the world are of no concern.
     """
-    inverse = np.linalg.inv(cameras.world_to_camera).astype(np.float64)
+    given = cameras.world_to_camera.astype(np.float64)
+    inverse = np.linalg.inv(given)
     inverted = "the poses are inverted: camera-to-world and world-to-camera are exchanged"
     turned = "y and z of the cameras are turned: OpenGL's axes and OpenCV's are exchanged"
-    inverse_turned, flipped = ((_OTHER_AXES @ poses).astype(np.float64) for poses in (inverse, cameras.world_to_camera))
-    for meant, words in ((inverse, inverted), (inverse_turned, inverted), (flipped, turned)):
+    mirrored = "the poses are mirrored: they are those of a left-handed world, as Unity's is"
+    tried = [(inverse, inverted), (_OTHER_AXES @ inverse, inverted), (_OTHER_AXES @ given, turned)]
+    tried += [(mirror @ given @ mirror, mirrored) for mirror in _MIRRORS]
+    for meant, words in tried:
         moved = [replace(v, camera=replace(v.camera, world_to_camera=m)) for v, m in zip(views, meant, strict=True)]
-        changed = replace(cameras, world_to_camera=np.asarray(meant, np.float64))
+        changed = replace(cameras, world_to_camera=meant)
         pairs = ((row, other) for row in range(len(views)) for other in nearest_views(changed, row, _NEIGHBOURS))
-        errors = [_error(moved[row], moved[other]) for row, other in pairs]
-        if errors and np.median(np.nan_to_num(errors, nan=_OCCLUDED)) <= params.max_depth_error:
+        errors = [_errors(moved[row], moved[other], np.array([1, _ENDLESS])) for row, other in pairs]
+        if not errors:
+            continue
+        error, parallax = np.median(np.nan_to_num(errors, nan=_OCCLUDED), axis=0)
+        if error <= min(params.max_depth_error, parallax / 2):
             return f"; they agree once {words}"
     return ""
 

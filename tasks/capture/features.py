@@ -40,6 +40,8 @@ class Features:
     """[N, 2] x, y in pixels of the frame."""
     descriptors: UInt8
     """[N, 128] RootSIFT, of length 512."""
+    focal: float = 0.0
+    """That of the frame."""
 
 
 @task(name="capture.features")
@@ -69,4 +71,4 @@ def features(frame: Frame, *, params: FeatureParams = FeatureParams()) -> Featur
     order = np.lexsort((shapes[:, 0], shapes[:, 1], -shapes[:, 2]))
     rows = order[counts[order]][: params.max_features]
     descriptors = np.asarray(found.data, np.uint8).reshape(-1, 128)
-    return Features(frame.name, frame.width, frame.height, points[rows], descriptors[rows])
+    return Features(frame.name, frame.width, frame.height, points[rows], descriptors[rows], frame.focal)

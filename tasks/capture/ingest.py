@@ -16,7 +16,7 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Frame
 from ss_flow.tasks.capture.layout_colmap import read_points
 from ss_flow.tasks.capture.lens import Lens, without_distortion
-from ss_flow.tasks.capture.photo_files import Photo, decode, read_gray, read_photo
+from ss_flow.tasks.capture.photo_files import Photo, Pixels, pixels_of, read_gray, read_photo
 from ss_flow.tasks.capture.scene_files import Pose
 from ss_flow.tasks.geometry.images import averaged_valid, encode_png
 from ss_flow.tasks.ranges import Count, JpegQuality
@@ -48,17 +48,22 @@ def frames(
     """The photos as frames: upright, without distortion, not above `params.max_side`.
 
     A photo that is all this already keeps its bytes. Where intrinsics are known, a photo is turned upright (EXIF) only
-    if they refer to the turned one. Pixels that the lens does not reach after undistortion become invalid.
+    if they refer to the turned one. Pixels that the lens does not reach after undistortion become invalid, as do those
+    that an alpha channel does not show. Warns of photos of 16 bits that are nearly black.
     skipped: views of the capture that are not among these, of which the run is to warn.
     Raises InputError when a photo is damaged, or its size or that of its valid mask is not the stated one.
     """
     warn_of_skipped(skipped, "without a readable photo, a pose or a depth map")
     result = []
     sizes: dict[Lens, tuple[int, int, str]] = {}
+    dim: list[str] = []
     for i, (name, ref) in enumerate(zip(names, photos, strict=True)):
         photo, mask = read_photo(ref.path), valid[i] if valid else None
         lens = lenses[i] if lenses else None
-        frame = frame_of(name, photo, str(ref.path), mask, lens, params)
+        pixels = pixels_of(photo, str(ref.path))
+        frame = frame_of(name, photo, pixels, str(ref.path), mask, lens, params)
+        if pixels.dim:
+            dim.append(name)
         if lens is not None:
             size = (frame.source_width, frame.source_height)
             *first, where = sizes.setdefault(lens, (*size, str(ref.path)))
@@ -69,6 +74,11 @@ def frames(
                 )
         result.append(frame)
         progress(i + 1, len(photos), name)
+    if dim:
+        warn(
+            f"Photos of 16 bits that use less than an eighth of their range, and are read as nearly black: {len(dim)} "
+            f"of {len(names)}, {first_of(dim)}; values of 12 bits, as raw files hold, must be multiplied by 16."
+        )
     return tuple(result)
 
 
@@ -80,12 +90,11 @@ def warn_of_skipped(names: tuple[str, ...], why: str) -> None:
 
 
 def frame_of(
-    name: str, photo: Photo, where: str, mask: FileRef | None, lens: Lens | None, params: IngestParams
+    name: str, photo: Photo, pixels: Pixels, where: str, mask: FileRef | None, lens: Lens | None, params: IngestParams
 ) -> Frame:
     import cv2
 
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = decode(photo.data, where, flags)
+    image = pixels.image
     stored = image.shape[1::-1]
     turn = _UPRIGHT.get(photo.orientation, "")
     if lens is not None and lens.width and stored == (lens.width, lens.height):
@@ -98,6 +107,8 @@ def frame_of(
             f"{lens.width}x{lens.height}; the two must agree."
         )
     keep = np.ones((height, width), bool) if mask is None else _valid_mask(mask, width, height)
+    if pixels.opaque is not None:
+        keep = keep & _turned(pixels.opaque, turn)
     distorted = lens is not None and not lens.pinhole
     if lens is not None and distorted:
         image, keep = without_distortion(image, keep, lens.scaled(width, height))
@@ -114,7 +125,7 @@ def frame_of(
     else:
         encoded = np.frombuffer(photo.data, np.uint8)
     packed = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
-    return Frame(name, w, h, encoded, packed, width, height)
+    return Frame(name, w, h, encoded, packed, width, height, photo.focal)
 
 
 def _turned(image: np.ndarray, turn: str) -> np.ndarray:

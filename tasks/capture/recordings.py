@@ -14,8 +14,8 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame, UInt8
 from ss_flow.tasks.capture.ingest import IngestParams, frame_of, warn_of_skipped
 from ss_flow.tasks.capture.layout_scannet import read_sens_index
-from ss_flow.tasks.capture.photo_files import inspect
-from ss_flow.tasks.capture.sensor_depth import registered_depth
+from ss_flow.tasks.capture.photo_files import inspect, pixels_of
+from ss_flow.tasks.capture.sensor_depth import in_world_units, registered_depth
 from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
 _WHOLE = 0.9
@@ -147,7 +147,9 @@ def sens_frames(
             start, length, _, _ = index.offsets[entry]
             file.seek(start)
             where = f"{recording.path}, frame {entry},"
-            result.append(frame_of(name, inspect(file.read(length), where), where, None, index.color_lens, params))
+            photo = inspect(file.read(length), where)
+            pixels = pixels_of(photo, where)
+            result.append(frame_of(name, photo, pixels, where, None, index.color_lens, params))
             progress(i + 1, len(entries), name)
     return tuple(result)
 
@@ -172,7 +174,7 @@ def sens_depth(
             where = f"{recording.path}, frame {entry},"
             file.seek(start)
             raw = _depth_values(file.read(length), index.depth_compression, lens.width, lens.height, where)
-            values = raw.astype(np.float32) * np.float32(index.depth_scale)
+            values = in_world_units(raw, index.depth_scale)
             result.append(registered_depth(frame, values, where, True, index.color_lens, lens))
             progress(i + 1, len(frames), frame.name)
     return tuple(result)

@@ -9,11 +9,13 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, task
-from ss_flow.tasks.artifacts import DepthMap, Frame
+from ss_flow.tasks.artifacts import DepthMap, Float32, Frame
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
 from ss_flow.tasks.geometry.images import decode_valid, pixels_under
 from ss_flow.tasks.words import first_of
+
+_NO_RETURN = np.iinfo(np.uint16).max
 
 
 @task(name="capture.sensor_depth")
@@ -29,7 +31,8 @@ def depth(
 ) -> tuple[DepthMap, ...]:
     """Sensor depth, registered to the frames' cameras, at the sensor's own resolution.
 
-    files: one-channel images, 16 bit in units of `scale` world units, or 32-bit floats in world units.
+    files: one-channel images, 16 bit in units of `scale` world units (0 and 65535: unknown), or 32-bit floats in world
+    units.
     depth_lens: the depth camera, where it is not the colour camera at another resolution; same centre and axes.
     Pixels that the frame's valid mask leaves out, and those that are not finite, become unknown (0). Warns of views
     without a known pixel.
@@ -46,12 +49,18 @@ def depth(
             raise InputError(
                 f"{ref.path} holds {raw.dtype} pixels; depth of 16 bits a pixel (or 32-bit floats) is expected."
             )
-        values = raw.astype(np.float32) * np.float32(scale if raw.dtype == np.uint16 else 1.0)
+        values = raw if raw.dtype == np.float32 else in_world_units(raw, scale)
         measured = measured or bool((np.isfinite(values) & (values > 0)).any())
         result.append(registered_depth(frame, values, str(ref.path), metric, lens, depth_lens))
         progress(i + 1, len(frames), frame.name)
     _check_known(result, measured, str(files[0].path.parent))
     return tuple(result)
+
+
+def in_world_units(raw: np.ndarray, scale: float) -> Float32:
+    """[h, w] depth of 16 bits, of which one unit is `scale` world units; 0 where it is 0 or 65535, the largest number,
+    which some sensors give for what returns nothing."""
+    return np.where(raw == _NO_RETURN, 0, raw).astype(np.float32) * np.float32(scale)
 
 
 def registered_depth(

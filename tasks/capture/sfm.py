@@ -21,6 +21,7 @@ from ss_flow.tasks.capture.lens import found_lens, without_distortion
 from ss_flow.tasks.capture.matches import FIRST_FOCAL, Matches
 from ss_flow.tasks.capture.pairs import Look, PairParams
 from ss_flow.tasks.capture.pose_fit import matches_that_fit
+from ss_flow.tasks.capture.turning import refuse_turning
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Positive
 
@@ -45,7 +46,8 @@ class MappingParams:
     """Parallax of the two photos that a model starts from, in degrees; further models start from half and a quarter of
     it, where photos have no place yet."""
     camera_model: Literal["SIMPLE_RADIAL", "SIMPLE_PINHOLE"] = "SIMPLE_RADIAL"
-    """"SIMPLE_RADIAL" (one focal length, one radial coefficient) or "SIMPLE_PINHOLE", shared by photos of one size."""
+    """"SIMPLE_RADIAL" (one focal length, one radial coefficient) or "SIMPLE_PINHOLE", shared by photos of one
+    size and of one focal length in EXIF."""
     max_point_error: Positive = 2.0
     """Sparse points with a larger mean reprojection error are dropped, in pixels."""
     min_track: Count = 3
@@ -93,8 +95,9 @@ def sfm(
     than a straight one.
     The unit of length is arbitrary (`metric` is False). Photos without a pose are missing from the result, which may be
     all; `registered` drops them, and takes out the distortion that `Cameras.radial` states. Mapping runs on one thread
-    with fixed seeds, so that two runs agree to the bit.
+    with fixed seeds, so that two runs agree to the bit. Raises InputError where photos were taken from one place.
     """
+    refuse_turning(photos, matches)
     best = _mapped(photos, matches, again, params, seed)
     if _bend(best) <= _BENT:
         return best
@@ -123,9 +126,9 @@ def _mapped(
     pycolmap = load_pycolmap()
     model = getattr(pycolmap.CameraModelId, params.camera_model)
 
-    def lens(photo: Features, _: int) -> tuple[tuple[int, int], Any]:
+    def lens(photo: Features, _: int) -> tuple[tuple[int, int, float], Any]:
         size = (photo.width, photo.height)
-        return size, pycolmap.Camera.create_from_model_id(1, model, FIRST_FOCAL * max(size), *size)
+        return (*size, photo.focal), pycolmap.Camera.create_from_model_id(1, model, FIRST_FOCAL * max(size), *size)
 
     database, kept = fill_database(photos, (*matches, *again), lens)
     manager = pycolmap.ReconstructionManager()
@@ -189,8 +192,8 @@ def accepted(
         fit, total = matches_that_fit(enough[best], photos, matches)
         warn(
             f"The poses that were found are probably wrong: {1 - fit / total:.0%} of the matches between photos do not "
-            "fit them, where 3 % is usual. Things that repeat or move, and photos from nearly one place, mislead; more "
-            "photos from other places help, or give poses (COLMAP, nerfstudio)."
+            "fit them, where 3 % is usual. Things that repeat or move, two lenses or a zoom, and photos from nearly "
+            "one place mislead; more photos from other places help, or give poses (COLMAP, nerfstudio)."
         )
     return enough[best]
 

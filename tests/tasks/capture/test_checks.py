@@ -120,6 +120,12 @@ def test_depth_of_a_wrong_scale_is_told_with_the_right_one(room: Room, factor: f
     assert np.nanmin(found.likeness) > 0.8, "photos are compared by the depth that fits"
 
 
+def _mirrored(poses: np.ndarray, axis: int) -> np.ndarray:
+    mirror = np.eye(4)
+    mirror[axis, axis] = -1
+    return mirror @ poses @ mirror
+
+
 @pytest.mark.parametrize(
     ("mistake", "says"),
     [
@@ -129,8 +135,10 @@ def test_depth_of_a_wrong_scale_is_told_with_the_right_one(room: Room, factor: f
         ),
         (lambda poses, flip: flip @ np.linalg.inv(poses) @ flip, "the poses are inverted: camera-to-world"),
         (lambda poses, flip: flip @ poses, "y and z of the cameras are turned: OpenGL's axes and OpenCV's are"),
+        (lambda poses, flip: _mirrored(poses, 1), "the poses are mirrored: they are those of a left-handed world"),
+        (lambda poses, flip: _mirrored(poses, 2), "the poses are mirrored: they are those of a left-handed world"),
     ],
-    ids=["inverted", "inverted, of OpenGL", "axes of OpenGL"],
+    ids=["inverted", "inverted, of OpenGL", "axes of OpenGL", "mirrored in y", "mirrored in z"],
 )
 def test_exchanged_conventions_of_poses_are_told_and_nothing_that_follows_from_them(
     room: Room, mistake: Any, says: str
@@ -144,6 +152,22 @@ def test_of_poses_that_are_merely_wrong_no_convention_is_blamed(room: Room) -> N
     heard, _ = _checked(room, cameras=_jittered(room, 0.0, 0.3, range(len(room))))
     assert any("poses, intrinsics and depth disagree" in said for said in heard)
     assert not any("they agree" in said for said in heard)
+
+
+def test_of_depth_so_far_away_that_any_poses_fit_no_convention_is_blamed(room: Room) -> None:
+    """As where depth was stored as its distance from the largest number."""
+    heard, _ = _checked(room, depth=np.float32(65.535) - room.depth)
+    assert any("poses, intrinsics and depth disagree" in said for said in heard)
+    assert not any("they agree" in said for said in heard)
+
+
+def test_by_poses_that_disagree_with_depth_no_photos_are_compared(room: Room) -> None:
+    rgb = room.rgb.copy()
+    rgb[::2] = rgb[::2] // 2
+    rgb[4] = rgb[4][::-1, ::-1]
+    heard, _ = _checked(room, rgb, cameras=_jittered(room, 2.0, 0.06, range(len(room))))
+    assert any("poses, intrinsics and depth disagree" in said for said in heard)
+    assert not any("exposure" in said or "neighbours show" in said for said in heard)
 
 
 def test_duplicates_are_counted_and_named(room: Room) -> None:

@@ -3,6 +3,7 @@ import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import capture_folders as made
 import cv2
@@ -11,6 +12,7 @@ import pytest
 from capture_folders import ref, refs
 
 from ss_flow.errors import InputError
+from ss_flow.tasks.capture import photo_files
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.ingest import IngestParams, cameras, frames
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map
@@ -271,6 +273,112 @@ def test_float_depth_is_in_world_units_and_what_is_not_finite_is_unknown(tmp_pat
     scene = open_scene(tmp_path)
     found = read_depth(scene, ingested(scene))[0].depth
     assert not found[0, :3].any() and (found[1:] == 2.5).all()
+
+
+def test_the_largest_number_of_sixteen_bits_is_no_depth(tmp_path):
+    made.scannet(tmp_path)
+    values = np.full((12, 16), 1000, np.uint16)
+    values[0, :3] = 65535
+    made.write(tmp_path / "depth" / "2.png", values)
+    scene = open_scene(tmp_path)
+    found = read_depth(scene, ingested(scene))[0].depth
+    assert not found[0, :3].any() and (found[1:] == 1).all()
+
+
+def cut_out(suffix, depth=np.uint8):
+    """A file whose left half is transparent, and white behind that."""
+    full = np.iinfo(depth).max
+    image = np.dstack([made.photo().astype(depth) * (full // 255), np.full((24, 32), full, depth)])
+    image[:, :16] = [full, full, full, full // 3]
+    return cv2.imencode(suffix, image, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+
+
+@pytest.mark.parametrize(("suffix", "depth"), [(".png", np.uint8), (".png", np.uint16), (".webp", np.uint8)])
+def test_what_a_photo_does_not_show_is_ignored(tmp_path, suffix, depth):
+    (tmp_path / f"a{suffix}").write_bytes(cut_out(suffix, depth))
+    (frame,) = ingested(open_scene(tmp_path))
+    np.testing.assert_array_equal(decode_valid(frame), np.arange(32)[None].repeat(24, 0) >= 16)
+
+
+def test_opacity_is_turned_upright_and_joins_the_valid_mask(tmp_path):
+    data = cut_out(".png")
+    chunk = b"eXIf" + tiff_of(6)
+    chunk = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "a.png").write_bytes(data[:33] + chunk + data[33:])
+    mask = np.full((32, 24), 255, np.uint8)
+    mask[:, :4] = 0
+    made.write(tmp_path / "valid" / "a.png", mask)
+    (frame,) = ingested(open_scene(tmp_path))
+    expected = np.zeros((32, 24), bool)
+    expected[16:, 4:] = True
+    np.testing.assert_array_equal(decode_valid(frame), expected)
+
+
+def tiff_of_four_channels(extra):
+    """Little-endian, 32 x 24, the fourth channel 0; extra: what it is said to be."""
+    tags = [(256, 32), (257, 24), (258, 8), (259, 1), (262, 2), (273, 200), (277, 4), (278, 24), (279, 4 * 24 * 32)]
+    entries = b"".join(struct.pack("<HHII", tag, 3, 1, value) for tag, value in [*tags, (338, extra)])
+    entries = entries.replace(struct.pack("<HHII", 258, 3, 1, 8), struct.pack("<HHII", 258, 3, 4, 180))
+    head = (b"II*\0" + struct.pack("<IH", 8, len(tags) + 1) + entries + bytes(4)).ljust(180, b"\0")
+    pixels = np.dstack([made.photo(), np.zeros((24, 32), np.uint8)])
+    return (head + struct.pack("<4H", 8, 8, 8, 8)).ljust(200, b"\0") + pixels.tobytes()
+
+
+@pytest.mark.parametrize(("extra", "counts"), [(0, True), (2, False)])
+def test_the_fourth_channel_of_a_tiff_is_its_opacity_only_where_it_says_so(tmp_path, extra, counts):
+    (tmp_path / "a.tif").write_bytes(tiff_of_four_channels(extra))
+    (frame,) = ingested(open_scene(tmp_path))
+    assert (decode_valid(frame) == counts).all()
+
+
+def test_a_photo_that_shows_all_keeps_its_bytes(tmp_path):
+    opaque = np.dstack([made.photo(), np.full((24, 32), 255, np.uint8)])
+    made.write(tmp_path / "a.png", opaque)
+    (frame,) = ingested(open_scene(tmp_path))
+    assert frame.encoded.tobytes() == (tmp_path / "a.png").read_bytes() and frame.valid.size == 0
+
+
+def test_photos_of_sixteen_bits_that_are_nearly_black_are_warned_of(tmp_path):
+    for name, gain in (("dark", 15), ("bright", 256)):
+        made.write(tmp_path / f"{name}.png", made.photo().astype(np.uint16) * gain)
+    with pytest.warns(UserWarning, match="less than an eighth of their range, .* 1 of 2, dark; values of 12 bits"):
+        ingested(open_scene(tmp_path))
+
+
+def exif_of(*focal):
+    """EXIF in whose second directory stand the given entries: tag, kind, value."""
+    more = struct.pack(">H", len(focal)) + b"".join(
+        struct.pack(">HHI", tag, kind, 1) + struct.pack(">HH" if kind == 3 else ">I", *value)
+        for tag, kind, *value in focal
+    )
+    first = struct.pack(">IHHHIII", 8, 1, 0x8769, 4, 1, 26, 0)
+    return (b"MM\0*" + first + more).ljust(100, b"\0") + struct.pack(">II", 425, 100)
+
+
+@pytest.mark.parametrize(
+    ("entries", "focal"),
+    [
+        ([(0x920A, 5, 100), (0xA405, 3, 26, 0)], 26),
+        ([(0x920A, 5, 100), (0xA405, 3, 0, 0)], 4.25),
+        ([(0x920A, 5, 100)], 4.25),
+        ([(0x920A, 5, 9999)], 0),
+        ([], 0),
+    ],
+    ids=["of 35 mm film", "not known for film", "the lens's own", "cut short", "none"],
+)
+def test_focal_length_is_read_of_exif_and_kept_with_the_frame(tmp_path, entries, focal):
+    exif, jpeg = exif_of(*entries), cv2.imencode(".jpg", made.photo())[1].tobytes()
+    segment = b"Exif\0\0" + exif
+    (tmp_path / "a.jpg").write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:])
+    (frame,) = ingested(open_scene(tmp_path))
+    assert frame.focal == focal
+
+
+def test_focal_length_of_heic_is_read_too(tmp_path, monkeypatch):
+    """As pi_heif gives EXIF; the files here have none."""
+    found = SimpleNamespace(size=(32, 24), info={"exif": b"Exif\0\0" + exif_of((0xA405, 3, 13, 0))})
+    monkeypatch.setattr(photo_files, "_open_heic", lambda data: found)
+    assert read_photo(SUPPORT / "quarters.heic").focal == 13
 
 
 def test_ready_masks_become_one_mask_an_id_at_the_frames_size(tmp_path):

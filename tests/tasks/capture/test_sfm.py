@@ -62,6 +62,16 @@ def test_poses_of_a_generated_scene_are_found_up_to_a_similarity(scene, found):
     assert len(found.sparse_points) > 100
 
 
+def test_photos_of_one_size_that_were_taken_through_two_lenses_have_two_focal_lengths(scene, store):
+    through = {26.0: scene[0], 39.0: views(EYES, width=320, height=240, focal=450.0)[0]}
+    chosen = [(26.0, row) for row in range(8)] + [(39.0, row) for row in (2, 3, 4, 5)]
+    frames = tuple(replace(through[focal][row], name=f"{i:02d}", focal=focal) for i, (focal, row) in enumerate(chosen))
+    cameras = cameras_of(find_poses(frames, store), store)
+    assert len(cameras) == 12
+    assert cameras.intrinsics[:8, 0] == pytest.approx(300.0, rel=0.03)
+    assert cameras.intrinsics[8:, 0] == pytest.approx(450.0, rel=0.03)
+
+
 @pytest.mark.parametrize("options", [{"jobs": 2}, {"executor": "processes"}])
 def test_other_workers_find_the_same_to_the_bit(scene, found, tmp_path, options):
     store = Store(tmp_path)
