@@ -140,7 +140,8 @@ class Store:
         return Claims(self.root)
 
     def __contains__(self, object_digest: str) -> bool:
-        return os.access(f"{self._objects}/{object_digest[:2]}/{object_digest}/", os.F_OK)  # quicker than isdir
+        path = f"{self._objects}/{object_digest[:2]}/{object_digest}/"  # of "", the folder of all objects
+        return DIGEST.fullmatch(object_digest) is not None and os.access(path, os.F_OK)  # quicker than isdir
 
     def _holds(self, digests: Sequence[str]) -> bool:
         return all(map(self.__contains__, digests))
@@ -220,7 +221,12 @@ class Store:
         return folder_bytes(self.object_path(object_digest))
 
     def discard(self, object_digest: str, *, unused_since: float = math.inf) -> bool:
-        """Take an object out, at once for all readers; False when it is not there, or was used since."""
+        """Take an object out, at once for all readers; False when it is not there, or was used since.
+
+        Raises ValueError for what is no digest.
+        """
+        if not DIGEST.fullmatch(object_digest):
+            raise ValueError(f"{object_digest!r} is no digest of an object")
         self._recent.drop(object_digest)
         return self._take_out(self.object_path(object_digest), unused_since)
 
@@ -246,7 +252,7 @@ class Store:
     def objects(self) -> Iterator[Entry]:
         """Every object."""
         for folder in entries(self._objects):
-            for entry in entries(folder.path):
+            for entry in filter(lambda entry: DIGEST.fullmatch(entry.name), entries(folder.path)):
                 with contextlib.suppress(FileNotFoundError):
                     yield Entry(entry.name, entry.stat().st_mtime, folder_bytes(Path(entry.path)))
 

@@ -112,6 +112,25 @@ def test_an_unknown_object_is_gone(store):
         store.get("00" * 32)
 
 
+@pytest.mark.parametrize("name", ["", ".", "..", "ab", "../../elsewhere", "AB" * 32])
+def test_what_is_no_digest_is_not_in_the_store_and_costs_nothing(store, name):
+    output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    assert name not in store
+    with pytest.raises(Gone, match="not in the store"):
+        store.get(name)
+    with pytest.raises(ValueError, match="no digest"):
+        store.discard(name)
+    assert output in store
+
+
+def test_what_others_put_among_the_objects_is_none_and_stays(store):
+    output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    stranger = store.object_path(output).with_name("notes")
+    stranger.mkdir()
+    assert [entry.name for entry in store.objects()] == [output]
+    assert not verify(store).damaged and stranger.is_dir()
+
+
 def test_an_object_of_a_foreign_type_is_refused():
     with pytest.raises(ValueError, match="foreign"):
         codec.type_named("subprocess:Popen")
