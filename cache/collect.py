@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import stat
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -23,6 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ss_flow.cache.canonical import DIGEST
 from ss_flow.cache.errors import writing
 from ss_flow.cache.files import remove
 from ss_flow.cache.store import GRACE_SECONDS, Entry, Store
@@ -33,6 +35,9 @@ THREADS = 8
 ORPHANS = "objects of no result"
 HIDDEN = (".*", "roots/*/.*", "roots/runs/*/.*")
 """Where files are written beside those that they replace."""
+_BESIDE = re.compile(r"\..+\.[0-9a-f]{32}")
+"""What `write_atomically` calls them."""
+_CHECKPOINT = re.compile(rf"{DIGEST.pattern}\.(npz|partial)")
 
 
 @dataclass(frozen=True)
@@ -96,11 +101,11 @@ def collect(
             if unwanted and (dry or store.drop_part(part.name, unused_since=before)):
                 others["parts of keys"].add(part.bytes)
     with writing(store.root):
-        for file, size in _old_files(store.root, ("checkpoints/*",), before):
+        for file, size in _old_files(store.root, ("checkpoints/*",), _CHECKPOINT, before):
             if file.stem not in living:
                 _take(file, size, others["checkpoints"], dry=dry)
         # Another process may be writing these files now, so they stay for an hour, however short the grace period.
-        for file, size in _old_files(store.root, HIDDEN, now - GRACE_SECONDS):
+        for file, size in _old_files(store.root, HIDDEN, _BESIDE, now - GRACE_SECONDS):
             _take(file, size, others["temporary files"], dry=dry)
     if not dry:
         others["temporary files"].count += store.sweep_temporaries()
@@ -185,10 +190,12 @@ def _sweep_results(store: Store, plan: _Plan, others: dict[str, Tally], *, dry: 
     return dict(sorted(results.items()))
 
 
-def _old_files(root: Path, patterns: tuple[str, ...], before: float) -> Iterator[tuple[Path, int]]:
-    """Files that were last written before then, and their sizes."""
+def _old_files(
+    root: Path, patterns: tuple[str, ...], named: re.Pattern[str], before: float
+) -> Iterator[tuple[Path, int]]:
+    """Files that a store names so and that were last written before then, and their sizes."""
     for pattern in patterns:
-        for path in root.glob(pattern):
+        for path in filter(lambda path: named.fullmatch(path.name), root.glob(pattern)):
             with contextlib.suppress(FileNotFoundError):  # its writer has just finished
                 status = path.stat()
                 if stat.S_ISREG(status.st_mode) and status.st_mtime < before:

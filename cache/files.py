@@ -46,11 +46,11 @@ def remove(path: Path) -> None:
 
 
 def entries(folder: str) -> list[os.DirEntry[str]]:
-    """What a folder holds, by name; nothing when it is not there."""
+    """What a folder holds, by name; nothing when it is not there, or a file, as file managers leave some anywhere."""
     try:
         with os.scandir(folder) as found:
             return sorted(found, key=lambda entry: entry.name)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return []
 
 

@@ -58,6 +58,9 @@ MEMORY_BYTES = 2 << 30
 GRACE_SECONDS = 3600.0
 """What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
 
+_TEMPORARY = re.compile(r"[0-9a-f]{32}")
+"""What `temporary` calls things."""
+
 NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 """What keeps a process from opening any file."""
 
@@ -102,8 +105,8 @@ class Store:
     Raises OSError (with the folder's name) when the folder cannot be created or written.
     """
 
-    def __init__(self, root: Path, *, memory_bytes: int = MEMORY_BYTES) -> None:
-        self.root = root = root.absolute()  # a process may change its folder
+    def __init__(self, root: Path | str, *, memory_bytes: int = MEMORY_BYTES) -> None:
+        self.root = root = Path(root).absolute()  # a process may change its folder
         self._recent = Recent(memory_bytes)
         self._actions = f"{root}/actions"
         self._objects = f"{root}/objects"
@@ -140,7 +143,8 @@ class Store:
         return Claims(self.root)
 
     def __contains__(self, object_digest: str) -> bool:
-        return os.access(f"{self._objects}/{object_digest[:2]}/{object_digest}/", os.F_OK)  # quicker than isdir
+        path = f"{self._objects}/{object_digest[:2]}/{object_digest}/"  # of "", the folder of all objects
+        return DIGEST.fullmatch(object_digest) is not None and os.access(path, os.F_OK)  # quicker than isdir
 
     def _holds(self, digests: Sequence[str]) -> bool:
         return all(map(self.__contains__, digests))
@@ -220,7 +224,12 @@ class Store:
         return folder_bytes(self.object_path(object_digest))
 
     def discard(self, object_digest: str, *, unused_since: float = math.inf) -> bool:
-        """Take an object out, at once for all readers; False when it is not there, or was used since."""
+        """Take an object out, at once for all readers; False when it is not there, or was used since.
+
+        Raises ValueError for what is no digest.
+        """
+        if not DIGEST.fullmatch(object_digest):
+            raise ValueError(f"{object_digest!r} is no digest of an object")
         self._recent.drop(object_digest)
         return self._take_out(self.object_path(object_digest), unused_since)
 
@@ -246,7 +255,7 @@ class Store:
     def objects(self) -> Iterator[Entry]:
         """Every object."""
         for folder in entries(self._objects):
-            for entry in entries(folder.path):
+            for entry in filter(lambda entry: DIGEST.fullmatch(entry.name), entries(folder.path)):
                 with contextlib.suppress(FileNotFoundError):
                     yield Entry(entry.name, entry.stat().st_mtime, folder_bytes(Path(entry.path)))
 
@@ -350,10 +359,11 @@ class Store:
             return place.stat().st_mtime
 
     def sweep_temporaries(self) -> int:
-        """Delete what killed processes left half-written; return how many. A writer at work is left alone by age."""
+        """Delete what killed processes left half-written; return how many. A writer at work is left alone by age, and
+        what no store has named so by its name: the folder may have been someone's before it was a store."""
         before = self.now() - GRACE_SECONDS
         stale = 0
-        for entry in entries(f"{self.root}/tmp"):
+        for entry in filter(lambda entry: _TEMPORARY.fullmatch(entry.name), entries(f"{self.root}/tmp")):
             with contextlib.suppress(FileNotFoundError):  # its writer has just finished
                 if entry.stat().st_mtime < before:
                     remove(Path(entry.path))

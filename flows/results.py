@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.cache.canonical import DIGEST
 from ss_flow.cache.location import is_url, open_store
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
@@ -181,7 +182,17 @@ def read_run(folder: Path) -> dict[str, Any]:
     """The document run.json of an output folder. Raises InputError when there is none, or it is damaged."""
     if not (folder / RUN_FILE).is_file():
         raise InputError(f"{folder} is not the output folder of a run: it has no {RUN_FILE}.")
-    return _read(folder / RUN_FILE, {"store", "scene", "params", "results"})
+    document = _read(folder / RUN_FILE, {"store", "scene", "params", "results"})
+    results = document["results"]
+    if not isinstance(results, dict) or not all(map(_are_digests, results.values())):
+        raise InputError(f"{folder / RUN_FILE} is damaged: its results are no digests; run the scene again.")
+    return document
+
+
+def _are_digests(value: Any) -> bool:
+    """Whether this is a digest, or a list of them."""
+    several = value if isinstance(value, list) else [value]
+    return all(isinstance(one, str) and DIGEST.fullmatch(one) for one in several)
 
 
 def not_of_an_edit(folder: Path, document: Mapping[str, Any], what: str) -> InputError:

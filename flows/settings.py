@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import math
+import numbers
 import tomllib
 import types
 import typing
@@ -83,10 +85,18 @@ def preset(params: T, name: str) -> T:
 
 
 def overlaid(params: T, table: Mapping[str, Any]) -> T:
-    """Set parameters from nested tables."""
+    """Set parameters from nested tables.
+
+    Raises InputError for an unknown name, and a value of the wrong type or range.
+    """
     values: dict[Path, Any] = {}
     for name, value in table.items():
         if isinstance(value, Mapping):
+            groups = [key for key, inner in vars(params).items() if dataclasses.is_dataclass(inner)]
+            if name not in groups:
+                raise InputError(
+                    f"the group of parameters {name!r} is unknown; there are {', '.join(groups) or 'none'}."
+                )
             params = dataclasses.replace(params, **{name: overlaid(getattr(params, name), value)})  # type: ignore[type-var]
         else:
             path = find(params, name)
@@ -128,7 +138,7 @@ def _parsed(text: str, kind: Any, name: str) -> Any:
     try:
         value = _converted(text, kind)
     except ValueError:
-        raise InputError(f"parameter {name} cannot be {text!r}; it takes {_described(kind)}.") from None
+        raise _refused(text, kind, name) from None
     _check(value, kind, name)
     return value
 
@@ -157,21 +167,41 @@ def _converted(text: str, kind: Any) -> Any:
 
 
 def _check(value: Any, kind: Any, name: str) -> None:
-    """Raises InputError for an empty list, and for a value, or an item of it, out of its declared range or choice."""
+    """Raises InputError for an empty list, and for a value, or an item of it, that is not of the declared type, or out
+    of the declared range or choice."""
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
         if value is not None:
             _check(value, next(k for k in typing.get_args(kind) if k is not type(None)), name)
     elif typing.get_origin(kind) is tuple:
+        if not isinstance(value, list | tuple):
+            raise _refused(value, kind, name)
         if not value:
             raise InputError(f"parameter {name} is empty; it takes {_described(kind)}.")
         for item in value:
             _check(item, typing.get_args(kind)[0], name)
     elif typing.get_origin(kind) is typing.Annotated:
+        _check(value, typing.get_args(kind)[0], name)
         for limit in typing.get_args(kind)[1:]:
             if isinstance(limit, Range) and value not in limit:
                 raise InputError(f"parameter {name} is out of range: {value}; it must be {limit}.")
-    elif typing.get_origin(kind) is typing.Literal and value not in typing.get_args(kind):
-        raise InputError(f"parameter {name} cannot be {value!r}; it takes {_described(kind)}.")
+    elif typing.get_origin(kind) is typing.Literal:
+        if value not in typing.get_args(kind):
+            raise _refused(value, kind, name)
+    elif not _is_of(value, kind):
+        raise _refused(value, kind, name)
+
+
+def _is_of(value: Any, kind: type) -> bool:
+    """Whether a value is of a plain type: a whole number is a number, true and false are none."""
+    if isinstance(value, bool):
+        return kind is bool
+    if kind is float:
+        return isinstance(value, numbers.Real) and math.isfinite(value)
+    return isinstance(value, numbers.Integral if kind is int else kind)
+
+
+def _refused(value: Any, kind: Any, name: str) -> InputError:
+    return InputError(f"parameter {name} cannot be {value!r}; it takes {_described(kind)}.")
 
 
 def _described(kind: Any) -> str:

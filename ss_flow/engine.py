@@ -14,6 +14,7 @@ import psutil
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure, writing
 from ss_flow.cache.store import Store
+from ss_flow.errors import InputError
 from ss_flow.events import Log, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
 from ss_flow.graph import Flow, Node
@@ -103,10 +104,13 @@ def run_flows(
     will use, None = one where the driver shows any.
     recorded: whether the run is kept among the store's runs; a question about a result need not be.
 
-    Raises KeyError when `until` names no output, StoreFailure when the store cannot be used, ExecutorLost when whoever
-    ran the calls is gone, and KeyboardInterrupt when interrupted: what runs is then told to stop at its next sign of
-    progress, and waited for; a second interrupt does not wait.
+    Raises InputError for a negative number, KeyError when `until` names no output, StoreFailure when the store cannot
+    be used, ExecutorLost when whoever ran the calls is gone, and KeyboardInterrupt when interrupted: what runs is then
+    told to stop at its next sign of progress, and waited for; a second interrupt does not wait.
     """
+    for name, number in (("jobs", jobs), ("memory_mb", memory_mb), ("gpus", gpus or 0)):
+        if number < 0:
+            raise InputError(f"{name} is {number}; it must be 0 or more.")
     with contextlib.ExitStack() as stack:
         claims = store.open_claims()
         stack.callback(claims.release_all)
@@ -116,7 +120,8 @@ def run_flows(
         try:
             room = workers.capacity or _this_machine(gpus)
             capacity = replace(room, cores=jobs or room.cores, memory_mb=memory_mb or room.memory_mb)
-            store.sweep_temporaries()
+            if not dry:
+                store.sweep_temporaries()
             claims.sweep()
             while not run.attempt(workers, capacity, memory_is_strict=memory_mb > 0, dry=dry):
                 pass

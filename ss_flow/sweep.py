@@ -20,6 +20,8 @@ from ss_flow.errors import InputError
 from ss_flow.runs import DONE
 
 T = TypeVar("T")
+MOST_ROWS = 10_000
+"""What a sweep may come to; each is a run of its own."""
 _RANGE = re.compile(r"([^:]*):([^:]*):([^:]*?)(log)?")
 
 
@@ -116,6 +118,8 @@ def _spread(match: re.Match[str], part: str) -> list[str]:
         raise InputError(f"{part!r} is no range; write lo:hi:n, as in 0.5:0.9:5, or lo:hi:nlog.") from None
     if not (abs(low) < float("inf") and abs(high) < float("inf") and count >= 2):
         raise InputError(f"range {part!r} is not possible; it needs two finite ends and at least 2 values.")
+    if count > MOST_ROWS:
+        raise InputError(f"range {part!r} is not possible; it may have at most {MOST_ROWS:,} values.")
     if match[4] and not (low > 0 and high > 0):
         raise InputError(f"range {part!r} is not possible; both ends of a range in the logarithm must be above 0.")
     shares = [i / (count - 1) for i in range(count)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,8 +97,8 @@ class Evaluate:
         return 0
 
     def _check(self) -> None:
-        if self.radius < 0:
-            raise InputError(f"--radius {self.radius} is out of range; it must be 0 or more.")
+        if not 0 <= self.radius < math.inf:
+            raise InputError(f"--radius {self.radius} is out of range; it must be 0 (no limit) or a length above 0.")
         if self.protocol != "points" and (self.radius or self.compat):
             raise InputError("--radius and --compat are for --protocol points; add it.")
         if self.compat and not self.truth:

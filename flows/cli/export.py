@@ -21,7 +21,7 @@ from ss_flow.flows.results import FinishedRun
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.export.coco import coco
-from ss_flow.tasks.deliver.output import check_file, check_place, replacing
+from ss_flow.tasks.deliver.output import check_named, check_place, replacing
 from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorted
 from ss_flow.tasks.geometry.images import suffix_of
 
@@ -207,4 +207,4 @@ def _check_place(out: Path, *, folder: bool) -> None:
     if folder:
         check_place(out, MANIFEST, "an earlier export")
     else:
-        check_file(out, "name another file with --out")
+        check_named(out, "--out")

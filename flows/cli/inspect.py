@@ -21,7 +21,7 @@ from ss_flow.flows.cli.context import OptionalPath, PositionalPath, StoreOptions
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.describe import told
 from ss_flow.runs import DONE, Run, latest_runs, settled
-from ss_flow.tasks.deliver.output import check_file
+from ss_flow.tasks.deliver.output import check_named
 from ss_flow.telemetry import trace
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -43,7 +43,7 @@ class Status:
     def run(self) -> int:
         run = latest_run(self.store.existing_store(), self.scene)
         if self.otlp:
-            check_file(self.otlp, "name another file with --otlp")
+            check_named(self.otlp, "--otlp")
             write_atomically(self.otlp, json.dumps(trace(run)) + "\n")
         events = list(run.events())
         steps = _steps(events)
@@ -268,7 +268,7 @@ class CacheShow:
     def run(self) -> int:
         store = self.store.existing_store()
         if self.png:
-            check_file(self.png, "name another file with --png")
+            check_named(self.png, "--png")
         run, digests = results_named(store, self.scene, self.what)
         values = [store.get(digest) for digest in digests]
         if self.png:

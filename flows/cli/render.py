@@ -20,7 +20,7 @@ from ss_flow.flows.render import CameraPath, Shot, shoot
 from ss_flow.flows.results import FinishedRun
 from ss_flow.graph import stored
 from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
-from ss_flow.tasks.deliver.output import check_file, check_place, replacing
+from ss_flow.tasks.deliver.output import check_named, check_place, replacing
 from ss_flow.tasks.deliver.pictures import What
 
 CAMERAS_FILE = "transforms.json"
@@ -172,7 +172,7 @@ def _write_pictures(
 def _check_place(out: Path, *, is_film: bool) -> None:
     """Raises InputError unless the pictures can be written here: a new place, or that of earlier ones."""
     if is_film:
-        check_file(out, "name another file with --out")
+        check_named(out, "--out")
     elif out.is_file():
         raise InputError(f"{out} is a file that does not end in .mp4; --out must name a film or a folder.")
     else:

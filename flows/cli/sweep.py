@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import types
 import typing
 from collections import defaultdict
@@ -38,7 +39,7 @@ from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.measures import NAMES, measures, names_of
 from ss_flow.flows.params import Params
 from ss_flow.runs import DONE
-from ss_flow.sweep import Row, grid, in_words, recorded_as, rows_of, values_of, zipped
+from ss_flow.sweep import MOST_ROWS, Row, grid, in_words, recorded_as, rows_of, values_of, zipped
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import check_writable
@@ -184,6 +185,8 @@ class Sweep:
         swept = {name: values for name, values in lists.items() if len(values) > 1}
         if not swept:
             raise InputError("there is nothing to sweep; give a parameter several values: --set tau_label=0.6,0.8.")
+        if not self.zipped and (count := math.prod(map(len, swept.values()))) > MOST_ROWS:
+            raise InputError(f"these values have {count:,} combinations; a sweep may have at most {MOST_ROWS:,}.")
         found = []
         for values in zipped(swept) if self.zipped else grid(swept):
             variant = settings.apply(params, [*fixed, *(f"{name}={text}" for name, text in values.items())])

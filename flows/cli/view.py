@@ -25,7 +25,7 @@ from ss_flow.flows.cli.context import (
 )
 from ss_flow.flows.cli.query import encoder_name, query_params
 from ss_flow.flows.results import FinishedRun, read_run
-from ss_flow.tasks.deliver.output import check_file
+from ss_flow.tasks.deliver.output import check_named
 
 if TYPE_CHECKING:
     from ss_flow.flows.view.search import Search
@@ -72,11 +72,13 @@ class View:
             if file and not file.absolute().parent.is_dir():
                 raise InputError(f"{file} cannot be written; {option} must name a file in a folder that exists.")
             if file:
-                check_file(file, f"name another file with {option}")
+                check_named(file, option)
         folder = Path(self.what)
         if not folder.exists() and "/" not in self.what:
             return self._artifact()
         if self.html or self.rerun:
+            if self.beside or self.script or self.correct:
+                raise InputError("--beside, --script and --correct are for the viewer, not for --html or --rerun.")
             return self._files(folder)
         return self._viewer(folder)
 
@@ -119,16 +121,16 @@ class View:
     def _files(self, folder: Path) -> int:
         """Files that show a run without this program."""
         out = console(json=False)
+        if self.rerun:  # first, since it may lack its package
+            from ss_flow.flows.view import rerun_file
+
+            rerun_file.write_recording(self.rerun, open_run(folder, self.store, rerun_file.SHOWN))
+            out.print(escape(f"{self.rerun} ({self.rerun.stat().st_size / 1e6:.1f} MB)"))
         if self.html:
             from ss_flow.flows.view import page
 
             page.write_page(self.html, open_run(folder, self.store, page.SHOWN))
             out.print(escape(f"{self.html} ({self.html.stat().st_size / 1e6:.1f} MB)"))
-        if self.rerun:
-            from ss_flow.flows.view import rerun_file
-
-            rerun_file.write_recording(self.rerun, open_run(folder, self.store, rerun_file.SHOWN))
-            out.print(escape(f"{self.rerun} ({self.rerun.stat().st_size / 1e6:.1f} MB)"))
         return 0
 
     def _viewer(self, folder: Path) -> int:

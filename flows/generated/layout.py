@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ss_flow.errors import InputError
 from ss_flow.flows.generated.shapes import SHAPES, Mesh, box, shelf, sofa, table
 
 HALF_WIDTH = 2.0
@@ -82,10 +81,8 @@ class _Surface:
 def furnish(objects: int, rng: np.random.Generator) -> tuple[Thing, ...]:
     """Everything in the room: the structure (id 0), the furniture (ids 1..3), the small things (ids 4..).
 
-    Raises InputError when `objects` is not in 1..MAX_OBJECTS.
+    objects: 1..MAX_OBJECTS.
     """
-    if not 1 <= objects <= MAX_OBJECTS:
-        raise InputError(f"A generated room holds 1 to {MAX_OBJECTS} objects, not {objects}.")
     furniture, surfaces, blocked = _furniture(rng)
     things = [*_structure(), *furniture]
     colors = list(rng.permutation(list(COLORS)))

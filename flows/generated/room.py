@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.flows.generated.composite_room import GAZE, Station, close_up, furnish_composites, gripper
-from ss_flow.flows.generated.layout import Thing, furnish
+from ss_flow.flows.generated.layout import MAX_OBJECTS, Thing, furnish
 from ss_flow.flows.generated.masks import DegradeParams, degrade
 from ss_flow.flows.generated.render import Renderer
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, UInt8
@@ -54,6 +54,13 @@ class RoomParams:
     """Whether to furnish with things of several, differently coloured parts; 480 x 360 pixels show them well."""
     gripper: bool = False
     """Whether a gripper moves along in front of the lens; the valid masks leave it out."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError when a number is out of range."""
+        if self.views < 2 or self.held_out < 0 or min(self.width, self.height) < 16:
+            raise InputError("A generated room needs at least 2 views, 0 held-out views and 16 x 16 pixels.")
+        if not 1 <= self.objects <= MAX_OBJECTS:
+            raise InputError(f"A generated room holds 1 to {MAX_OBJECTS} objects, not {self.objects}.")
 
 
 @dataclass(frozen=True)
@@ -115,10 +122,8 @@ class Room(Views):
 def generate(params: RoomParams) -> Room:
     """Build and photograph a room; the same parameters give the same arrays.
 
-    Raises InputError when a number is out of range, or when open3d cannot be loaded.
+    Raises InputError when open3d cannot be loaded.
     """
-    if params.views < 2 or params.held_out < 0 or min(params.width, params.height) < 16:
-        raise InputError("A generated room needs at least 2 views, 0 held-out views and 16 x 16 pixels.")
     rng = np.random.default_rng(params.seed)
     things, stations = _furnished(params, rng)
     gaze = GAZE if params.composite else _GAZE

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
+from ss_flow.errors import InputError
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import DepthMap, Float32, Frame
 from ss_flow.tasks.geometry.cameras import Camera
@@ -65,6 +66,12 @@ class AgreementParams:
     """How far a pixel may come back from where it started, in pixels of the depth map."""
     max_relative: Positive = 0.02
     """How far the depths may be apart, as a share of the depth."""
+
+    def __post_init__(self) -> None:
+        if self.min_views > self.neighbors:
+            raise InputError(
+                f"min_views is {self.min_views} but only {self.neighbors} neighbors are asked; it must be at most that."
+            )
 
 
 @task(name="capture.sweep")

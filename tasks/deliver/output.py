@@ -56,6 +56,15 @@ def check_file(file: Path, instead: str) -> None:
     _check_nearest(file, file.absolute().parents, instead)
 
 
+def check_named(file: Path, option: str) -> None:
+    """Raises InputError unless the file that an option names can be written here, which no file of a result can."""
+    instead = f"name another file with {option}"
+    folders = Path(os.path.realpath(file)).parents[:2]  # of a file in instances/, the second
+    if any(os.path.isfile(folder / RUN_FILE) for folder in folders):
+        raise InputError(f"{file} cannot be written: its folder is that of a result; {instead}.")
+    check_file(file, instead)
+
+
 def _check_nearest(what: Path, places: Iterable[Path], instead: str = "name another folder with --out") -> None:
     """Check the first of these places that is there."""
     place = next(p for p in places if p.exists())

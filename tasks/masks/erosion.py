@@ -72,7 +72,7 @@ def erode(mask: Bool, params: ErosionParams) -> Bool:
     height, width = mask.shape
     scale = float(np.hypot(height, width)) / params.diagonal if params.diagonal else 1.0
     large = area >= params.large_area * mask.size
-    radius = round((params.radius_large if large else params.radius) * scale)
+    radius = round(min((params.radius_large if large else params.radius) * scale, max(mask.shape)))  # more is the same
     x0, y0, x1, y1 = bounds(mask)
     box = slice(max(y0 - radius, 0), y1 + radius), slice(max(x0 - radius, 0), x1 + radius)
     crop = mask[box].astype(np.uint8)

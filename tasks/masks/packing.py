@@ -21,4 +21,5 @@ def grown(mask: Bool, pixels: int) -> Bool:
     """A mask [H, W] with all within so many pixels of it, diagonals included."""
     import cv2
 
+    pixels = min(pixels, max(mask.shape))  # more reach no farther
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0

@@ -23,6 +23,11 @@ _NOT = re.compile(r"(?<![\w-])(?:but\s+)?not(?![\w-])", re.IGNORECASE)
 """The word by itself; in "forget-me-not" it is none."""
 
 
+def _check_prompt(prompt: str) -> None:
+    if "{text}" not in prompt:
+        raise InputError(f"The prompt {prompt!r} has no {{text}} in it; one is 'an image of a {{text}}'.")
+
+
 @dataclass(frozen=True)
 class QueryParams:
     """Which instances a text means."""
@@ -42,6 +47,9 @@ class QueryParams:
     prompt: str = "{text}"
     """What the encoder reads, with the text in the place of {text}; "an image of a {text}" in the code of the paper's
     authors."""
+
+    def __post_init__(self) -> None:
+        _check_prompt(self.prompt)
 
 
 @dataclass(frozen=True)
@@ -162,8 +170,7 @@ def similarity(
     """
     model = encoder_of(encoder)
     wanted, unwanted = terms(text)
-    if "{text}" not in prompt:
-        raise InputError(f"The prompt {prompt!r} has no {{text}} in it; one is 'an image of a {{text}}'.")
+    _check_prompt(prompt)
     foreign = sorted({d.encoder for d in descriptors} - {model.name})
     if foreign:
         raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_noise, sum_by_voxel
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, pixels_under
-from ss_flow.tasks.ranges import Count, NonNegative, Positive
+from ss_flow.tasks.ranges import Count, NonNegative, Positive, Range
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class DenseParams:
     """Upper limit of the side of a sampling cube, in scene units (metres where the scale is known)."""
     voxel_pixels: Positive = 2.0
     """The cube's side in median pixel footprints, where that is finer than `voxel`."""
-    max_points: Count = 400_000
+    max_points: Annotated[int, Range(100, float("inf"))] = 400_000
     """Cubes grow until no more points than this remain."""
     tolerance: Positive = 0.02
     """How far two views' depths may differ at one point, in scene units."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -20,14 +20,14 @@ from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, PromptedImage, Sam
 from ss_flow.tasks.packed import Masks
-from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
+from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Range
 
 
 @dataclass(frozen=True)
 class SegmentParams:
     """How masks are prompted, filtered and merged; tuples have one value for each grid."""
 
-    grids: tuple[Count, ...] = (1, 4, 8, 16)
+    grids: tuple[Annotated[int, Range(1, 1024)], ...] = (1, 4, 8, 16)
     """Prompt points a side of each grid, coarse to fine (row 2)."""
     adaptive: bool = True
     """Whether the finest grid leaves out the points where the coarser ones agree."""

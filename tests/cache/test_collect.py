@@ -175,26 +175,30 @@ def test_leftovers_are_swept_by_age(store):
     used, unused = act(store, "used", 1, code="aa" * 32), "bb" * 32
     for code in ("aa" * 32, unused):
         store.put_part(code, {"f": code})
-    place = store.checkpoint("gone").parent
+    gone, claimed, half = digest("gone"), digest("claimed"), "cd" * 16
+    place = store.checkpoint(gone).parent
     place.mkdir()
-    names = [place / "gone.npz", place / "gone.partial", place / "claimed.npz", store.root / ".files.json.1"]
-    names += [store.root / "roots" / "runs" / ".run.json.1", store.root / "tmp" / "half"]
-    for name in names:
+    names = [place / f"{gone}.npz", place / f"{gone}.partial", place / f"{claimed}.npz"]
+    names += [store.root / f".files.json.{half}", store.root / "roots" / "runs" / f".run.json.{half}"]
+    names += [store.root / "tmp" / half]
+    theirs = [store.root / ".profile", place / "epoch-3.npz"]
+    for name in names + theirs:
         name.write_text("x")
     age_all(store.root)
-    fresh = place / "fresh.npz"
+    fresh = store.checkpoint(digest("fresh"))
     fresh.write_text("x")
     claims = store.open_claims()
-    claims.take("claimed")
+    claims.take(claimed)
     done = collect(store, held(used))
     assert "parts of keys" not in done.others, "a run that is alive may be about to use one"
-    assert {name for name in names if name.exists()} == {place / "claimed.npz"}
+    assert {name for name in names if name.exists()} == {place / f"{claimed}.npz"}
     assert done.others["checkpoints"].count == 2 and done.others["temporary files"].count == 3
     claims.release_all()
     done = collect(store, held(used))
     assert [p.stem for p in (store.root / "parts").iterdir()] == ["aa" * 32]
     assert done.others["parts of keys"].count == 1
-    assert [p.name for p in place.iterdir()] == ["fresh.npz"]
+    assert set(place.iterdir()) == {fresh, theirs[1]}
+    assert all(name.exists() for name in theirs), "the folder was someone's before it was a store"
 
 
 def test_a_list_of_inputs_stays_as_long_as_a_record_names_it(store):

@@ -112,6 +112,25 @@ def test_an_unknown_object_is_gone(store):
         store.get("00" * 32)
 
 
+@pytest.mark.parametrize("name", ["", ".", "..", "ab", "../../elsewhere", "AB" * 32])
+def test_what_is_no_digest_is_not_in_the_store_and_costs_nothing(store, name):
+    output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    assert name not in store
+    with pytest.raises(Gone, match="not in the store"):
+        store.get(name)
+    with pytest.raises(ValueError, match="no digest"):
+        store.discard(name)
+    assert output in store
+
+
+def test_what_others_put_among_the_objects_is_none_and_stays(store):
+    output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    stranger = store.object_path(output).with_name("notes")
+    stranger.mkdir()
+    assert [entry.name for entry in store.objects()] == [output]
+    assert not verify(store).damaged and stranger.is_dir()
+
+
 def test_an_object_of_a_foreign_type_is_refused():
     with pytest.raises(ValueError, match="foreign"):
         codec.type_named("subprocess:Popen")
@@ -139,10 +158,16 @@ def test_large_arrays_are_chunked_and_gaussians_keep_their_ids(store):
 
 
 def test_what_a_killed_writer_left_is_swept_by_age(store):
-    (store.root / "tmp" / "old").mkdir()
+    mine = store.root / "tmp" / "thesis.txt"
+    with store.temporary() as place:
+        left = place
+    for path in (left, mine):
+        path.write_text("x")
     assert store.sweep_temporaries() == 0
-    os.utime(store.root / "tmp" / "old", (0, time.time() - 2 * GRACE_SECONDS))
+    for path in (left, mine):
+        os.utime(path, (0, time.time() - 2 * GRACE_SECONDS))
     assert store.sweep_temporaries() == 1
+    assert mine.exists() and not left.exists()
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -271,6 +296,19 @@ def test_an_object_that_cannot_be_read_now_stays_and_the_store_says_why_in_one_s
                 with pytest.raises(StoreFailure, match=os.strerror(number)):
                     ask(output)
     assert Store(store.root).get(output).ids.trace() == 3
+
+
+def test_files_that_lie_about_in_a_store_are_no_hindrance(store):
+    output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    for folder in ("objects", "actions"):
+        (store.root / folder / ".DS_Store").write_text("x")
+    assert [entry.name for entry in store.objects()] == [output]
+    assert list(store.actions()) == [] and not verify(store).damaged
+
+
+def test_a_store_may_be_named_by_a_text(tmp_path):
+    output = Store(str(tmp_path / "store")).put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    assert output in Store(tmp_path / "store")
 
 
 def test_a_store_that_was_named_by_a_relative_path_stays_where_it_is(tmp_path, monkeypatch):

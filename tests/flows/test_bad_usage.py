@@ -510,3 +510,10 @@ def test_an_interrupt_before_the_command_is_known_ends_as_any_other():
     )
     called = run_entry(["doctor"], before)
     assert (called.returncode, called.stdout) == (130, "") and called.stderr.startswith("ss-flow: interrupted")
+
+
+def test_a_sweep_of_more_rows_than_anybody_waits_for_is_refused(tmp_path):
+    values = ["--set", "tau_label=0.5:0.9:200", "--set", "tau_depth=0.1:0.5:100"]
+    assert_refused(
+        ss_flow("sweep", tmp_path, *values), "these values have 20,000 combinations; a sweep may have at most"
+    )

@@ -104,6 +104,14 @@ def test_wrong_options_are_refused_before_a_room_is_photographed(wrong, says, tm
     assert not (tmp_path / "demo").exists() and not list(tmp_path.glob("store/actions/*/*"))
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "says"), [("--views", 0, "at least 2 views"), ("--objects", 1000, "holds 1")]
+)
+def test_a_dry_run_of_the_demo_refuses_a_room_that_cannot_be(option, value, says, tmp_path):
+    called = ss_flow("demo", "--dry-run", option, value, "--out", tmp_path / "a", "--cache", tmp_path / "store")
+    assert called.code == 2 and says in called.err
+
+
 def test_a_dry_run_of_the_demo_writes_nothing(tmp_path):
     room = ["--objects", "1", "--views", "3", "--masks", "truth", "--cache", tmp_path / "store"]
     dry = ["--dry-run", "--out", tmp_path / "a", *room]

@@ -189,6 +189,8 @@ WRONG = [
     ("--radius", "1"),
     ("--compat",),
     ("--protocol", "points", "--radius", "-1"),
+    ("--protocol", "points", "--radius", "nan"),
+    ("--protocol", "points", "--radius", "inf"),
     ("--protocol", "objects", "--truth", "."),
     ("--protocol", "points", "--texts", "x.json"),
     ("--protocol", "lerf-2d", "--compat"),

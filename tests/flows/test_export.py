@@ -210,6 +210,16 @@ def test_bad_usage_gets_one_sentence(tiny, tmp_path, more, said):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("format", "name"), [("ply", "scene.ply"), ("ply", "instances/0001.ply"), ("coco", "run.json"), ("ply", "new.ply")]
+)
+def test_the_files_of_a_result_are_never_written_over(tiny, format, name):
+    before = {path: path.stat().st_mtime_ns for path in tiny.out.rglob("*")}
+    answer = export(tiny, "--format", format, "--out", tiny.out / name)
+    assert answer.code == 2 and "its folder is that of a result; name another file with --out." in answer.err
+    assert {path: path.stat().st_mtime_ns for path in tiny.out.rglob("*")} == before
+
+
 def test_a_folder_of_something_else_stays_as_it_is(tiny, tmp_path):
     (tmp_path / "photo.jpg").write_bytes(b"x")
     answer = export(tiny, "--format", "mesh-ply", "--out", tmp_path)

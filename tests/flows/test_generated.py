@@ -167,18 +167,11 @@ def test_volumes_of_simple_shapes_are_those_of_the_textbook() -> None:
 
 
 @pytest.mark.parametrize(
-    "params",
-    [
-        RoomParams(objects=0),
-        RoomParams(objects=MAX_OBJECTS + 1),
-        RoomParams(views=1),
-        RoomParams(held_out=-1),
-        RoomParams(width=8),
-    ],
+    "values", [{"objects": 0}, {"objects": MAX_OBJECTS + 1}, {"views": 1}, {"held_out": -1}, {"width": 8}]
 )
-def test_impossible_rooms_are_refused(params: RoomParams) -> None:
+def test_impossible_rooms_are_refused(values: dict[str, int]) -> None:
     with pytest.raises(InputError, match="generated room"):
-        generate(params)
+        RoomParams(**values)  # type: ignore[arg-type]
 
 
 def test_a_written_scene_reads_back_as_the_room(room: Room, tmp_path: Path) -> None:

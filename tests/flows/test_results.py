@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
-from ss_flow.flows.results import FinishedRun, Results
+from ss_flow.flows.results import FinishedRun, Results, read_run
+
+
+@pytest.mark.parametrize("results", [{"describe": [""]}, {"describe": ""}, {"describe": None}, ["ab" * 32]])
+def test_a_run_json_whose_results_are_no_digests_is_damaged(tmp_path, results):
+    document = {"store": str(tmp_path), "scene": "", "params": {}, "results": results}
+    (tmp_path / "run.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"run\.json is damaged: its results are no digests"):
+        read_run(tmp_path)
 
 
 def run_of(names, tmp_path):

@@ -5,6 +5,7 @@ import typing
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
 import pytest
 
 from ss_flow.errors import InputError
@@ -136,6 +137,10 @@ def parts(kind):
         ("split.rgbd.crease=200", "greater than 0 and at most 180"),
         ("capture.sfm.matching=all", "it takes 'auto' or 'exhaustive' or 'sequential'"),
         ("capture.ingest.jpeg_quality=101", "between 0 and 100"),
+        ("capture.agreement.min_views=9", "only 8 neighbors are asked"),
+        ("split.segment.grids=1,4,8,100000", "between 1 and 1024"),
+        ("split.dense.max_points=1", "at least 100"),
+        ("semantics.query.prompt=an image", r"has no \{text\} in it"),
         ("capture.sweep.planes=2", "at least 3"),
         ("splat.plan.bbox_quantile=0.5", "at least 0 and less than 0.5"),
         ("splat.reconstruct.objective.background=white", "it takes 'random' or 'black'"),
@@ -144,6 +149,32 @@ def parts(kind):
 def test_a_value_that_a_step_cannot_take_is_refused_before_any_work(text, sentence):
     with pytest.raises(InputError, match=sentence):
         settings.apply(Params(), [text])
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"inner": {"share": "0.5"}}, "share cannot be '0.5'; it takes a number"),
+        ({"inner": {"share": True}}, "share cannot be True; it takes a number"),
+        ({"inner": {"limit": float("nan")}}, "limit cannot be nan; it takes a number"),
+        ({"inner": {"grids": [1, 2.5]}}, "grids cannot be 2.5; it takes a whole number"),
+        ({"inner": {"grids": [True]}}, "grids cannot be True; it takes a whole number"),
+        ({"inner": {"grids": 3}}, "grids cannot be 3; it takes a whole number, or several"),
+        ({"inner": {"on": 1}}, "on cannot be 1; it takes true or false"),
+        ({"inner": {"name": None}}, "name cannot be None; it takes a text"),
+        ({"inner": {"rule": 1}}, "rule cannot be 1; it takes 'child' or 'union'"),
+        ({"iner": {"share": 0.5}}, "the group of parameters 'iner' is unknown; there are inner, other"),
+        ({"inner": {"share": {"x": 1}}}, "the group of parameters 'share' is unknown; there are none"),
+    ],
+)
+def test_a_table_with_a_value_of_another_type_is_refused_in_one_sentence(table, sentence):
+    with pytest.raises(InputError, match=sentence):
+        settings.overlaid(Group(), table)
+
+
+def test_a_table_takes_numbers_of_numpy_and_whole_ones_for_numbers():
+    changed = settings.overlaid(Inner(), {"share": 1, "grids": [np.int64(2)], "limit": np.float32(0.5)})
+    assert (changed.share, changed.grids, changed.limit) == (1, (2,), 0.5)
 
 
 def test_an_unknown_preset_is_refused_with_the_known_ones():

@@ -20,6 +20,21 @@ def test_without_the_extra_one_sentence_says_which_to_install(tiny, monkeypatch)
     assert called.code == 2 and "pip install 'ss-flow[view]'" in called.err and called.err.count("\n") == 1
 
 
+@pytest.mark.parametrize("option", ["--beside", "--script", "--correct"])
+@pytest.mark.parametrize("form", ["--html", "--rerun"])
+def test_what_only_the_viewer_takes_is_refused_for_a_file(tiny, tmp_path, form, option):
+    called = ss_flow("view", tiny.out, form, tmp_path / "a", option, tiny.out)
+    assert called.code == 2 and option in called.err and "are for the viewer, not for --html" in called.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_rerun_no_page_is_written_either(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr("ss_flow.flows.view.rerun_file.find_spec", lambda name: None)
+    called = ss_flow("view", tiny.out, "--html", tmp_path / "a.html", "--rerun", tmp_path / "a.rrd")
+    assert called.code == 2 and "pip install 'ss-flow[rerun]'" in called.err
+    assert not list(tmp_path.iterdir())
+
+
 def started(*arguments: object) -> tuple[subprocess.Popen[str], str, str]:
     """The command in a process of its own, and the two lines that it prints: the address, and where edits go."""
     code = "from ss_flow.flows.cli.main import entry; entry()"

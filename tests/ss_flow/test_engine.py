@@ -129,7 +129,11 @@ def test_until_runs_only_what_the_named_output_needs(store):
 
 def test_a_dry_run_names_what_would_run_and_computes_nothing(store):
     run(store, toy.flow)
+    half = store.root / "tmp" / ("ab" * 16)
+    half.write_text("x")
+    os.utime(half, (0, 0))
     report = run(store, lambda: toy.flow(limit=5.0), dry=True)
+    assert half.exists()
     would = [n for n in report.nodes if n["event"] == "would run"]
     assert {n["label"] for n in would} == {f"ss_flow_toy.clip[n{i}]" for i in range(3)}
     assert would[0]["why"] == "parameter limit 100.0 -> 5.0"
@@ -621,6 +625,14 @@ def test_an_unknown_executor_is_refused_in_one_sentence(store):
 
     with pytest.raises(InputError, match="threads, processes"):
         run(store, toy.flow, executor="mesos")
+
+
+@pytest.mark.parametrize("name", ["jobs", "memory_mb", "gpus"])
+def test_a_negative_number_is_refused_in_one_sentence(store, name):
+    from ss_flow.errors import InputError
+
+    with pytest.raises(InputError, match=f"{name} is -1; it must be 0 or more"):
+        run(store, toy.flow, **{name: -1})
 
 
 def test_an_input_that_is_no_node_is_refused():

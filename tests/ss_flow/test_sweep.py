@@ -49,6 +49,7 @@ def test_values_that_hold_commas_are_listed_with_another_separator():
         ("0:1:1", "at least 2 values"),
         ("0:1:-3", "at least 2 values"),
         ("0:inf:3", "two finite ends"),
+        ("0:1:99999999", "at most 10,000 values"),
         ("0:1:3log", "must be above 0"),
         ("-1:1:3log", "must be above 0"),
     ],

@@ -34,6 +34,11 @@ def agreed_view(scene, maps, view, **params):
     return agree(around(maps, view), around(cameras, view), params=AgreementParams(**params))
 
 
+def test_more_agreement_than_views_that_are_asked_is_refused():
+    with pytest.raises(InputError, match="min_views is 9 but only 8 neighbors are asked"):
+        AgreementParams(min_views=9)
+
+
 def test_swept_depth_is_right_within_a_percent_without_knowing_its_range(scene, swept):
     frames, _, depth = scene
     for k in range(len(EYES)):

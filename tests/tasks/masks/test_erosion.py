@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.tasks.masks.erosion import ErosionParams, erode, interiors
+from ss_flow.tasks.masks.packing import grown
 
 
 def square(size, low, high):
@@ -35,6 +36,21 @@ def test_the_radius_shrinks_until_enough_of_a_small_mask_survives(side, left):
     # Side 8: radius 1 leaves 36 >= 30 pixels; side 10: radius 2 leaves 36; side 5: even radius 1 leaves only 9.
     mask = square(400, 100, 100 + side)
     assert erode(mask, ErosionParams(diagonal=0)).sum() == left**2
+
+
+@pytest.mark.parametrize("params", [{"radius": 1e9, "radius_large": 1e9}, {"diagonal": 1e-9}, {"diagonal": 5e-324}])
+def test_a_radius_beyond_the_picture_is_as_good_as_its_longer_side(params):
+    most = ErosionParams(radius=60, radius_large=60, diagonal=0)
+    for mask in (square(60, 5, 55), np.ones((60, 60), bool)):
+        assert (erode(mask, ErosionParams(**params)) == erode(mask, most)).all()
+
+
+@pytest.mark.parametrize("pixels", [1, 9, 20, 10**9])
+def test_a_mask_grows_by_so_many_pixels_and_no_farther_than_the_picture(pixels):
+    mask = np.zeros((12, 20), bool)
+    mask[3, 0] = True
+    rows, columns = np.indices(mask.shape)
+    assert (grown(mask, pixels) == (np.maximum(abs(rows - 3), columns) <= pixels)).all()
 
 
 @settings(deadline=None, max_examples=40)

@@ -139,7 +139,9 @@ def test_without_the_test_of_relevancy_missing_descriptors_and_other_colours_sti
 
 def test_a_prompt_without_a_place_for_the_text_is_refused():
     with pytest.raises(InputError, match=r"has no \{text\} in it"):
-        query(ROOM, text="red", params=QueryParams(prompt="an image"))
+        similarity(ROOM, text="red", prompt="an image")
+    with pytest.raises(InputError, match=r"has no \{text\} in it"):
+        QueryParams(prompt="an image")
 
 
 def test_the_prompt_wraps_the_text(monkeypatch):
