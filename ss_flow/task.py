@@ -18,10 +18,14 @@ from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 from ss_flow.cache.files import stamp
+from ss_flow.errors import InputError
 from ss_flow.graph import current_flow
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+TRIES = 3
+"""How often a file is read that changes meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,19 @@ class FileRef:
     def __post_init__(self) -> None:
         with contextlib.suppress(OSError):
             object.__setattr__(self, "stamp", stamp(self.path))
+
+    @classmethod
+    def of(cls, path: Path, digest_file: Callable[[Path], str]) -> FileRef:
+        """A file as it is now. digest_file: gives the blake3 digest of its content, which may take a while.
+
+        Raises OSError when it cannot be read, InputError when it changes again and again while it is.
+        """
+        for _ in range(TRIES):
+            before = stamp(path)
+            ref = cls(path, digest_file(path))
+            if ref.stamp == before:
+                return ref
+        raise InputError(f"{path} changes while it is read; run again when it is complete.")
 
     def has_changed(self) -> bool:
         """Whether the file holds anything else than when this was made; it is read only where its stamp differs."""
