@@ -7,7 +7,6 @@ hashed into its key. It reads nothing else. Called in a flow, a task returns a `
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -51,8 +50,7 @@ class FileRef:
     """Size, time of change and inode when this was made; () when there was no such file."""
 
     def __post_init__(self) -> None:
-        with contextlib.suppress(OSError):
-            object.__setattr__(self, "stamp", stamp(self.path))
+        object.__setattr__(self, "stamp", self.stamp_now())
 
     @classmethod
     def of(cls, path: Path, digest_file: Callable[[Path], str]) -> FileRef:
@@ -67,11 +65,18 @@ class FileRef:
                 return ref
         raise InputError(f"{path} changes while it is read; run again when it is complete.")
 
+    def stamp_now(self) -> tuple[int, ...]:
+        """Size, time of change and inode of the file as it is now; () when there is no such file."""
+        try:
+            return stamp(self.path)
+        except OSError:
+            return ()
+
     def has_changed(self) -> bool:
         """Whether the file holds anything else than when this was made; it is read only where its stamp differs."""
+        now = self.stamp_now()
         try:
-            now = stamp(self.path)
-            return now != self.stamp and _digest_of(self.path, now) != self.digest
+            return not now or (now != self.stamp and _digest_of(self.path, now) != self.digest)
         except OSError:
             return True
 

@@ -208,6 +208,29 @@ def test_an_input_file_that_changes_after_its_key_was_made_fails_its_step_and_le
     assert again.nodes[-1]["event"] == "finished" and float(store.get(again.values["x"]).value[0]) == 6.0
 
 
+def test_a_file_that_is_another_one_only_while_it_is_read_fails_its_step(store, tmp_path, monkeypatch):
+    file = tmp_path / "factor.txt"
+    file.write_text("2.0")
+    read = Path.read_text
+
+    def exchanged(path, *args, **options):
+        if path != file:
+            return read(path, *args, **options)
+        file.write_text("5.00")
+        content = read(file)
+        file.write_text("2.0")
+        os.utime(file, (1, 1))
+        return content
+
+    monkeypatch.setattr(Path, "read_text", exchanged)
+
+    def flow():
+        return {"x": toy.times_file(toy.source(values=(3.0,))[0], files=(FileRef(file, digest_file(file)),))}
+
+    failure = run_flow(flow, store, scene="toy").values["x"]
+    assert "factor.txt, which has changed since the run started" in str(failure.error)
+
+
 def written_meanwhile(file, contents, digests=digest_file):
     """Digests of a file into which someone else writes each of these contents just after it was read."""
     left = iter(contents)
