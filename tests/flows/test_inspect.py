@@ -62,7 +62,8 @@ def test_why_looks_further_back_where_the_latest_run_is_of_something_else(warm):
     header = run.header | {"scene": "/edited", "started": run.header["started"] + 60}
     (later / "run.json").write_text(json.dumps(header))
     event = {"event": "finished", "label": "edit.begin", "step": "edit.begin", "key": "k", "outputs": [], "inputs": {}}
-    (later / "events.jsonl").write_text(json.dumps(event | {"why": "never computed for this scene", "seconds": 0}))
+    event |= {"time": 0.0, "item": "", "why": "never computed for this scene", "seconds": 0}
+    (later / "events.jsonl").write_text(json.dumps(event))
     assert ss_flow("why", "edit.begin", "--cache", warm.store).out == "edit.begin: never computed for this scene\n"
     told = ss_flow("why", "propagate", "--cache", warm.store).out.splitlines()
     assert told[0].startswith(f"the latest run has no such step; in that of {warm.scene}, started ")
