@@ -14,7 +14,7 @@ import pytest
 import ss_flow_toy as toy
 from aged_store import age_all
 
-from ss_flow import engine, keys
+from ss_flow import engine, keys, scheduler
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
@@ -364,6 +364,17 @@ def test_why_knows_no_items_when_the_store_has_lost_the_list(store):
     for part in store.parts():
         store.drop_part(part.name)
     assert why_total(run(store, lambda: squares_of(1.0, 3.0))) == "input xs changed"
+
+
+@pytest.mark.parametrize("harm", [Path.unlink, lambda part: part.write_text('{"toy.other": "00"}')])
+def test_why_names_no_definition_when_the_store_has_lost_which_there_were(store, monkeypatch, harm):
+    run(store, toy.flow)
+    for part in (store.root / "parts").iterdir():
+        harm(part)
+    edited = Closure({"toy.helper": "11"}, frozenset(), {})
+    monkeypatch.setattr(scheduler, "kept_closure", lambda function, folder: edited)
+    would = [node["why"] for node in run(store, toy.flow, dry=True).nodes if node["event"] == "would run"]
+    assert set(would) == {"its code changed; which part of it is no longer known"}
 
 
 def test_a_record_does_not_grow_with_the_lists_that_go_in_and_a_list_is_kept_once(store):
