@@ -129,13 +129,19 @@ def serve(descriptor: int) -> None:
         invocation = inbox.get()
         try:
             reply: tuple[str, Any] = ("finished", execute_here(invocation, listener))
-        except Exception as error:
-            reply = ("raised", _portable(error))
+        except BaseException as error:
+            reply = ("raised", portable(error))
         connection.send(reply)
 
 
-def _portable(error: Exception) -> Exception:
-    """An exception that arrives as it is; what cannot be pickled, or not be made again from that, becomes its text."""
+def portable(error: BaseException) -> Exception:
+    """What a task raised, as an exception that arrives as it is.
+
+    What would end whoever raises it again (SystemExit, say), what cannot be pickled, and what cannot be made again from
+    that becomes its text.
+    """
+    if not isinstance(error, Exception):
+        return RuntimeError(f"{type(error).__name__}: {error}")
     try:
         pickle.loads(pickle.dumps(error))
     except Exception as fault:
