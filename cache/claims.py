@@ -106,8 +106,9 @@ class Claims:
         """Give a claim back. Raises StoreFailure."""
         with self._lock:
             self._held.discard(key)
-        if (seen := self._ours(key)) is not None:
-            self._place.remove(key, seen)
+        for _ in range(3):  # the heartbeat may touch it once more between the look and the removal
+            if (seen := self._ours(key)) is None or self._place.remove(key, seen):
+                return
 
     def release_all(self) -> None:
         """Give every claim back, and stop the heartbeat."""

@@ -57,8 +57,8 @@ UNFIT = (*NOT_THERE, KeyError, TypeError, AttributeError, RecursionError, Overfl
 def write(value: Any, folder: Path) -> None:
     """Write a dataclass instance as a Zarr group at `folder`, which must not exist.
 
-    Raises TypeError for a value that is not a frozen dataclass, for a field that neither Zarr nor JSON can hold, and
-    for one that could not be given back to the type.
+    Raises TypeError for a value that is not a frozen dataclass, for a field that neither Zarr nor JSON can hold, for
+    one that could not be given back to the type, and for more plain data than `read` takes.
     """
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         raise TypeError(f"a task returned {type(value).__name__}; only dataclasses of arrays are stored")
@@ -78,14 +78,19 @@ def write(value: Any, folder: Path) -> None:
         else:
             attributes[item.name] = _plain(content, f"{kind.__name__}.{item.name}")
     header = {"format": FORMAT, "type": f"{kind.__module__}:{kind.__qualname__}", "values": attributes}
+    group = json.dumps({"zarr_format": 3, "node_type": "group", "attributes": header})
+    if len(group) > MOST_HEADER_BYTES:
+        raise TypeError(
+            f"{kind.__name__} holds {len(group)} bytes of plain data, where {MOST_HEADER_BYTES} are the most; make the "
+            "large field an array"
+        )
     folder.mkdir()
     for name, array in arrays.items():
         if array.nbytes <= PLAIN_BYTES:
             _write_plain(array, folder / name)
         else:
             _write_zarr(array, folder / name)
-    group = {"zarr_format": 3, "node_type": "group", "attributes": header}
-    (folder / "zarr.json").write_text(json.dumps(group))
+    (folder / "zarr.json").write_text(group)
 
 
 def _write_plain(array: np.ndarray, folder: Path) -> None:

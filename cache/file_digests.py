@@ -40,8 +40,9 @@ class FileDigests:
         if known is not None and known[:3] == now and not self._verify:
             return str(known[3])
         content = digest_file(place)
-        self._known[place] = [*now, content]
-        self._changed = True
+        if [*stamp(place)] == now:  # else it is what a file held that was being written
+            self._known[place] = [*now, content]
+            self._changed = True
         return content
 
     def once(self, check: Callable[[T], None], subject: T, contents: Sequence[str]) -> None:

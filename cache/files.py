@@ -23,13 +23,17 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def rename_folder(source: Path, target: Path) -> None:
-    """Give a complete folder its name, unless another writer was first."""
+    """Give a complete folder its name, unless another writer was first. What is there and is no folder makes way."""
     try:
         source.rename(target)
     except OSError:
         # A folder cannot be renamed onto one that is not empty: another writer was first, with the same bytes.
-        if not target.is_dir():
+        if target.is_dir():
+            return
+        if not os.path.lexists(target):
             raise
+        remove(target)  # a foreign hand's: a file, or a link that leads nowhere
+        source.rename(target)
 
 
 def remove(path: Path) -> None:

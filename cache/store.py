@@ -160,8 +160,8 @@ class Store:
             if target.is_dir() and not codec.is_current(target):
                 self._take_out(target, math.inf)
             try:
-                os.utime(target)  # used again: it must not be collected before its action is recorded
-            except FileNotFoundError:
+                os.utime(f"{target}/")  # used again: it must not be collected before its action is recorded
+            except (FileNotFoundError, NotADirectoryError):
                 with self.temporary() as place:
                     codec.write(value, place)
                     target.parent.mkdir(exist_ok=True)
@@ -189,10 +189,14 @@ class Store:
 
     def read(self, object_digest: str) -> Any:
         """The same, from the disk."""
+        folder = self.object_path(object_digest)
         if object_digest not in self:
+            if os.path.lexists(folder) and not folder.is_dir():
+                self.discard(object_digest)
+                raise Gone(object_digest, "was damaged (it is no folder)")
             raise Gone(object_digest, "is not in the store")
         try:
-            return self._verified(self.object_path(object_digest), object_digest)
+            return self._verified(folder, object_digest)
         except ValueError as error:
             self.discard(object_digest)
             raise Gone(object_digest, f"was damaged ({error})") from None
@@ -257,7 +261,8 @@ class Store:
         for folder in entries(self._objects):
             for entry in filter(lambda entry: DIGEST.fullmatch(entry.name), entries(folder.path)):
                 with contextlib.suppress(FileNotFoundError):
-                    yield Entry(entry.name, entry.stat().st_mtime, folder_bytes(Path(entry.path)))
+                    status = entry.stat(follow_symlinks=entry.is_dir())  # a link may lead nowhere
+                    yield Entry(entry.name, status.st_mtime, folder_bytes(Path(entry.path)))
 
     def actions(self) -> Iterator[Entry]:
         """Every action."""

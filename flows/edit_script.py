@@ -234,7 +234,7 @@ def _replace(call: _Call) -> Step:
         raise call.fault("run", run, error) from None
     call.objects.remove((instance,))
     new_id = call.objects.put_in(entry, parts, call.new_name(entry["name"]))
-    ref = FileRef(file.absolute(), digest_file(file))
+    ref = FileRef.of(file.absolute(), digest_file)
     own, theirs = call.objects.up, up_of_run(call.folder / run)
     turn = smallest_turn(theirs, own) if own and theirs else _NO_TURN
 

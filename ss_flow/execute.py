@@ -22,7 +22,7 @@ from ss_flow.errors import InputError
 from ss_flow.keys import Components, Value
 from ss_flow.running import Listener, Surroundings, remove_checkpoint, running
 from ss_flow.sameness import check_sameness
-from ss_flow.task import Resources, Task, files_in
+from ss_flow.task import FileRef, Resources, Task, files_in
 
 SAMPLE_SECONDS = 0.2
 
@@ -52,7 +52,8 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     """Run a call in this thread. Whatever the task raises passes through; nothing is then stored under the key.
 
     Raises Gone when an input is no longer in the store, ExecutorLost when this process would compute, or has computed,
-    something else than the key stands for; InputError when a file is no longer as its reference says.
+    something else than the key stands for; InputError when a file is not, or while the task ran was not, as its
+    reference says.
     """
     task = find_task(invocation.task)
     check = functools.partial(check_sameness, task, invocation.components, invocation.label, store.closures)
@@ -61,13 +62,15 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     checkpoint = store.checkpoint(invocation.key)
     warned: list[str] = []
     surroundings = Surroundings(listener, max(1, invocation.resources.cores), checkpoint, warned)
+    # Whether a file was another one only in between, its stamp tells, and no later look at its content.
+    stamps = {ref: ref.stamp_now() for ref in files_in(invocation.parameters)}
+    _refuse([ref for ref in stamps if ref.has_changed()], invocation.label)
     started = time.monotonic()
     with running(surroundings), _peaks.watching() as peak:
         result = task.run(arguments, invocation.parameters)
     seconds = time.monotonic() - started
     check()  # a module that the task itself loaded may have been edited since its key was made
-    if changed := [str(ref.path) for ref in files_in(invocation.parameters) if ref.has_changed()]:
-        raise InputError(f"{invocation.label} read {changed[0]}, which has changed since the run started; run again.")
+    _refuse([ref for ref, before in stamps.items() if ref.stamp_now() != before], invocation.label)
     items = result if task.returns_list else (result,)
     action = Action(
         key=invocation.key,
@@ -82,6 +85,11 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     store.record(action)
     remove_checkpoint(checkpoint)
     return action
+
+
+def _refuse(changed: Sequence[FileRef], label: str) -> None:
+    if changed:
+        raise InputError(f"{label} reads {changed[0].path}, which has changed since the run started; run again.")
 
 
 def _read(value: Value, store: Store, streamed: bool) -> Any:

@@ -18,6 +18,7 @@ SHOWN_ITEMS = 3
 def first_difference(before: Components, now: Components, items: Callable[[str], str] = lambda name: "") -> str:
     """One phrase that names the first part of a key that changed; code as a closure, digests by qualified name.
 
+    before: its code is None where only that it differs is known.
     items: says which items of an input changed (see `changed_items`), "" where it is no list. Ordered from cause to
     effect: the task's own parameters, its code, packages and machine come before its inputs, which may have changed
     only because of another step. Returns "" when nothing differs.
@@ -26,6 +27,8 @@ def first_difference(before: Components, now: Components, items: Callable[[str],
         return "the format of keys changed"
     for name in _changed(before["parameters"], now["parameters"]):
         return f"parameter {name} {_shown(before['parameters'], now['parameters'], name)}"
+    if before["code"] is None:
+        return "its code changed; which part of it is no longer known"
     for name in _changed(before["code"], now["code"]):
         word = "changed" if name in before["code"] and name in now["code"] else "is new or gone"
         return f"{_what(name)} of {name.removeprefix('ss_flow.')} {word}"

@@ -6,6 +6,7 @@ that a killed run is known up to its last step).
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import json
@@ -28,6 +29,15 @@ NAME_BYTES = 100
 """How much of a scene's name the name of a run's folder takes: file systems allow 255 bytes in all."""
 ENDS = (*DONE, "failed", "skipped", "would run")
 """Kinds of events that say what a node came to."""
+NEEDED: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("started", *ENDS), ("label", "step", "item")),
+    **dict.fromkeys(DONE, ("label", "step", "item", "key", "outputs", "inputs", "seconds")),
+    "failed": ("label", "step", "item", "key", "error"),
+    "taken": ("outputs",),
+}
+"""What an event of a kind always has."""
+ABSENT = (FileNotFoundError, IsADirectoryError)
+"""What reading a file raises that is not there, or is none."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +53,14 @@ class Run:
         return str(self.header["scene"])
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """What happened, in order; the last line of a killed run may be cut, and is then left out."""
+        """What happened, in order; a line that is cut (the last one of a killed run) or damaged is left out."""
         try:
-            with (self.folder / "events.jsonl").open(encoding="utf-8") as stream:
+            with (self.folder / "events.jsonl").open("rb") as stream:
                 for line in stream:
-                    try:
-                        yield json.loads(line)
-                    except ValueError:
-                        return
-        except FileNotFoundError:
+                    with contextlib.suppress(ValueError):
+                        if _is_whole(event := json.loads(line)):
+                            yield event
+        except ABSENT:
             return
 
     def results(self) -> dict[str, list[str]]:
@@ -83,6 +92,12 @@ class Run:
                 if producer in graph and producer != node["step"]:
                     graph.add_edge(producer, node["step"], key=name)
         return graph
+
+
+def _is_whole(event: Any) -> bool:
+    """Whether a line of a log is an event with all that its readers ask for."""
+    kind = event.get("event") if isinstance(event, dict) else None
+    return isinstance(kind, str) and {"time", *NEEDED.get(kind, ())} <= event.keys()
 
 
 def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -121,7 +136,7 @@ def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
             header = json.loads(file.read_text())
             if header["scene"] == scene or scene is None:
                 found.append((float(header["started"]), Run(file.parent, header)))
-        except (FileNotFoundError, ValueError, KeyError, TypeError):  # collected just now, or damaged
+        except (*ABSENT, ValueError, KeyError, TypeError):  # collected just now, or damaged
             continue
     yield from (run for _, run in sorted(found, key=lambda one: one[0], reverse=True))
 

@@ -15,6 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from typing import Any
 
+from ss_flow.cache.canonical import digest
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.store import Action, Store
@@ -199,7 +200,7 @@ class Scheduler:
         before = nearest(among, parts)
         closure = self._keys.recipe(node.task).closure
         code = before["code"]
-        known_code = closure if code == parts["code"] else self._store.part(code) or {}
+        known_code = closure if code == parts["code"] else self._part(code)
         items = functools.partial(self._changed_items, node, before["inputs"])
         return first_difference({**before, "code": known_code}, {**parts, "code": closure}, items)
 
@@ -207,10 +208,15 @@ class Scheduler:
         now = self._graph.values[node.inputs[name]]
         if not isinstance(now, tuple) or name not in before:
             return ""
-        then = self._store.part(before[name])
+        then = self._part(before[name])
         if not isinstance(then, list):  # it was one artifact; or what its digest stood for is no longer known
             return ""
         return changed_items(then, now, self._graph.item_names(node.inputs[name]))
+
+    def _part(self, name: str) -> Any:
+        """What a digest in a key stands for; None where the store has lost it, or holds something else by now."""
+        part = self._store.part(name)
+        return part if digest(part) == name else None
 
     def _submit(self) -> None:
         """Hand out what fits into the tokens that are left."""

@@ -7,7 +7,6 @@ hashed into its key. It reads nothing else. Called in a flow, a task returns a `
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -18,10 +17,14 @@ from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 from ss_flow.cache.files import stamp
+from ss_flow.errors import InputError
 from ss_flow.graph import current_flow
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+TRIES = 3
+"""How often a file is read that changes meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -47,14 +50,33 @@ class FileRef:
     """Size, time of change and inode when this was made; () when there was no such file."""
 
     def __post_init__(self) -> None:
-        with contextlib.suppress(OSError):
-            object.__setattr__(self, "stamp", stamp(self.path))
+        object.__setattr__(self, "stamp", self.stamp_now())
+
+    @classmethod
+    def of(cls, path: Path, digest_file: Callable[[Path], str]) -> FileRef:
+        """A file as it is now. digest_file: gives the blake3 digest of its content, which may take a while.
+
+        Raises OSError when it cannot be read, InputError when it changes again and again while it is.
+        """
+        for _ in range(TRIES):
+            before = stamp(path)
+            ref = cls(path, digest_file(path))
+            if ref.stamp == before:
+                return ref
+        raise InputError(f"{path} changes while it is read; run again when it is complete.")
+
+    def stamp_now(self) -> tuple[int, ...]:
+        """Size, time of change and inode of the file as it is now; () when there is no such file."""
+        try:
+            return stamp(self.path)
+        except OSError:
+            return ()
 
     def has_changed(self) -> bool:
         """Whether the file holds anything else than when this was made; it is read only where its stamp differs."""
+        now = self.stamp_now()
         try:
-            now = stamp(self.path)
-            return now != self.stamp and _digest_of(self.path, now) != self.digest
+            return not now or (now != self.stamp and _digest_of(self.path, now) != self.digest)
         except OSError:
             return True
 

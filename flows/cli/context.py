@@ -134,7 +134,7 @@ def choose_patches(name: str, digests: FileDigests) -> catalogue.Model | None:
 
 def references(digests: FileDigests) -> Reference:
     """References to files by absolute paths, since a worker may stand in another folder."""
-    return lambda path: FileRef(path.absolute(), digests(path))
+    return lambda path: FileRef.of(path.absolute(), digests)
 
 
 def open_run(folder: Path, options: StoreOptions, needed: Sequence[str]) -> FinishedRun:

@@ -96,7 +96,8 @@ def _state(ended: dict[str, Any] | None, events: list[dict[str, Any]]) -> str:
         return f"running, or killed; last heard of {silent:.0f} s ago"
     if ended.get("interrupted"):
         return "interrupted"
-    return f"done, {ended['failed']} failed" if ended["failed"] else "done"
+    failed = ended.get("failed")
+    return f"done, {failed} failed" if failed else "done"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.location import is_url
 from ss_flow.cache.store import Action
 from ss_flow.execute import Cancelled, Invocation, execute_here
-from ss_flow.executors.worker import Worker
+from ss_flow.executors.worker import Worker, portable
 
 PROGRESS_SECONDS = 0.25
 TOPIC = "ss-flow"
@@ -27,21 +27,13 @@ _stopped: set[str] = set()
 
 def run_call(packed: bytes, run: str, call: str) -> bytes:
     """Run a packed call. Returns its action, or what was raised, packed."""
-    outcome: tuple[Action | None, Exception | None]
     _running.add((run, call))
     try:
-        outcome = _execute(pickle.loads(packed), run), None
-    except Exception as error:
-        outcome = None, error
+        return pickle.dumps((_execute(pickle.loads(packed), run), None))
+    except BaseException as error:
+        return pickle.dumps((None, portable(error)))
     finally:
         _running.discard((run, call))
-    try:
-        reply = pickle.dumps(outcome)
-        pickle.loads(reply)
-    except Exception as fault:  # what cannot be pickled travels as its text
-        raised = outcome[1]
-        reply = pickle.dumps((None, RuntimeError(f"{type(raised).__name__}: {raised} ({fault})")))
-    return reply
 
 
 def _execute(invocation: Invocation, run: str) -> Action:

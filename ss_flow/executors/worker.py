@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, cast
@@ -49,18 +50,17 @@ class Worker:
 
     def run(self, invocation: Invocation, listener: Listener) -> Action:
         """Run a call there; what it raises is raised here. Raises WorkerDied when the process ends."""
-        try:
+        with self._reaching(invocation.label):
             self._send(invocation)
-            while True:
+        while True:
+            with self._reaching(invocation.label):
                 kind, content = self._connection.recv()
-                if kind == "progress":
-                    listener(*content)
-                elif kind == "raised":
-                    raise content
-                else:
-                    return cast(Action, content)
-        except (EOFError, BrokenPipeError, ConnectionResetError):
-            raise WorkerDied(f"the process of {invocation.label} {self._ending()}") from None
+            if kind == "progress":
+                listener(*content)
+            elif kind == "raised":
+                raise content
+            else:
+                return cast(Action, content)
 
     def cancel(self) -> None:
         """Make the call that runs stop at its next sign of progress."""
@@ -79,6 +79,14 @@ class Worker:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+    @contextlib.contextmanager
+    def _reaching(self, label: str) -> Iterator[None]:
+        """Within this, a connection that is gone becomes WorkerDied."""
+        try:
+            yield
+        except (EOFError, BrokenPipeError, ConnectionResetError):
+            raise WorkerDied(f"the process of {label} {self._ending()}") from None
 
     def _send(self, message: Any) -> None:
         with self._sending:
@@ -121,13 +129,19 @@ def serve(descriptor: int) -> None:
         invocation = inbox.get()
         try:
             reply: tuple[str, Any] = ("finished", execute_here(invocation, listener))
-        except Exception as error:
-            reply = ("raised", _portable(error))
+        except BaseException as error:
+            reply = ("raised", portable(error))
         connection.send(reply)
 
 
-def _portable(error: Exception) -> Exception:
-    """An exception that arrives as it is; what cannot be pickled, or not be made again from that, becomes its text."""
+def portable(error: BaseException) -> Exception:
+    """What a task raised, as an exception that arrives as it is.
+
+    What would end whoever raises it again (SystemExit, say), what cannot be pickled, and what cannot be made again from
+    that becomes its text.
+    """
+    if not isinstance(error, Exception):
+        return RuntimeError(f"{type(error).__name__}: {error}")
     try:
         pickle.loads(pickle.dumps(error))
     except Exception as fault:

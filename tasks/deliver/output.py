@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import re
 import shutil
+import time
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,6 +24,8 @@ from ss_flow.tasks.deliver import ply
 from ss_flow.tasks.geometry.images import encode_png
 
 RUN_FILE = "run.json"
+GRACE_SECONDS = 3600.0
+"""For so long after its last change an unfinished folder counts as being filled, where no lock tells."""
 
 
 def check_place(folder: Path, mark: str = RUN_FILE, what: str = "an earlier result") -> None:
@@ -77,28 +82,70 @@ def replacing(folder: Path) -> Iterator[Path]:
     """Yield a folder to fill, beside `folder`; when all went well it takes `folder`'s place.
 
     Of a symbolic link it is the place that it leads to: the link stays.
-    A reader sees the old content or the new. After a crash the unfinished folder, whose name begins with a dot, may
-    remain; the next run takes it away.
+
+    Notes
+    -----
+    *Readers* see the old content or the new, or for the moment between two renames none.
+
+    *Crash.* The unfinished folder, whose name begins with a dot, may remain, and the old content beside it under such a
+    name; the next call puts the old content back where there is none, and takes away the rest.
+
+    *Several at once*, on one machine, fill a folder each, which they hold locked; the last to end stays.
     """
     folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = re.compile(rf"\.{re.escape(folder.name)}\.[0-9a-f]{{8}}(\.old)?\.partial")
-    for stale in folder.parent.iterdir():
-        if unfinished.fullmatch(stale.name):
-            shutil.rmtree(stale, ignore_errors=True)
+    _tidy(folder)
     filling = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}.partial"
     filling.mkdir()
+    lock = os.open(filling, os.O_RDONLY)
     try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(lock, fcntl.LOCK_EX)
         yield filling
-        if folder.exists():
-            old = filling.with_suffix(".old.partial")
-            folder.rename(old)
+        old = filling.with_suffix(".old.partial")
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                folder.rename(old)
             filling.rename(folder)
-            shutil.rmtree(old)
-        else:
-            filling.rename(folder)
+        except BaseException:  # Ctrl-C, too
+            if old.exists() and not folder.exists():
+                old.rename(folder)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(filling, ignore_errors=True)
+        os.close(lock)
+
+
+def _tidy(folder: Path) -> None:
+    """Clear away what calls of `replacing` left that were killed."""
+    unfinished = re.compile(rf"\.{re.escape(folder.name)}\.([0-9a-f]{{8}})(\.old)?\.partial")
+    for left in list(folder.parent.iterdir()):
+        found = unfinished.fullmatch(left.name)
+        if found is None or _is_filled(folder.parent / f".{folder.name}.{found[1]}.partial"):
+            continue
+        if found[2] and not folder.exists():
+            with contextlib.suppress(OSError):  # another one has put its content there just now
+                left.rename(folder)
+        else:
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _is_filled(filling: Path) -> bool:
+    """Whether a living process fills this folder; where the file system has no locks, by age."""
+    try:
+        handle = os.open(filling, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return False
+    except BlockingIOError:
+        return True
+    except OSError:
+        return time.time() - os.fstat(handle).st_mtime < GRACE_SECONDS
+    finally:
+        os.close(handle)
 
 
 def write_scene(folder: Path, scene: Gaussians, instances: Mapping[str, Any]) -> None:

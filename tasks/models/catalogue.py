@@ -195,7 +195,7 @@ def find(
     if paths is None:
         return None
     files = tuple(
-        ModelFile(file.role, FileRef(path, digest_file(path))) for file, path in zip(entry.files, paths, strict=True)
+        ModelFile(file.role, FileRef.of(path, digest_file)) for file, path in zip(entry.files, paths, strict=True)
     )
     return Model(entry.name, entry.kind, files, entry.parameters, entry.names_inside)
 

@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from ss_flow.cache import claims as module
-from ss_flow.cache.claims import Claims
+from ss_flow.cache.claims import Claims, Folder
 from ss_flow.cache.errors import StoreFailure
 
 
@@ -24,6 +24,14 @@ def claims(store):
 
 def place(store, key="k"):
     return store.root / "claims" / key
+
+
+def test_a_claim_that_is_touched_while_it_is_released_is_released_all_the_same(store, monkeypatch):
+    claims, remove, touched = Claims(store.root), Folder.remove, iter([True])
+    monkeypatch.setattr(Folder, "remove", lambda *args: not next(touched, False) and remove(*args))
+    assert claims.take("k")
+    claims.release("k")
+    assert list((store.root / "claims").iterdir()) == []
 
 
 def test_one_of_two_gets_a_key_and_the_other_after_its_release(store, claims):

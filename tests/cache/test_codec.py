@@ -132,6 +132,15 @@ def test_an_object_that_names_a_foreign_type_is_refused(tmp_path):
         codec.read(tmp_path / "object")
 
 
+def test_more_plain_data_than_can_be_read_back_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(codec, "MOST_HEADER_BYTES", 1000)
+    codec.write(LabelMap("x" * 800, np.zeros(1)), tmp_path / "a")
+    assert codec.read(tmp_path / "a").name == "x" * 800
+    with pytest.raises(TypeError, match=r"LabelMap holds .* bytes of plain data, where 1000 are the most"):
+        codec.write(LabelMap("x" * 1000, np.zeros(1)), tmp_path / "b")
+    assert not (tmp_path / "b").exists()
+
+
 def test_what_is_not_a_dataclass_of_arrays_is_refused(tmp_path):
     @dataclass(frozen=True)
     class Holder:

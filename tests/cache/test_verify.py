@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import os
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -59,6 +63,20 @@ def test_each_damaged_thing_is_named_and_taken_out_and_only_that(filled):
     assert lost == {3, 5, 7}
     again = verify(filled)
     assert (again.damaged, again.incomplete, again.objects.count) == ((), 1, 19)
+
+
+@pytest.mark.parametrize("foreign", [Path.touch, lambda place: place.symlink_to("nowhere")], ids=["file", "link"])
+def test_what_is_no_folder_in_the_place_of_an_object_is_damaged_and_makes_way_for_the_object(filled, foreign):
+    broken, value = output_of(filled, 3), LabelMap("3", np.full((9, 9), 3, np.uint16))
+    place = filled.object_path(broken)
+    for mend in (verify, lambda store: store.put(value)):
+        shutil.rmtree(place)
+        foreign(place)
+        mended = mend(filled)
+        if mend is verify:
+            assert [(damage.kind, damage.name) for damage in mended.damaged] == [("object", broken)]
+            assert not os.path.lexists(place) and filled.put(value) == broken
+        assert Store(filled.root).get(broken).name == "3"
 
 
 def test_what_a_collector_takes_meanwhile_is_no_damage(filled, monkeypatch):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import random
 import threading
 import time
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import pytest
 import ss_flow_toy as toy
 from aged_store import age_all
 
-from ss_flow import engine, keys
+from ss_flow import engine, keys, scheduler
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
@@ -26,6 +27,7 @@ from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
 from ss_flow.task import task
+from ss_flow.telemetry import trace
 
 
 def run(store, build, **kwargs):
@@ -368,6 +370,17 @@ def test_why_knows_no_items_when_the_store_has_lost_the_list(store):
     assert why_total(run(store, lambda: squares_of(1.0, 3.0))) == "input xs changed"
 
 
+@pytest.mark.parametrize("harm", [Path.unlink, lambda part: part.write_text('{"toy.other": "00"}')])
+def test_why_names_no_definition_when_the_store_has_lost_which_there_were(store, monkeypatch, harm):
+    run(store, toy.flow)
+    for part in (store.root / "parts").iterdir():
+        harm(part)
+    edited = Closure({"toy.helper": "11"}, frozenset(), {})
+    monkeypatch.setattr(scheduler, "kept_closure", lambda function, folder: edited)
+    would = [node["why"] for node in run(store, toy.flow, dry=True).nodes if node["event"] == "would run"]
+    assert set(would) == {"its code changed; which part of it is no longer known"}
+
+
 def test_a_record_does_not_grow_with_the_lists_that_go_in_and_a_list_is_kept_once(store):
     def totals(count):
         numbers = toy.source(values=tuple(float(i) for i in range(count)))
@@ -484,6 +497,29 @@ def test_a_run_whose_record_is_damaged_is_passed_over(store, content):
     (folder / "run.json").write_text(content)
     assert run(store, toy.flow).values == first.values
     assert folder not in [one.folder for one in latest_runs(store.runs)]
+
+
+def test_a_damaged_event_log_keeps_no_later_run_from_its_work(store):
+    values = run(store, toy.flow).values
+    whole = next(latest_runs(store.runs))
+    log = whole.folder / "events.jsonl"
+    good, rng = log.read_bytes(), random.Random(0)
+    for _ in range(200):
+        damaged = bytearray(good)
+        damaged[rng.randrange(len(good))] ^= 1 << rng.randrange(8)
+        log.write_bytes(b"null\n[]\n{}\n" + damaged)
+        assert 6 <= len(whole.nodes()) <= 8 and trace(whole)
+        whole.results(), whole.taken()
+    assert run(store, toy.flow).values == values
+
+
+def test_folders_in_the_place_of_the_files_of_a_run_are_passed_over(store):
+    run(store, toy.flow)
+    made = next(latest_runs(store.runs))
+    for name in ("events.jsonl", "run.json"):
+        (made.folder / name).unlink()
+        (made.folder / name).mkdir()
+    assert made.nodes() == list(latest_runs(store.runs)) == []
 
 
 def test_a_store_that_can_only_be_read_ends_the_run_with_one_sentence(store, monkeypatch):

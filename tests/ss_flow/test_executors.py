@@ -135,6 +135,22 @@ def test_what_cannot_travel_comes_back_as_its_text(store, executor, task, raised
     assert value(store, executor.run(call(store, toy.square, 3.0)).outputs[0]) == 9.0
 
 
+@pytest.mark.parametrize("isolated", [True, False])
+def test_a_task_that_raises_what_a_lost_process_does_has_failed_of_itself(store, executor, isolated):
+    error = executor.error(replace(call(store, toy.raising, 2.0, error="EOFError"), isolate=isolated))
+    assert type(error) is EOFError and str(error) == "two is too much"
+
+
+@pytest.mark.parametrize("name", ["SystemExit", "KeyboardInterrupt", "GeneratorExit"])
+def test_a_task_that_raises_what_ends_a_program_has_failed_and_the_next_one_is_run(store, executor, name):
+    error = executor.error(call(store, toy.raising, 2.0, error=name))
+    if executor.name == "threads":
+        assert type(error).__name__ == name
+    else:
+        assert type(error) is RuntimeError and str(error) == f"{name}: two is too much"
+    assert value(store, executor.run(call(store, toy.square, 3.0)).outputs[0]) == 9.0
+
+
 def test_an_isolated_call_has_a_process_of_its_own_which_ends_with_it(store, executor):
     pids = [int(value(store, executor.run(call(store, toy.own_process, x)).outputs[0])) for x in (1.0, 2.0)]
     assert len({*pids, os.getpid()}) == 3

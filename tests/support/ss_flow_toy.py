@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import os
 import signal
 import time
@@ -272,6 +273,12 @@ class Unmade(Exception):
 def unmade(x: Number) -> Number:
     """Raises what cannot be read back."""
     raise Unmade("two is", "too much")
+
+
+@task()
+def raising(x: Number, *, error: str) -> Number:
+    """Raises a built-in exception."""
+    raise getattr(builtins, error)("two is too much")
 
 
 @task()

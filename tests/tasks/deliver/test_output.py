@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -53,9 +57,62 @@ def test_what_a_killed_run_left_is_taken_away_and_the_neighbours_are_not(tmp_pat
     assert names(tmp_path) == sorted([*others, "out[1]"])
 
 
-def test_a_relative_name_is_taken_from_where_one_is(tmp_path, monkeypatch):
-    from pathlib import Path
+def killed_in_the_middle(folder, monkeypatch, error):
+    """Replace a folder, and have this be raised between the two renames."""
+    rename = Path.rename
 
+    def interrupted(path, target):
+        rename(path, target)
+        if path == folder:
+            raise error
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rename", interrupted)
+        with replacing(folder) as filling:
+            (filling / "b").touch()
+
+
+def test_who_is_interrupted_between_the_two_renames_puts_the_old_content_back(tmp_path, monkeypatch):
+    with replacing(tmp_path / "out") as filling:
+        (filling / "a").touch()
+    with pytest.raises(KeyboardInterrupt):
+        killed_in_the_middle(tmp_path / "out", monkeypatch, KeyboardInterrupt)
+    assert names(tmp_path) == ["out"] and names(tmp_path / "out") == ["a"]
+
+
+def test_what_was_killed_between_the_two_renames_is_put_back_also_by_one_that_fails(tmp_path):
+    for left in (".out.0123abcd.partial", ".out.0123abcd.old.partial"):
+        (tmp_path / left).mkdir()
+        (tmp_path / left / left).touch()
+    with pytest.raises(OSError, match="full"), replacing(tmp_path / "out"):
+        raise OSError("disk full")
+    assert names(tmp_path) == ["out"] and names(tmp_path / "out") == [".out.0123abcd.old.partial"]
+
+
+@pytest.mark.parametrize("locks", [True, False])
+def test_what_another_one_is_filling_is_left_alone(locks, tmp_path, monkeypatch):
+    def refuse(handle, how):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    if not locks:
+        monkeypatch.setattr(fcntl, "flock", refuse)
+    with replacing(tmp_path / "out") as filling:
+        (filling / "a").touch()
+        with replacing(tmp_path / "out") as another:
+            (another / "b").touch()
+        (filling / "c").touch()
+    assert names(tmp_path) == ["out"] and names(tmp_path / "out") == ["a", "c"]
+
+
+def test_what_another_one_has_moved_away_is_left_to_it(tmp_path):
+    with replacing(tmp_path / "out") as filling:
+        filling.with_suffix(".old.partial").mkdir()
+        with replacing(tmp_path / "out"):
+            pass
+        assert filling.with_suffix(".old.partial").is_dir()
+
+
+def test_a_relative_name_is_taken_from_where_one_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with replacing(Path("out")) as filling:
         (filling / "a").touch()
