@@ -19,7 +19,7 @@ from ss_flow.tasks.deliver.export.splat import splat
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.export.usda import usda
 
-Gaussian = Literal["ply", "labelled-ply", "compressed-ply", "splat", "spz", "sog", "gltf", "usda"]
+Gaussian = Literal["ply", "labelled-ply", "compressed-ply", "splat", "spz", "sog", "gltf", "gltf-flat", "usda"]
 Surface = Literal["mesh-ply", "mesh-obj", "mesh-glb"]
 Workspace = Literal["colmap", "nerfstudio"]
 Format = Literal[Gaussian, Surface, "coco", Workspace]  # a union of them would be told of in any order
@@ -60,6 +60,7 @@ GAUSSIANS: dict[str, tuple[str, Callable[[Source], FileContent]]] = {
     "spz": (".spz", lambda source: spz(source.gaussians())),
     "sog": (".sog", lambda source: sog(source.gaussians())),
     "gltf": (".glb", lambda source: gltf(source.gaussians(), source.cameras, names=source.names)),
+    "gltf-flat": (".glb", lambda source: gltf(source.gaussians(), source.cameras, names=source.names, flat=True)),
     "usda": (".usda", lambda source: usda(source.gaussians(), source.cameras, names=source.names)),
 }
 """The formats of Gaussians: what their files end in, and the node of a file."""

@@ -26,7 +26,7 @@ from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorte
 from ss_flow.tasks.geometry.images import suffix_of
 
 MANIFEST = "export.json"
-_ADDED = {"labelled-ply": "-labelled", "mesh-glb": "-mesh"}
+_ADDED = {"labelled-ply": "-labelled", "gltf-flat": "-flat", "mesh-glb": "-mesh"}
 """What the default names of formats have before a suffix that is another's too."""
 _MOST_IN_A_NAME = 3
 """Of the chosen instances, in the default name of their file."""
@@ -50,7 +50,8 @@ class Export:
     """For meshes: "closed" closes by a guess what no view shows."""
     out: OptionalPath = None
     """The file or folder to write; by default in ss-flow-export: NAME of the result with the format's suffix, as in
-    NAME.ply; NAME-labelled.ply and NAME-mesh.glb; NAME-0004.ply with --instance 4; and NAME-FORMAT for a folder."""
+    NAME.ply; NAME-labelled.ply, NAME-flat.glb and NAME-mesh.glb; NAME-0004.ply with --instance 4; and NAME-FORMAT for
+    a folder."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""
     json: bool = False

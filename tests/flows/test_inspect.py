@@ -67,8 +67,7 @@ def test_why_looks_further_back_where_the_latest_run_is_of_something_else(warm):
     event = {"event": "finished", "label": "edit.begin", "step": "edit.begin", "key": "k", "outputs": [], "inputs": {}}
     event |= {"time": 0.0, "item": "", "why": "for a reason", "seconds": 0}
     (later / "events.jsonl").write_text(json.dumps(event))
-    assert ss_flow("why", "edit.begin", "--cache", warm.store).out == "edit.begin: for a reason
-"
+    assert ss_flow("why", "edit.begin", "--cache", warm.store).out == "edit.begin: for a reason\n"
     told = ss_flow("why", "propagate", "--cache", warm.store).out.splitlines()
     assert told[0].startswith(f"the latest run has no such step; in that of {warm.scene}, started ")
     assert told[1].startswith("split.propagate: ")

@@ -1,4 +1,4 @@
-"""glTF with `KHR_gaussian_splatting`: one mesh with all Gaussians, and the parts of files that meshes share with it."""
+"""glTF with `KHR_gaussian_splatting`: a node for each instance, or one mesh for viewers that sort mesh by mesh."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Gaussians
 from ss_flow.tasks.deliver.export.content import FileContent, base_colors, degree_of, instances_of, y_up
+from ss_flow.tasks.gaussians.initialise import select
 
 _EXTENSION = "KHR_gaussian_splatting"
 _FLOAT, _POINTS, _VERTEX_DATA = 5126, 0, 34962
@@ -72,30 +73,36 @@ def _name_of(instance_id: int, names: Mapping[str, str]) -> str:
 
 
 @task(name="deliver.export.gltf")
-def gltf(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str]) -> FileContent:
-    """A .glb file with all that the Gaussians hold, in float32 and in their order; part ids are lost.
+def gltf(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str], flat: bool = False) -> FileContent:
+    """A .glb file with all that the Gaussians hold, in float32; part ids are lost.
 
-    They are one mesh, whatever the instances: viewers sort the Gaussians of a mesh by depth, but not those of several
-    meshes among each other, so that objects vanish behind the background. Of one instance, the node has its name and
-    `extras.instance_id`. Of several, the attribute `_INSTANCE_ID` (float32, as glTF allows no 32-bit integers there)
-    tells that of each Gaussian, and `extras.instances` of the node the id and name of each.
+    Each instance is a node with its name and `extras.instance_id`, which any scene graph can move or hide. Some viewers
+    sort the Gaussians of each mesh by depth, but not those of several among each other, so that objects vanish behind
+    the background. For these there is one mesh (`flat`), whose attribute `_INSTANCE_ID` (float32, as glTF allows no
+    32-bit integers there) tells the instance of each Gaussian, and `extras.instances` of its node their names.
 
     names: of the instances, by their ids as text.
     """
-    buffer, ids = Buffer(), instances_of(gaussians).tolist()
-    if not ids:
-        return glb(scene_of([], cameras), buffer)
-    attributes = _attributes(gaussians, buffer)
-    node = node_of(ids[0], names, 0)
-    if len(ids) > 1:
-        attributes["_INSTANCE_ID"] = buffer.add(gaussians.instance_id.astype("<f4"), _VERTEX_DATA)
+    buffer, meshes = Buffer(), []
+    ids = instances_of(gaussians).tolist()
+    if flat and ids:
         known = [{"id": instance_id, "name": _name_of(instance_id, names)} for instance_id in ids]
-        node |= {"name": "instances", "extras": {"instances": known}}
-    appearance = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    appearance |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-    primitive = {"mode": _POINTS, "attributes": attributes, "extensions": {_EXTENSION: appearance}}
-    mesh = {"name": node["name"], "primitives": [primitive]}
-    return glb({"extensionsUsed": [_EXTENSION], "meshes": [mesh], **scene_of([node], cameras)}, buffer)
+        parts = [({"name": "instances", "mesh": 0, "extras": {"instances": known}}, gaussians)]
+    else:
+        parts = [
+            (node_of(instance_id, names, mesh), select(gaussians, gaussians.instance_id == instance_id))
+            for mesh, instance_id in enumerate(ids)
+        ]
+    for node, own in parts:
+        attributes = _attributes(own, buffer)
+        if flat:
+            attributes["_INSTANCE_ID"] = buffer.add(own.instance_id.astype("<f4"), _VERTEX_DATA)
+        appearance = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+        appearance |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
+        primitive = {"mode": _POINTS, "attributes": attributes, "extensions": {_EXTENSION: appearance}}
+        meshes.append({"name": node["name"], "primitives": [primitive]})
+    document = {"extensionsUsed": [_EXTENSION], "meshes": meshes} if meshes else {}
+    return glb({**document, **scene_of([node for node, _ in parts], cameras)}, buffer)
 
 
 def _attributes(own: Gaussians, buffer: Buffer) -> dict[str, int]:

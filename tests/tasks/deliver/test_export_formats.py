@@ -74,36 +74,48 @@ def column(document: dict, binary: bytes, accessor: int) -> np.ndarray:
 
 
 @given(count=SIZES, degree=DEGREES)
-def test_gltf_holds_every_number_exactly_in_one_mesh_and_tells_the_instance_of_each_gaussian(count, degree):
+def test_gltf_holds_every_number_of_every_instance_exactly_and_names_its_node(count, degree):
     made = made_gaussians(count, degree)
     document, binary = glb_parts(bytes_of(gltf(made, made_cameras(), names={"1": "red mug"})))
+    nodes = {node["extras"]["instance_id"]: node for node in document["nodes"][1:]}
+    assert sorted(nodes) == np.unique(made.instance_id).tolist()
+    assert document["nodes"][0].get("children", []) == list(range(1, len(nodes) + 1))
+    assert nodes.get(1, {"name": "red mug"})["name"] == "red mug"
+    for instance_id, node in nodes.items():
+        own = made.instance_id == instance_id
+        assert document["meshes"][node["mesh"]]["name"] == node["name"]
+        (primitive,) = document["meshes"][node["mesh"]]["primitives"]
+        found = {name: column(document, binary, a) for name, a in primitive["attributes"].items()}
+        prefix = "KHR_gaussian_splatting"
+        assert primitive["mode"] == 0 and primitive["extensions"][prefix]["kernel"] == "ellipse"
+        np.testing.assert_array_equal(found["POSITION"], made.means[own])
+        np.testing.assert_array_equal(found[f"{prefix}:ROTATION"], made.quaternions[own][:, [1, 2, 3, 0]])
+        np.testing.assert_allclose(np.log(found[f"{prefix}:SCALE"]), made.log_scales[own], atol=1e-6)
+        np.testing.assert_allclose(found[f"{prefix}:OPACITY"], made.opacities[own], rtol=1e-6)
+        coefficients = [found[f"{prefix}:SH_DEGREE_{d}_COEF_{n}"] for d in range(degree + 1) for n in range(2 * d + 1)]
+        np.testing.assert_array_equal(np.stack(coefficients, axis=1), made.sh[own])
+        assert len(found) == 5 + (degree + 1) ** 2
+        accessor = document["accessors"][primitive["attributes"]["POSITION"]]
+        np.testing.assert_array_equal(np.float32(accessor["min"]), made.means[own].min(axis=0))
+
+
+@given(count=SIZES, degree=DEGREES)
+def test_flat_gltf_has_one_mesh_and_tells_the_instance_of_each_gaussian(count, degree):
+    made = made_gaussians(count, degree)
+    document, binary = glb_parts(bytes_of(gltf(made, made_cameras(), names={"1": "red mug"}, flat=True)))
     ids = np.unique(made.instance_id).tolist()
     if not ids:
         assert len(document["nodes"]) == 1 and "meshes" not in document
         return
     root, node = document["nodes"]
-    assert root["children"] == [1] and node["mesh"] == 0
     called = {0: "background", 1: "red mug", 2: "object 2", 3: "object 3"}
-    if len(ids) == 1:
-        assert (node["name"], node["extras"]) == (called[ids[0]], {"instance_id": ids[0]})
-    else:
-        assert node["extras"] == {"instances": [{"id": i, "name": called[i]} for i in ids]}
+    assert root["children"] == [1] and node["extras"] == {"instances": [{"id": i, "name": called[i]} for i in ids]}
     (mesh,) = document["meshes"]
     (primitive,) = mesh["primitives"]
-    assert mesh["name"] == node["name"]
     found = {name: column(document, binary, a) for name, a in primitive["attributes"].items()}
-    prefix = "KHR_gaussian_splatting"
-    assert primitive["mode"] == 0 and primitive["extensions"][prefix]["kernel"] == "ellipse"
     np.testing.assert_array_equal(found["POSITION"], made.means)
-    np.testing.assert_array_equal(found[f"{prefix}:ROTATION"], made.quaternions[:, [1, 2, 3, 0]])
-    np.testing.assert_allclose(np.log(found[f"{prefix}:SCALE"]), made.log_scales, atol=1e-6)
-    np.testing.assert_allclose(found[f"{prefix}:OPACITY"], made.opacities, rtol=1e-6)
-    coefficients = [found[f"{prefix}:SH_DEGREE_{d}_COEF_{n}"] for d in range(degree + 1) for n in range(2 * d + 1)]
-    np.testing.assert_array_equal(np.stack(coefficients, axis=1), made.sh)
-    np.testing.assert_array_equal(found.pop("_INSTANCE_ID", ids[0]), made.instance_id if len(ids) > 1 else ids[0])
-    assert len(found) == 5 + (degree + 1) ** 2
-    accessor = document["accessors"][primitive["attributes"]["POSITION"]]
-    np.testing.assert_array_equal(np.float32(accessor["min"]), made.means.min(axis=0))
+    np.testing.assert_array_equal(found["_INSTANCE_ID"], made.instance_id)
+    assert len(found) == 6 + (degree + 1) ** 2
 
 
 def test_the_root_node_turns_up_to_y():
