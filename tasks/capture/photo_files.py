@@ -84,7 +84,8 @@ def inspect(data: bytes, where: str) -> Photo:
         if _is_heic(data):
             opened = _open_heic(data)
             _, focal = _exif((opened.info.get("exif") or b"").removeprefix(_EXIF_HEADER))
-            return Photo(data, "heic", *opened.size, 1, focal)
+            width, height = opened.size
+            return Photo(data, "heic", width, height, 1, focal)
     except (IndexError, struct.error, ValueError, EOFError) as error:
         raise InputError(f"{where} is cut short or damaged; a whole image file is expected.") from error
     return Photo(data, "other", 0, 0, 1)
