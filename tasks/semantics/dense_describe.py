@@ -78,7 +78,7 @@ def dense_describe(
     The instance is rendered alone on grey, from views on a half sphere above it. In each picture the vector of a patch
     goes to the Gaussian with the largest weight in the pixel, bilinear between patches; a Gaussian's vectors are
     averaged in each picture, then over the pictures that it won a pixel of. One that won none gets the mean of the
-    nearest that did, and is flagged.
+    nearest that did, and is flagged (Split&Splat, Eq. 8).
 
     own: Gaussians of one instance, one at least. cameras: the input views; they tell which way is up. network: DINOv2,
     or a segmenter.
@@ -147,6 +147,7 @@ def around(own: Gaussians, cameras: Cameras, params: DenseDescribeParams) -> tup
 def _assignment(top: Int32, counted: Bool, gaussians: int, patches: tuple[int, int]) -> csr_array:
     """[N, h * w] what takes the vectors of patches to the mean over the pixels that each Gaussian won.
 
+    A pixel's vector goes to the Gaussian that weighs most there (Split&Splat, Eq. 7; spec A32).
     top: [H, W] the Gaussian that each pixel shows. counted: [H, W]. patches: h, w.
     """
     from scipy.sparse import coo_array

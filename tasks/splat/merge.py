@@ -171,7 +171,7 @@ def merge_pair(
     w_mask: float,
     visibility: VisibilityParams = VisibilityParams(),
 ) -> Gaussians:
-    """Two groups as one, refined together where they collide (Split&Splat, Eqs. of l and l_mask).
+    """Two groups as one, refined together where they collide (Split&Splat, Eq. 5, 6).
 
     What collides are, with `local`, the Gaussians inside the box of the smaller group, and the instances they belong
     to; all else is kept as it is, and with it the time that a merge takes grows with the smaller group, not with the
