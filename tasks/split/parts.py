@@ -89,8 +89,8 @@ def _owners(seen: Observation, shown: Int32, label: Int32) -> Int32:
     """
     owner = np.full(len(label), -1, np.int32)
     for j, mask in enumerate(seen.mask.tolist()):  # smaller ones come later
-        part = slice(seen.first[j], seen.first[j + 1])
-        row = seen.row[part][seen.standing[part] != STRAY]
+        row, standing = seen.under(j)
+        row = row[standing != STRAY]
         owner[row[label[row] == shown[mask]]] = mask
     return owner
 

@@ -171,10 +171,10 @@ def _sightings(label: Int32, observations: Sequence[Observation], matched: Match
         seen[observation.point_index] += 1
         best = np.zeros(len(label))
         for j, mask in enumerate(observation.mask.tolist()):
-            part = slice(observation.first[j], observation.first[j + 1])
-            under = observation.point_index[observation.row[part]]
+            row, standing = observation.under(j)
+            under = observation.point_index[row]
             own = label[under] == name_of.get((k, mask), -1)
-            best[under[own]] = np.maximum(best[under[own]], worth[observation.standing[part][own]])
+            best[under[own]] = np.maximum(best[under[own]], worth[standing[own]])
         shown += best
     return seen, shown
 

@@ -185,11 +185,10 @@ def vote_at_once(
     for k, (seen, shown) in enumerate(zip(observations, labels, strict=True)):
         progress(k, len(labels), seen.name)
         for j in np.flatnonzero(shown).tolist():
-            part = slice(seen.first[j], seen.first[j + 1])
-            standing = seen.standing[part]
+            row, standing = seen.under(j)
             kept = standing != STRAY
             weight = np.where(standing == INSIDE, 1.0, params.border_vote)[kept]
-            votes.add(seen.point_index[seen.row[part][kept]], int(shown[j]), weight)
+            votes.add(seen.point_index[row[kept]], int(shown[j]), weight)
         if len(seen.mask):  # a view without masks knows nothing
             free = np.ones(len(seen.point_index), bool)
             free[seen.row] = False
