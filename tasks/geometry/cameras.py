@@ -90,6 +90,13 @@ def up_of(poses: Float64 | Sequence[Float64]) -> Float64:
     return np.asarray(-poses[0][1, :3])
 
 
+def level_axes(up: Float64) -> tuple[Float64, Float64]:
+    """Two directions [3] across `up` and each other, all of length 1: east, and north = up x east."""
+    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east)
+
+
 def looking(eye: Float64, forward: Float64, up: Float64) -> Float64:
     """[4, 4] world-to-camera of an upright camera.
 

@@ -25,7 +25,7 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.geometry.cameras import Camera, looking, up_of
+from ss_flow.tasks.geometry.cameras import Camera, level_axes, looking, up_of
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.models.catalogue import Model
@@ -128,9 +128,7 @@ def around(own: Gaussians, cameras: Cameras, params: DenseDescribeParams) -> tup
     center = own.means.mean(axis=0, dtype=np.float64)
     diagonal = max(box_diagonal(own.means), float(np.exp(own.log_scales.max())))
     up = up_of(cameras.world_to_camera)
-    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    east /= np.linalg.norm(east)
-    north = np.cross(up, east)
+    east, north = level_axes(up)
     focal = _SHARE_OF_PICTURE * params.side * params.distance
     middle = params.side / 2
     lens = Camera(params.side, params.side, focal, focal, middle, middle, np.eye(4))
