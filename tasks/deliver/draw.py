@@ -35,7 +35,7 @@ from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, decompressed
 from ss_flow.tasks.deliver.contact_sheet import FAINT, INK, as_picture, blank, caption, contact_sheet, table_picture
 from ss_flow.tasks.deliver.palette import depth_colors, instance_colors, paint_ids, turbo
 from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
-from ss_flow.tasks.geometry.cameras import Camera, camera_of, level_axes, up_of
+from ss_flow.tasks.geometry.cameras import Camera, camera_of, centers_of, level_axes, up_of
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.models.colour_words import TERMS, ColourWords
 from ss_flow.tasks.semantics.query import QueryResult
@@ -246,9 +246,8 @@ def _(value: Cameras, context: Context) -> UInt8:
     poses = value.world_to_camera
     if not len(value):
         return table_picture("Cameras", [])
-    centers = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
     plane = np.stack(level_axes(up_of(poses)), axis=1)
-    seen, looks = centers @ plane, poses[:, 2, :3] @ plane
+    seen, looks = centers_of(poses) @ plane, poses[:, 2, :3] @ plane
     figure = blank(900, 800)
     axes = figure.add_axes((0.1, 0.08, 0.85, 0.84))
     axes.set_facecolor("white")

@@ -71,6 +71,11 @@ def cameras_by_view(cameras: Cameras) -> tuple[Camera, ...]:
     return tuple(camera_of(cameras, view) for view in range(len(cameras)))
 
 
+def centers_of(poses: Float64) -> Float64:
+    """[K, 3] where cameras stand in the world; poses: [K, 4, 4] world to camera."""
+    return np.asarray(-np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3]))
+
+
 _AGREED = 0.1
 """Length of the mean of unit directions from which they agree; 1 = parallel."""
 
@@ -172,7 +177,7 @@ def surface_of_pixels(column: NDArray[np.integer], row: NDArray[np.integer], dep
 def nearest_views(cameras: Cameras, view: int, count: int) -> list[int]:
     """Rows of the nearest other cameras that look the same way as one does, within 45 degrees; the nearest first."""
     poses = cameras.world_to_camera
-    centers = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
+    centers = centers_of(poses)
     distance = np.linalg.norm(centers - centers[view], axis=1)
     distance[poses[:, 2, :3] @ poses[view, 2, :3] < np.sqrt(0.5)] = np.inf
     distance[view] = np.inf
