@@ -67,6 +67,10 @@ class Cameras:
     def __len__(self) -> int:
         return len(self.names)
 
+    def row_of(self) -> dict[str, int]:
+        """The row of each view by its name."""
+        return {name: row for row, name in enumerate(self.names)}
+
 
 @dataclass(frozen=True)
 class DepthMap:
