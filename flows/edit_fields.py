@@ -27,12 +27,12 @@ class Field(Generic[T]):
 
 
 def _field(wanted: str, read: Callable[[Any], T]) -> Field[T]:
-    """read: may raise TypeError, KeyError or ValueError where a value is not right."""
+    """read: may raise TypeError, KeyError, ValueError or OverflowError where a value is not right."""
 
     def checked(value: Any) -> T:
         try:
             return read(value)
-        except (TypeError, KeyError, ValueError):
+        except (TypeError, KeyError, ValueError, OverflowError):
             raise Unfit(wanted) from None
 
     return Field(wanted, checked)
