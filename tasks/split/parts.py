@@ -13,8 +13,7 @@ from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import STRAY, Bool, Int32, MaskSet, Observation, PointLabels, PointParts
 from ss_flow.tasks.ranges import Count, Fraction
-from ss_flow.tasks.split.observe import membership
-from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence
+from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence, membership
 from ss_flow.tasks.split.votes.votes import Votes
 
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Int32, Observation, PointCloud
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
-from ss_flow.tasks.split.observe import membership
-from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence
+from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence, membership
 
 
 def part_labels(

@@ -18,7 +18,6 @@ import numpy as np
 from ss_flow.running import progress
 from ss_flow.tasks.artifacts import INSIDE, STRAY, Float32, Float64, Int32, Observation
 from ss_flow.tasks.ranges import Count, Fraction
-from ss_flow.tasks.split.observe import membership
 from ss_flow.tasks.split.votes.votes import Votes
 
 if TYPE_CHECKING:
@@ -92,6 +91,15 @@ def _cluster(views: list[list[Int32]], num_points: int, params: MaskClusteringPa
         for (_, k, j), label in zip(found, number[cluster].tolist(), strict=True):
             labels[k][j] = label
     return [labels[k] for k in original]
+
+
+def membership(groups: list[Int32], num_points: int) -> csr_array:
+    """Groups of points as a sparse matrix [groups, points] of ones."""
+    from scipy.sparse import csr_array
+
+    bounds = np.cumsum([0, *(len(group) for group in groups)])
+    columns = np.concatenate([np.zeros(0, np.int32), *groups])
+    return csr_array((np.ones(len(columns), np.float32), columns, bounds), shape=(len(groups), num_points))
 
 
 def evidence(

@@ -5,12 +5,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import BORDER, INSIDE, STRAY, Observation
-from ss_flow.tasks.split.observe import membership
 from ss_flow.tasks.split.votes.at_once import (
     MaskClusteringParams,
     cluster_masks,
     correlation_clusters,
     evidence,
+    membership,
     vote_at_once,
 )
 
