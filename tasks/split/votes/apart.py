@@ -39,12 +39,12 @@ def part_labels(
     of: list[int] = []
     rows_of = rows_by_label(label)
     rows_of.pop(0, None)
-    for name, rows in rows_of.items():
+    for label_id, rows in rows_of.items():
         component = dbscan(cloud.points[rows], reach, min_samples=1)
         large = np.flatnonzero(np.bincount(component) >= max(min_points, share * len(rows)))
         if len(large) > 1:
             pieces += [rows[component == number].astype(np.int32) for number in large]
-            of += [name] * len(large)
+            of += [label_id] * len(large)
     if not pieces:
         return label
     whole = np.array(of, np.int32)
