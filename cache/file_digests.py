@@ -24,13 +24,19 @@ T = TypeVar("T")
 
 
 class FileDigests:
-    """The remembered digests of one store. Call `save` when done."""
+    """The remembered digests of one store. What was learnt in a `with` block is saved at its end, as by `save`."""
 
     def __init__(self, table: Path, *, verify: bool = False) -> None:
         self._table = table
         self._verify = verify
         self._changed = False
         self._known: dict[str, list[object]] = _read(table)
+
+    def __enter__(self) -> FileDigests:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.save()
 
     def __call__(self, path: Path) -> str:
         """The blake3 digest of a file. Raises OSError when it cannot be read."""

@@ -118,29 +118,27 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     else:
         beside = Beside.of(frames, cameras, names, params)
         depths, presumed = without_sensor(source, beside, cameras, given, monodepth)
-    objects = scene.hints.objects if scene.hints is not None else ()
-    by_view, length = views.by_view(cameras), views.unit(cameras, depths)
+    by_view, unit = views.by_view(cameras), views.unit(cameras, depths)
     evened: tuple[ColourTransform, ...] = ()
     if params.colours.transform != "none" and given is None:  # whose Gaussians keep the colours they have
-        evened = colours(frames, cameras, depths, length, params=params.colours)
-    checked = checks(frames, cameras, depths, params=params.checks)
+        evened = colours(frames, cameras, depths, unit, params=params.colours)
     return Capture(
         frames=frames,
         cameras=cameras,
         by_view=by_view,
         depths=depths,
         presumed=presumed,
-        unit=length,
+        unit=unit,
         masks=masks,
         truth=truth,
         names=names,
         clicks=pointed,
         corrections=corrected,
         things=scene.corrections.objects if scene.corrections is not None else (),
-        objects=objects,
+        objects=scene.hints.objects if scene.hints is not None else (),
         registration=placing,
         colours=evened,
-        checks=checked,
+        checks=checks(frames, cameras, depths, params=params.checks),
         given=given,
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import difflib
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,8 @@ from typing import Any, TypeVar, cast
 
 from ss_flow.cache.canonical import digest_file
 from ss_flow.errors import InputError
+from ss_flow.flows import edit_fields
+from ss_flow.flows.edit_fields import Field, Unfit
 from ss_flow.flows.edit_objects import Objects, object_of_run, up_of_run
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import EditedScene
@@ -82,8 +83,8 @@ def _step(number: int, raw: object, objects: Objects, folder: Path) -> Step | No
             f"{_hint(op, _OPERATIONS) or '.'}"
         )
     call = _Call(number, op, dict(raw), objects, folder)
-    call.take("op", str)
-    call.take("comment", _text, "")
+    call.take("op", edit_fields.TEXT)
+    call.take("comment", edit_fields.TEXT, "")
     step = _OPERATIONS[op](call)
     call.finish()
     return step
@@ -105,17 +106,17 @@ class _Call:
         self.number, self.op, self.objects, self.folder = number, op, objects, folder
         self._raw, self._known = raw, list[str]()
 
-    def take(self, name: str, parse: Callable[[Any], T], default: T = _REQUIRED) -> T:
-        """One field. parse: raises ValueError that says what would be right."""
+    def take(self, name: str, field: Field[T], default: T = _REQUIRED) -> T:
+        """The value of one field."""
         self._known.append(name)
         if name not in self._raw:
             if default is _REQUIRED:
-                raise InputError(f"operation {self.number} ({self.op}): {name} is missing; {_wanted(parse)}.")
+                raise InputError(f"operation {self.number} ({self.op}): {name} is missing; {field.wanted}.")
             return default
         value = self._raw.pop(name)
         try:
-            return parse(value)
-        except ValueError as error:
+            return field.read(value)
+        except Unfit as error:
             raise self.fault(name, value, error) from None
 
     def fault(self, name: str, value: object, error: Exception) -> InputError:
@@ -138,62 +139,62 @@ class _Call:
 
     def instance(self, field: str = "instance") -> int:
         """The one instance that the field names."""
-        return self.take(field, self._one)
+        return self.take(field, Field("it must name an instance by id or by name", self._one))
 
     def instances(self, *, background: bool = False, least: int = 1) -> tuple[int, ...]:
         """The instances that the field `instances` names, each once, in its order."""
 
-        def parse(value: Any) -> tuple[int, ...]:
-            """it must name instances by id or by name, as in [3, "red mug"]"""
+        def read(value: Any) -> tuple[int, ...]:
             named = value if isinstance(value, list) else [value]
             ids = tuple(dict.fromkeys(self._one(item, background=background) for item in named))
             if len(ids) < least:
-                raise ValueError(f"it must name at least {'one instance' if least == 1 else f'{least} instances'}")
+                raise Unfit(f"it must name at least {'one instance' if least == 1 else f'{least} instances'}")
             return ids
 
-        return self.take("instances", parse)
+        return self.take("instances", Field('it must name instances by id or by name, as in [3, "red mug"]', read))
 
     def new_name(self, like: str) -> str:
         """A name that no object has yet; by default one like this."""
-        return self.take("name", self._free_name, self.objects.unique(like))
+        return self.take("name", Field(edit_fields.TEXT.wanted, self._free_name), self.objects.unique(like))
 
     def name_of(self, instance: int) -> str:
         """Its new name; by default it keeps its own."""
         own = self.objects.name(instance)
-        return self.take("name", lambda value: own if value == own else self._free_name(value), own)
+        return self.take(
+            "name", Field(edit_fields.TEXT.wanted, lambda value: own if value == own else self._free_name(value)), own
+        )
 
     def _free_name(self, value: Any) -> str:
-        if _text(value) in self.objects.names():
-            raise ValueError("there is an object of this name; give it another one")
+        if edit_fields.TEXT.read(value) in self.objects.names():
+            raise Unfit("there is an object of this name; give it another one")
         return str(value)
 
     def motion(self) -> Motion:
         """move, rotate, scale and pivot."""
-        turn = self.take("rotate", _turn, _NO_TURN)
+        turn = self.take("rotate", edit_fields.TURN, _NO_TURN)
         return Motion(
-            move=self.take("move", _vector, (0.0, 0.0, 0.0)),
+            move=self.take("move", edit_fields.VECTOR, (0.0, 0.0, 0.0)),
             axis=turn[0],
             degrees=turn[1],
-            scale=self.take("scale", _positive, 1.0),
-            pivot=self.take("pivot", _pivot, None),
+            scale=self.take("scale", edit_fields.POSITIVE, 1.0),
+            pivot=self.take("pivot", edit_fields.PIVOT, None),
         )
 
     def _one(self, value: Any, *, background: bool = False) -> int:
-        """it must name an instance by id or by name"""
         if background and value in (0, "background") and not isinstance(value, bool):
             return 0
         found = self.objects.find(value) if isinstance(value, int | str) and not isinstance(value, bool) else None
         if found is None:
             names = self.objects.names()
             close = _hint(value, names) if isinstance(value, str) else ""
-            raise ValueError(f"no instance goes by {value!r} at this point; instances.json lists ids and names{close}")
+            raise Unfit(f"no instance goes by {value!r} at this point; instances.json lists ids and names{close}")
         if self.op in _MOVING and not self.objects.solid(found):
-            raise ValueError(f"{found} has no Gaussians (too few views show it); name one that has")
+            raise Unfit(f"{found} has no Gaussians (too few views show it); name one that has")
         return found
 
 
 def _remove(call: _Call) -> Step:
-    ids, fill = call.instances(background=True), call.take("fill", _flag, False)
+    ids, fill = call.instances(background=True), call.take("fill", edit_fields.FLAG, False)
     call.objects.remove(ids)
     leaving = tuple(i for i in ids if i)
     return call.step(lambda scene: operations.remove(scene, instances=ids), leaving, fill=fill)
@@ -212,20 +213,20 @@ def _duplicate(call: _Call) -> Step:
 
 
 def _transform(call: _Call) -> Step:
-    ids, motion, fill = call.instances(), call.motion(), call.take("fill", _flag, False)
+    ids, motion, fill = call.instances(), call.motion(), call.take("fill", edit_fields.FLAG, False)
     call.objects.move(ids)
     return call.step(lambda scene: operations.transform(scene, instances=ids, motion=motion), ids, fill=fill)
 
 
 def _recolour(call: _Call) -> Step:
-    ids, color = call.instances(), call.take("color", _color)
+    ids, color = call.instances(), call.take("color", edit_fields.COLOR)
     return call.step(lambda scene: operations.recolour(scene, instances=ids, color=color))
 
 
 def _replace(call: _Call) -> Step:
-    instance, fill = call.instance(), call.take("fill", _flag, False)
-    run, wanted = call.take("run", _text), call.take("by", _id_or_name)
-    scale = call.take("scale", _scale_or_fit, None)
+    instance, fill = call.instance(), call.take("fill", edit_fields.FLAG, False)
+    run, wanted = call.take("run", edit_fields.TEXT), call.take("by", edit_fields.ID_OR_NAME)
+    scale = call.take("scale", edit_fields.SCALE_OR_FIT, None)
     try:
         entry, parts, file = object_of_run(call.folder / run, wanted)
     except ValueError as error:
@@ -248,7 +249,9 @@ def _replace(call: _Call) -> Step:
 def _relabel(call: _Call) -> None:
     """Names and kinds are no matter of the Gaussians: nothing is to be computed."""
     instance = call.instance()
-    call.objects.rename(instance, call.name_of(instance), call.take("kind", _kind, call.objects.kind(instance)))
+    call.objects.rename(
+        instance, call.name_of(instance), call.take("kind", edit_fields.KIND, call.objects.kind(instance))
+    )
 
 
 def _merge(call: _Call) -> Step:
@@ -278,101 +281,3 @@ _OPERATIONS: dict[str, Callable[[_Call], Step | None]] = {
     "merge": _merge,
     "split": _split,
 }
-
-
-def _wanted(parse: Callable[[Any], Any]) -> str:
-    return (parse.__doc__ or "it is needed").strip()
-
-
-def _text(value: Any) -> str:
-    """it must be a text that is not empty"""
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(_wanted(_text))
-    return value
-
-
-def _flag(value: Any) -> bool:
-    """it must be true or false"""
-    if not isinstance(value, bool):
-        raise ValueError(_wanted(_flag))
-    return value
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError("no number")
-    return float(value)
-
-
-def _positive(value: Any) -> float:
-    """it must be a number above 0"""
-    try:
-        number = _number(value)
-    except ValueError:
-        number = 0.0
-    if number <= 0:
-        raise ValueError(_wanted(_positive))
-    return number
-
-
-def _vector(value: Any) -> Vector:
-    """it must be three numbers in world units, as in [0, 0, 0.5]"""
-    try:
-        x, y, z = (_number(item) for item in value)
-    except (TypeError, ValueError):
-        raise ValueError(_wanted(_vector)) from None
-    return x, y, z
-
-
-def _pivot(value: Any) -> Vector | None:
-    """it must be "centre", or three numbers in world units"""
-    try:
-        return None if value == "centre" else _vector(value)
-    except ValueError:
-        raise ValueError(_wanted(_pivot)) from None
-
-
-def _turn(value: Any) -> tuple[Vector, float]:
-    """it must be such as {"axis": [0, 0, 1], "degrees": 90}, with an axis that is not 0"""
-    try:
-        axis, degrees = _vector(value["axis"]), _number(value["degrees"])
-        fits = len(value) == 2 and any(axis)
-    except (TypeError, KeyError, ValueError):
-        fits = False
-    if not fits:
-        raise ValueError(_wanted(_turn))
-    return axis, degrees
-
-
-def _color(value: Any) -> tuple[int, int, int]:
-    """it must be "#rrggbb", or red, green and blue as whole numbers of 0 to 255"""
-    try:
-        if isinstance(value, str) and len(value) == 7 and value[0] == "#":
-            value = list(bytes.fromhex(value[1:]))
-        r, g, b = value
-        if not all(isinstance(c, int) and not isinstance(c, bool) and 0 <= c <= 255 for c in (r, g, b)):
-            raise ValueError
-    except (TypeError, ValueError):
-        raise ValueError(_wanted(_color)) from None
-    return r, g, b
-
-
-def _scale_or_fit(value: Any) -> float | None:
-    """it must be "fit" (the size of what is replaced), or a number above 0"""
-    try:
-        return None if value == "fit" else _positive(value)
-    except ValueError:
-        raise ValueError(_wanted(_scale_or_fit)) from None
-
-
-def _kind(value: Any) -> str:
-    if value not in ("thing", "stuff"):
-        raise ValueError('it must be "thing" or "stuff"')
-    return str(value)
-
-
-def _id_or_name(value: Any) -> int | str:
-    """it must be the id or the name of an object of that run"""
-    if isinstance(value, bool) or not isinstance(value, int | str):
-        raise ValueError(_wanted(_id_or_name))
-    return value

@@ -69,6 +69,10 @@ class Cameras:
     def __len__(self) -> int:
         return len(self.names)
 
+    def row_of(self) -> dict[str, int]:
+        """The row of each view by its name."""
+        return {name: row for row, name in enumerate(self.names)}
+
 
 @dataclass(frozen=True)
 class DepthMap:
@@ -215,8 +219,13 @@ class Observation:
 
     def inside(self, j: int) -> Int32:
         """Points of the cloud that lie inside the j-th mask, ascending."""
+        row, standing = self.under(j)
+        return self.point_index[row[standing == INSIDE]]
+
+    def under(self, j: int) -> tuple[Int32, UInt8]:
+        """The points under the j-th mask as rows of `point_index`, ascending, and how each of them stands there."""
         part = slice(self.first[j], self.first[j + 1])
-        return self.point_index[self.row[part][self.standing[part] == INSIDE]]
+        return self.row[part], self.standing[part]
 
 
 BORDER, STRAY, INSIDE = 0, 1, 2

@@ -82,7 +82,7 @@ class Batch:
         digests = file_digests(store, verify=options.verify)
         scenes: dict[Path, Prepared] = {}
         errors: dict[Path, str] = {}
-        try:
+        with digests:
             for path in (path for path in folders if str(path) not in ended):
                 try:
                     scenes[path] = self._opened(path, self.out / folders[path], params, digests)
@@ -117,8 +117,6 @@ class Batch:
                     run_flows(watched, store, **engine)
                 for position in finishing.damaged:
                     finishing.again(requests[position], position, engine)
-        finally:
-            digests.save()
         if options.json:
             print(json.dumps(book.rows))
         else:

@@ -136,9 +136,8 @@ class Evaluate:
         kept_back = "truth_held_out" in run.results.digests
         if "truth" in run.results.digests or kept_back:
             run.require([f"{name}_held_out" if kept_back else name for name in ("ingest", "cameras", "truth")])
-        digests = file_digests(run.store)
-        perception = choose_model(DISTANCES, run.document["params"].get("evaluate.lpips", "auto"), digests)
-        digests.save()
+        with file_digests(run.store) as digests:
+            perception = choose_model(DISTANCES, run.document["params"].get("evaluate.lpips", "auto"), digests)
         found = _evaluated(run, lambda nodes, reference: dict(on_objects(nodes, perception)), warnings)
         views, taken = found["views"], found["removals"]
         means = {
@@ -167,17 +166,16 @@ class Evaluate:
     def _of_labels(self, warnings: list[str]) -> _Tables:
         run = open_run(self.result, self.store, _LERF_NEEDED[self.protocol])
         files = open_scene(Path(run.document["scene"]))
-        digests = file_digests(run.store)
         name = encoder_name(run.store, run.results.digests["describe"])
-        labelled = LabelledScene.of(
-            self.truth or labels_of(files),
-            files,
-            references(digests),
-            encoder=choose_model("text-image", name, digests),
-            query=query_params(run.document),
-            texts=_texts(self.texts),
-        )
-        digests.save()
+        with file_digests(run.store) as digests:
+            labelled = LabelledScene.of(
+                self.truth or labels_of(files),
+                files,
+                references(digests),
+                encoder=choose_model("text-image", name, digests),
+                query=query_params(run.document),
+                texts=_texts(self.texts),
+            )
         if labelled.unread:
             said = ", ".join(labelled.unread)
             warnings.append(f"{name_in_words(name)} cannot be asked for {said}; these categories score 0.")
@@ -210,15 +208,14 @@ def _evaluated(
     run: FinishedRun, build: Callable[[Nodes, Reference], dict[str, Any]], warnings: list[str]
 ) -> dict[str, Any]:
     """The artifacts that `build` makes of a run's results. Raises what went wrong."""
-    digests = file_digests(run.store)
     found: list[Report] = []
-    request = Request(
-        lambda: build(run.results.nodes(), references(digests)),
-        run.document["scene"],
-        done=found.append,
-    )
-    run_flows([request], run.store, recorded=False)
-    digests.save()
+    with file_digests(run.store) as digests:
+        request = Request(
+            lambda: build(run.results.nodes(), references(digests)),
+            run.document["scene"],
+            done=found.append,
+        )
+        run_flows([request], run.store, recorded=False)
     warnings += dict.fromkeys(text for node in found[-1].nodes for text in node.get("warnings") or ())
     return {name: run.store.get(str(value)) for name, value in found[-1].succeeded().items()}
 

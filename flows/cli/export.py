@@ -184,7 +184,6 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
 
     Where the capture is gone or has no photos of its own (a video), photos are called as the frames are.
     """
-    digests = file_digests(run.store)
     names = run.results.one("cameras").names
     try:
         scene = open_scene(Path(run.document["scene"]))
@@ -195,8 +194,8 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
     missing = next((file for file in files if not file.is_file()), None)
     if missing is not None:
         raise InputError(f"{missing} is not there; run the scene again.")
-    masks = tuple(map(references(digests), files))
-    digests.save()
+    with file_digests(run.store) as digests:
+        masks = tuple(map(references(digests), files))
     for name, value in zip(names, run.document["results"]["ingest"], strict=True):
         if name not in photos:
             photos[name] = f"{name}.{suffix_of(run.store.get(value))}"

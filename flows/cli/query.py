@@ -80,9 +80,8 @@ class Query:
         params = self._params(document)
         if self.out is not None:
             check_place(self.out, ANSWER_FILE)
-        digests = file_digests(run.store)
-        encoder = choose_model("text-image", encoder_name(run.store, document["results"]["describe"]), digests)
-        digests.save()
+        with file_digests(run.store) as digests:
+            encoder = choose_model("text-image", encoder_name(run.store, document["results"]["describe"]), digests)
 
         def build() -> dict[str, Any]:
             nodes, known = run.results.nodes(), {}

@@ -119,10 +119,8 @@ class Render:
         file = Path(self.path)
         if not file.is_file():
             raise InputError(f"--path {self.path} is neither input nor orbit, nor a file of cameras (transforms.json).")
-        digests = file_digests(store)
-        reference = references(digests)(file)
-        digests.save()
-        return reference
+        with file_digests(store) as digests:
+            return references(digests)(file)
 
 
 def _scene_before(run: FinishedRun) -> str:

@@ -89,12 +89,10 @@ class Reproduce:
             for scene in scenes
             for seed in range(self.seeds)
         ]
-        try:
+        with digests:
             prepared, unmeasured = self._prepared(runs, plan, digests)
             tell_remarks((one.prepared for one in prepared.values()), tell)
             found = self._measured(runs, prepared, store, digests, tell)
-        finally:
-            digests.save()
         sections = [section_of(section, plan, printed, found.values()) for section in plan.sections]
         document = {
             "table": self.table,

@@ -140,12 +140,9 @@ def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions,
             documents.append(finish(prepared, report, store, place, undistorted=undistorted))
 
     tell_remarks([prepared], console_out)
-    try:
-        with display(console_out) as screen:
-            request = Request(prepared.build, prepared.name, header(prepared, options), options.target, screen, done)
-            (report,) = run_flows([request], store, **engine)
-    finally:
-        digests.save()
+    with digests, display(console_out) as screen:
+        request = Request(prepared.build, prepared.name, header(prepared, options), options.target, screen, done)
+        (report,) = run_flows([request], store, **engine)
     if options.dry_run:
         return _tell_plan(report, console_out, json_wanted=options.json)
     (document,) = documents

@@ -102,7 +102,7 @@ class Sweep:
         store = options.store.open_store()
         digests = file_digests(store, verify=options.verify)
         tell = console(json=options.json)
-        try:
+        with digests:
             variants = [
                 Variant(prepare(scene, params, options, digests, text=self.query), values)
                 for scene in scenes
@@ -129,8 +129,6 @@ class Sweep:
                     for position, variant in enumerate(variants)
                 ]
                 rows = rows_of([v.values for v in variants], run_flows(requests, store, **engine))
-        finally:
-            digests.save()
         for name in _idle(variants, rows, zipped=self.zipped):
             hint = "; --query TEXT adds one" if name.startswith("semantics.query.") and self.query is None else ""
             tell.print(f"[yellow]warning:[/] no step of these runs depends on {name}{hint}.")

@@ -193,7 +193,6 @@ def search_of(run: FinishedRun) -> Search | None:
 
     if run.results.missing(("describe",)):
         return None
-    digests = file_digests(run.store)
-    encoder = choose_model("text-image", encoder_name(run.store, run.results.digests["describe"]), digests)
-    digests.save()
+    with file_digests(run.store) as digests:
+        encoder = choose_model("text-image", encoder_name(run.store, run.results.digests["describe"]), digests)
     return Search(tuple(run.results.all("describe")), query_params(run.document), encoder)

@@ -118,8 +118,6 @@ class SensIndex:
 
     color_lens: Lens
     depth_lens: Lens
-    color_compression: int
-    """1 = PNG, 2 = JPEG."""
     depth_compression: int
     """0 = raw uint16, 1 = zlib."""
     depth_scale: float
@@ -170,7 +168,6 @@ def read_sens_index(path: Path) -> SensIndex:
     return SensIndex(
         color_lens=_lens(matrices[0], str(path), cw, ch),
         depth_lens=_lens(matrices[2], str(path), dw, dh),
-        color_compression=color_kind,
         depth_compression=depth_kind,
         depth_scale=1.0 / shift,
         camera_to_world=np.array(poses, np.float64).reshape(-1, 4, 4),

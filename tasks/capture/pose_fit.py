@@ -155,7 +155,7 @@ def matches_that_fit(cameras: Cameras, photos: Sequence[Features], matches: Sequ
 
     photos: all that the matches name; their lenses may bend lines as `Cameras.radial` says.
     """
-    rows = {name: row for row, name in enumerate(cameras.names)}
+    rows = cameras.row_of()
     points = {}
     for photo in photos:
         if photo.name in rows:

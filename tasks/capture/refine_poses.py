@@ -16,6 +16,7 @@ from ss_flow.tasks.capture.colmap import load_pycolmap
 from ss_flow.tasks.capture.colmap_database import fill_database
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.matches import Matches
+from ss_flow.tasks.geometry.cameras import centers_of
 from ss_flow.tasks.ranges import Count, Positive
 
 _LEAST_POINTS = 100
@@ -198,7 +199,7 @@ def _similarity(poses: Float64, given: Float64) -> Float64 | None:
     """
     u, _, vt = np.linalg.svd(np.einsum("kji,kjl->il", given[:, :3, :3], poses[:, :3, :3]))
     rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    source, target = _centers(poses) @ rotation.T, _centers(given)
+    source, target = centers_of(poses) @ rotation.T, centers_of(given)
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     scale = (a * b).sum() / max((a * a).sum(), 1e-12)
     if scale < _LEAST_SCALE:
@@ -208,7 +209,7 @@ def _similarity(poses: Float64, given: Float64) -> Float64 | None:
 
 def _tell(given: Cameras, found: Adjusted) -> None:
     rows, refined = found.rows, found.cameras.world_to_camera
-    moved = np.linalg.norm(_centers(refined) - _centers(given.world_to_camera), axis=1)[rows]
+    moved = np.linalg.norm(centers_of(refined) - centers_of(given.world_to_camera), axis=1)[rows]
     turn = refined[rows, :3, :3] @ given.world_to_camera[rows, :3, :3].transpose(0, 2, 1)
     turned = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     warn(
@@ -221,11 +222,6 @@ def _tell(given: Cameras, found: Adjusted) -> None:
 
 def _points(model: Any, number: int) -> int:
     return int(model.image(number).num_points3D)
-
-
-def _centers(world_to_camera: Float64) -> Float64:
-    centers: Float64 = -np.einsum("kji,kj->ki", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
-    return centers
 
 
 def _median_error(model: Any) -> float:

@@ -35,7 +35,7 @@ from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, decompressed
 from ss_flow.tasks.deliver.contact_sheet import FAINT, INK, as_picture, blank, caption, contact_sheet, table_picture
 from ss_flow.tasks.deliver.palette import depth_colors, instance_colors, paint_ids, turbo
 from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
-from ss_flow.tasks.geometry.cameras import Camera, camera_of, up_of
+from ss_flow.tasks.geometry.cameras import Camera, camera_of, centers_of, level_axes, up_of
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.models.colour_words import TERMS, ColourWords
 from ss_flow.tasks.semantics.query import QueryResult
@@ -248,12 +248,8 @@ def _(value: Cameras, context: Context) -> UInt8:
     poses = value.world_to_camera
     if not len(value):
         return table_picture("Cameras", [])
-    centers = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
-    up = up_of(poses)
-    east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    east /= np.linalg.norm(east)
-    plane = np.stack([east, np.cross(up, east)], axis=1)
-    seen, looks = centers @ plane, poses[:, 2, :3] @ plane
+    plane = np.stack(level_axes(up_of(poses)), axis=1)
+    seen, looks = centers_of(poses) @ plane, poses[:, 2, :3] @ plane
     figure = blank(560, 500)  # about as wide as a report shows it, so that its words keep their size
     axes = figure.add_axes((0.11, 0.11, 0.85, 0.81))
     axes.set_facecolor("none")

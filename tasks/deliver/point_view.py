@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, UInt8
-from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, up_of
+from ss_flow.tasks.geometry.cameras import Camera, level_axes, looking, pixels_in_view, up_of
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
 _WIDTH, _HEIGHT = 960, 720
@@ -51,8 +51,7 @@ def _side(up: Float64, cameras: Cameras | None) -> Float64:
         towards -= up * (up @ towards)
         if (agreed := float(np.linalg.norm(towards))) > _ONE_SIDE:
             return towards / agreed
-    east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    return east / np.linalg.norm(east)
+    return level_axes(up)[0]
 
 
 def _up(centred: Float64, cameras: Cameras | None) -> Float64:

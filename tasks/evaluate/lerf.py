@@ -197,7 +197,7 @@ def _labelled(
     frames: Sequence[Frame], cameras: Cameras, labels: Labels
 ) -> Iterator[tuple[int, LabelledFrame, _Carried]]:
     """The labelled views: row of the frame, its label, and what brings images of the frame to the label's pixels."""
-    rows = {name: row for row, name in enumerate(cameras.names)}
+    rows = cameras.row_of()
     stated = dict(zip(labels.photos, labels.lenses, strict=True))
     present = [(view, file) for view, file in zip(labels.views, labels.files, strict=True) if view in rows]
     if not present:

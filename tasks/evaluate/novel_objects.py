@@ -79,7 +79,7 @@ def object_views(
     """
     from ss_flow.tasks.gaussians.render import render
 
-    row_of = {name: row for row, name in enumerate(cameras.names)}
+    row_of = cameras.row_of()
     boxes: dict[int, list[tuple[float, float, float]]] = defaultdict(list)
     whole, bands = [], []
     for done, ids in enumerate(truth):

@@ -1,4 +1,4 @@
-"""Open-vocabulary evaluation on labelled frames, as LERF-OVS labels them (spec 2.2), and best IoU per object."""
+"""Open-vocabulary evaluation on labelled frames, as LERF-OVS labels them (spec 2.2)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Bool, Float64, LabelMap
-from ss_flow.tasks.evaluate.contingency import Contingency, Labels, contingency
-from ss_flow.tasks.evaluate.instances import pooled, summary
+from ss_flow.tasks.artifacts import Bool, Float64
+from ss_flow.tasks.evaluate.contingency import Labels
+from ss_flow.tasks.evaluate.instances import summary
 from ss_flow.tasks.masks.overlap import iou
 
 
@@ -113,58 +113,6 @@ def oracle_scores(frames: Sequence[Sequence[float]]) -> dict[str, float]:
         "macc25": float(np.mean([(f >= 0.25).mean() for f in kept])),
         "macc50": float(np.mean([(f >= 0.50).mean() for f in kept])),
     }
-
-
-@dataclass(frozen=True)
-class ObjectIoU:
-    """How well predicted masks cover each true object."""
-
-    object_ids: tuple[int, ...]
-    """[G] the true ids that occur."""
-    best_id: tuple[int, ...]
-    """[G] the one predicted id with the highest IoU over all frames; 0 = none touches the object."""
-    pooled: Float64
-    """[G] IoU with that id, over the pixels of all frames."""
-    per_frame: Float64
-    """[G] mean, over the frames that show the object, of the best IoU of any id in that frame."""
-
-    def scores(self) -> dict[str, float]:
-        """Means over the objects: pooled_iou and per_frame_iou."""
-        return {"pooled_iou": float(self.pooled.mean()), "per_frame_iou": float(self.per_frame.mean())}
-
-
-def object_ious(
-    predicted: tuple[LabelMap, ...], truth: tuple[LabelMap, ...], *, zero_is_void: bool = False
-) -> ObjectIoU:
-    """Best IoU of each true object with predicted masks: with one id over all frames, and frame by frame.
-
-    truth: 0 = none of the objects; with `zero_is_void` such pixels are dropped, else a mask that spills over loses.
-    Raises InputError when a view lacks its prediction, sizes differ, or no object occurs.
-    """
-    true_ids, ids = pooled(predicted, truth)
-    table = _objects(true_ids, ids, zero_is_void)
-    if not len(table.truth_ids):
-        raise InputError("The ground truth masks hold no object; at least one is needed to evaluate.")
-    best = [int(table.predicted_ids[row.argmax()]) if row.any() else 0 for row in table.iou]
-    by_name = {m.name: m for m in predicted}
-    seen: dict[int, list[float]] = {int(i): [] for i in table.truth_ids}
-    for true_map in truth:
-        of_frame = _objects(true_map.ids, by_name[true_map.name].ids, zero_is_void)
-        for instance, value in zip(of_frame.truth_ids, of_frame.best_iou(), strict=True):
-            seen[int(instance)].append(float(value))
-    return ObjectIoU(
-        tuple(int(i) for i in table.truth_ids),
-        tuple(best),
-        table.best_iou(),
-        np.array([np.mean(values) for values in seen.values()]),
-    )
-
-
-def _objects(truth: Labels, predicted: Labels, zero_is_void: bool) -> Contingency:
-    if zero_is_void:
-        annotated = truth > 0
-        return contingency(truth[annotated], predicted[annotated]).without(predicted=0)
-    return contingency(truth, predicted).without(truth=0, predicted=0)
 
 
 def _filled(frame: LabelledFrame, corners: Float64) -> Bool:

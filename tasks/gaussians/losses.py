@@ -70,7 +70,8 @@ def surface(alpha: Float32, depth: Float32, mismatch: Float32 | None, target: Ta
     of the world does not matter; or, between inverse depths, known * |alpha^2 / depth - 1 / target depth|, where
     alpha / depth, the inverse of the mean depth, stands for 3DGS's mean of inverse depths. Labels, without `mismatch`
     0: labelled * (mismatch + 1 where ids >= 0); its gradient towards `mismatch` is `labelled`. That is the absolute
-    error of all label masks against their one-hot targets, since no mask falls below 0 or exceeds 1 (spec A25).
+    error of all label masks against their one-hot targets, l_mask, since no mask falls below 0 or exceeds 1
+    (Split&Splat, Eq. 6; spec A25).
     """
     towards_alpha, towards_depth, out = np.empty_like(alpha), np.empty_like(depth), np.empty(3, np.float64)
     asked = (target.inside, target.judged, target.depth, target.known, target.labelled, target.ids)
@@ -89,8 +90,8 @@ def gradients_of(
 ) -> tuple[float, tuple[Float32, Float32, Float32, Float32 | None]]:
     """The loss of one view, and its gradients towards rgb, alpha, depth and mismatch (None = zero).
 
-    Split&Splat's l = l_RGB + w_mask l_mask, with the losses of alpha and depth that an `Objective` may add: colour by
-    L1 and SSIM, and each rendered label against its one-hot target, a mean over pixels and labels (spec A25).
+    l = l_RGB + w_mask l_mask (Split&Splat, Eq. 5), with the losses of alpha and depth that an `Objective` may add:
+    colour by L1 and SSIM, and each rendered label against its one-hot target, a mean over pixels and labels (spec A25).
     """
     color = photometric(
         rendered.rgb, target.image, target.counted, weights.ssim, workspace=workspace, threads=threads

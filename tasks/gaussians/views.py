@@ -51,6 +51,10 @@ class Views(Bundle):
     colours: Sequence[ColourTransform]
     """What the photos' colours go through; empty where they stay."""
 
+    def row_of(self) -> dict[str, int]:
+        """The row of each view by its name."""
+        return {frame.name: row for row, frame in enumerate(self.frames)}
+
     def compared(self, visibility: VisibilityParams) -> SceneViews:
         """The same with what tells whether two depths are of one surface."""
         return SceneViews(self.frames, self.cameras, self.depths, self.unit, self.colours, visibility)

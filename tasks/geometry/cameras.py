@@ -71,6 +71,11 @@ def cameras_by_view(cameras: Cameras) -> tuple[Camera, ...]:
     return tuple(camera_of(cameras, view) for view in range(len(cameras)))
 
 
+def centers_of(poses: Float64) -> Float64:
+    """[K, 3] where cameras stand in the world; poses: [K, 4, 4] world to camera."""
+    return np.asarray(-np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3]))
+
+
 _AGREED = 0.1
 """Length of the mean of unit directions from which they agree; 1 = parallel."""
 
@@ -88,6 +93,13 @@ def up_of(poses: Float64 | Sequence[Float64]) -> Float64:
         if length >= _AGREED:
             return np.asarray(-away / length)
     return np.asarray(-poses[0][1, :3])
+
+
+def level_axes(up: Float64) -> tuple[Float64, Float64]:
+    """Two directions [3] across `up` and each other, all of length 1: east, and north = up x east."""
+    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east)
 
 
 def looking(eye: Float64, forward: Float64, up: Float64) -> Float64:
@@ -165,7 +177,7 @@ def surface_of_pixels(column: NDArray[np.integer], row: NDArray[np.integer], dep
 def nearest_views(cameras: Cameras, view: int, count: int) -> list[int]:
     """Rows of the nearest other cameras that look the same way as one does, within 45 degrees; the nearest first."""
     poses = cameras.world_to_camera
-    centers = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
+    centers = centers_of(poses)
     distance = np.linalg.norm(centers - centers[view], axis=1)
     distance[poses[:, 2, :3] @ poses[view, 2, :3] < np.sqrt(0.5)] = np.inf
     distance[view] = np.inf

@@ -73,5 +73,5 @@ def nearest_spacing(points: Float32 | Float64) -> float:
 def rows_by_label(labels: Int32) -> dict[int, NDArray[np.intp]]:
     """The rows that carry each label that occurs in [N], ascending."""
     order = np.argsort(labels, kind="stable")
-    names, starts = np.unique(labels[order], return_index=True)
-    return dict(zip(names.tolist(), np.split(order, starts[1:]), strict=True)) if len(labels) else {}
+    found, starts = np.unique(labels[order], return_index=True)
+    return dict(zip(found.tolist(), np.split(order, starts[1:]), strict=True)) if len(labels) else {}

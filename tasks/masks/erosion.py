@@ -43,7 +43,7 @@ class Interior:
 
 
 def interiors(masks: MaskSet | PromptedMasks, params: ErosionParams, *, nested: bool) -> list[Interior]:
-    """The eroded masks of one view (Split&Splat, Eq. 3), in canonical order; empty ones are left out.
+    """The eroded masks of one view (Split&Splat, M_{k,j} of Eq. 3), in canonical order; empty ones are left out.
 
     nested: whether masks keep the pixels that smaller masks cover too. If not, each pixel belongs to the smallest mask
     on it, and the borders of the smaller masks are taken off the larger ones as well.

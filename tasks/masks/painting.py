@@ -55,8 +55,8 @@ def by_area(painted: PaintedView, height: int, width: int) -> PaintedView:
 
 def labels_in_front(painted: PaintedView, min_points: int) -> list[int]:
     """The labels that at least so many points in front carry, ascending."""
-    names, counts = np.unique(painted.label, return_counts=True)
-    found: list[int] = names[(names > 0) & (counts >= min_points)].tolist()
+    labels, counts = np.unique(painted.label, return_counts=True)
+    found: list[int] = labels[(labels > 0) & (counts >= min_points)].tolist()
     return found
 
 

@@ -73,13 +73,13 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     """
     order = canonical_order(dense)
     dense = dense[order]
-    names, index = np.unique(painted.label, return_inverse=True)
+    labels, index = np.unique(painted.label, return_inverse=True)
     flat = dense.reshape(len(dense), -1)[:, painted.pixel]
-    count = np.stack([np.bincount(index[mask], painted.area[mask], len(names)) for mask in flat])
-    total = np.bincount(index, painted.area, len(names))
-    area = count @ np.where(names == 0, params.unlabelled, 1.0)
+    count = np.stack([np.bincount(index[mask], painted.area[mask], len(labels)) for mask in flat])
+    total = np.bincount(index, painted.area, len(labels))
+    area = count @ np.where(labels == 0, params.unlabelled, 1.0)
     fits = count / np.maximum(area[:, None] + total - count, 1)
-    fits[:, names == 0] = 0
+    fits[:, labels == 0] = 0
     rank = np.round(fits * pool.quality[order, None], 9)
 
     chosen: dict[int, Bool] = {}
@@ -91,11 +91,11 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     for row, column in pairs:
         if free[row] and column not in chosen:
             free[row] = False
-            chosen[column], shown[int(names[column])] = flat[row], dense[row]
+            chosen[column], shown[int(labels[column])] = flat[row], dense[row]
 
     # An occluder may cut an object in two: what is left joins where it fits.
     for column in sorted(chosen):
-        mine, label = index == column, int(names[column])
+        mine, label = index == column, int(labels[column])
         for row in np.flatnonzero(free & (count.argmax(axis=1) == column)):
             both = chosen[column] | flat[row]
             added = dense[row] & ~shown[label]

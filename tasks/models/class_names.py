@@ -19,7 +19,7 @@ from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Bool, Float32, UInt8
 from ss_flow.tasks.models.efficientnet import EfficientNetLite2
 from ss_flow.tasks.models.sentences import SentenceEncoder
-from ss_flow.tasks.models.text_image import CANONICAL
+from ss_flow.tasks.models.text_image import CANONICAL, unit_rows
 
 LIKELIEST = 10
 """How many classes a picture is made of; the paper's choice."""
@@ -57,8 +57,8 @@ class ClassNames:
             raise ValueError("the classifier sees whole pictures; compose the background before")
         probabilities = self._classifier.probabilities(images)
         least = np.sort(probabilities, axis=1)[:, -LIKELIEST, None]
-        mixed = np.einsum("nc,cd->nd", np.where(probabilities >= least, probabilities, 0), self._class_vectors)
-        return (mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+        likely = np.where(probabilities >= least, probabilities, 0)
+        return unit_rows(np.einsum("nc,cd->nd", likely, self._class_vectors))
 
     def encode_texts(self, texts: Sequence[str]) -> Float32:
         """Unit vectors of texts: [n, D]."""

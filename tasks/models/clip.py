@@ -16,7 +16,7 @@ from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Bool, Float32, UInt8
 from ss_flow.tasks.models.onnx import open_session
-from ss_flow.tasks.models.text_image import CANONICAL
+from ss_flow.tasks.models.text_image import CANONICAL, unit_rows
 from ss_flow.tasks.models.tokenizer import ClipTokenizer
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class Clip:
         for start in range(0, len(images), _BATCH):
             pixels = np.stack([prepare(image, self._side) for image in images[start : start + _BATCH]])
             rows.append(self._vision.run([self._image_output], {entry: pixels})[0])
-        return _unit(np.concatenate(rows)) if rows else np.zeros((0, self.dimension), np.float32)
+        return unit_rows(np.concatenate(rows)) if rows else np.zeros((0, self.dimension), np.float32)
 
     def encode_texts(self, texts: Sequence[str]) -> Float32:
         """Unit vectors of texts: [n, D]."""
@@ -79,7 +79,7 @@ class Clip:
         for entry in self._text.get_inputs():
             values = np.ones_like(ids) if "mask" in entry.name else ids
             feeds[entry.name] = values.astype(np.int32 if "int32" in entry.type else np.int64)
-        return _unit(self._text.run([self._text_output], feeds)[0])
+        return unit_rows(self._text.run([self._text_output], feeds)[0])
 
     def negatives(self, text: str) -> tuple[str, ...]:
         """The canonical phrases."""
@@ -112,8 +112,3 @@ def _output(session: InferenceSession, known: Sequence[str], file: Path) -> str:
     if not found:
         raise InputError(f"{file.name} has the outputs {', '.join(names)}; one of {', '.join(known)} is needed.")
     return found[0]
-
-
-def _unit(rows: Float32) -> Float32:
-    rows = rows.astype(np.float32)
-    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)

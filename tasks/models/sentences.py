@@ -12,6 +12,7 @@ from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Float32
 from ss_flow.tasks.models.onnx import open_written, run
 from ss_flow.tasks.models.onnx_graph import GraphWriter
+from ss_flow.tasks.models.text_image import unit_rows
 
 _HEADS = 12
 _EPSILON = 1e-12
@@ -61,7 +62,7 @@ class SentenceEncoder:
                 some = alike[start : start + _BATCH]
                 embedded = self._words[np.array([tokens[row] for row in some])] + self._places[:length]
                 rows[some] = run(self._session, {"embedded": embedded})[0]
-        return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+        return unit_rows(rows)
 
 
 def _read(file: FileRef) -> dict[str, Float32]:

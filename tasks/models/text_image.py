@@ -5,10 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
+import numpy as np
+
 from ss_flow.tasks.artifacts import Bool, Float32, UInt8
 
 CANONICAL = ("object", "things", "stuff", "texture")
 """The canonical phrases, which fit anything (Kerr et al., "LERF", Sec. 3.4)."""
+
+
+def unit_rows(rows: Float32) -> Float32:
+    """Rows [n, D] brought to length 1; zeros stay."""
+    rows = rows.astype(np.float32)
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
 
 
 class TextImageEncoder(Protocol):

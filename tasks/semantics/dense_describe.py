@@ -25,7 +25,7 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.geometry.cameras import Camera, looking, up_of
+from ss_flow.tasks.geometry.cameras import Camera, level_axes, looking, up_of
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.models.catalogue import Model
@@ -78,7 +78,7 @@ def dense_describe(
     The instance is rendered alone on grey, from views on a half sphere above it. In each picture the vector of a patch
     goes to the Gaussian with the largest weight in the pixel, bilinear between patches; a Gaussian's vectors are
     averaged in each picture, then over the pictures that it won a pixel of. One that won none gets the mean of the
-    nearest that did, and is flagged.
+    nearest that did, and is flagged (Split&Splat, Eq. 8).
 
     own: Gaussians of one instance, one at least. cameras: the input views; they tell which way is up. network: DINOv2,
     or a segmenter.
@@ -128,9 +128,7 @@ def around(own: Gaussians, cameras: Cameras, params: DenseDescribeParams) -> tup
     center = own.means.mean(axis=0, dtype=np.float64)
     diagonal = max(box_diagonal(own.means), float(np.exp(own.log_scales.max())))
     up = up_of(cameras.world_to_camera)
-    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    east /= np.linalg.norm(east)
-    north = np.cross(up, east)
+    east, north = level_axes(up)
     focal = _SHARE_OF_PICTURE * params.side * params.distance
     middle = params.side / 2
     lens = Camera(params.side, params.side, focal, focal, middle, middle, np.eye(4))
@@ -147,6 +145,7 @@ def around(own: Gaussians, cameras: Cameras, params: DenseDescribeParams) -> tup
 def _assignment(top: Int32, counted: Bool, gaussians: int, patches: tuple[int, int]) -> csr_array:
     """[N, h * w] what takes the vectors of patches to the mean over the pixels that each Gaussian won.
 
+    A pixel's vector goes to the Gaussian that weighs most there (Split&Splat, Eq. 7; spec A32).
     top: [H, W] the Gaussian that each pixel shows. counted: [H, W]. patches: h, w.
     """
     from scipy.sparse import coo_array

@@ -28,7 +28,7 @@ def part_masks(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> 
     """
     if not len(scene):
         return ()
-    row_of = {name: row for row, name in enumerate(cameras.names)}
+    row_of = cameras.row_of()
     found: dict[tuple[int, int], dict[str, Masks]] = {}
     for done, shown in enumerate(maps):
         height, width = shown.ids.shape

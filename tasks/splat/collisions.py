@@ -57,7 +57,7 @@ def group_box(gaussians: Gaussians, *, min_opacity: float, quantile: float) -> F
 
 
 def collision_matrix(centers: Sequence[Float32 | Float64], boxes: Float64) -> Float64:
-    """C_ab, the share of a's Gaussians inside b's box; C_aa = 0 (Split&Splat, Sec. 3.2.3, Eq. of C_ab).
+    """C_ab, the share of a's Gaussians inside b's box; C_aa = 0 (Split&Splat, Eq. 4).
 
     centers: of each of G groups [N_g, 3]; boxes: [G, 2, 3]. Borders belong to the box. Returns [G, G].
     """

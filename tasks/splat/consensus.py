@@ -100,8 +100,8 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
 
 def _views(scene: SceneViews, instance: InstanceMasks) -> Iterator[tuple[int, Bool, list[tuple[int, Bool]]]]:
     """Each view with a mask: its row, the mask, and rows and masks of the views that are asked about it."""
-    row = {frame.name: i for i, frame in enumerate(scene.frames)}
-    views = [row[name] for name in instance.views]
+    row_of = scene.row_of()
+    views = [row_of[name] for name in instance.views]
     asked = [(views[k], instance.mask(k)) for k in range(0, len(views), -(-len(views) // MOST_VIEWS))]
     for k, view in enumerate(views):
         yield view, instance.mask(k), [(other, held) for other, held in asked if other != view]

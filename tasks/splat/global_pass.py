@@ -15,7 +15,8 @@ from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.trainer import PartView, TrainParams, train
 from ss_flow.tasks.gaussians.views import NONE_OF_MINE, SceneViews, TrainView, Views, whole_view
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.splat.merge import MergeParams, channels, extent, guarded
+from ss_flow.tasks.splat.guard import guarded
+from ss_flow.tasks.splat.merge import MergeParams, channels, extent
 from ss_flow.tasks.splat.relabel import relabelled, shown_masks
 from ss_flow.tasks.splat.side_views import side_views
 from ss_flow.tasks.splat.strays import without_strays

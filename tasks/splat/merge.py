@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 
-from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, extents, select
@@ -31,6 +30,7 @@ from ss_flow.tasks.geometry.cameras import camera_extent, pixels_in_view
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import SOLID_OPACITY, TRIMMED, group_box
+from ss_flow.tasks.splat.guard import guarded
 
 _OF_PAIRS = (
     "iterations_per_view",
@@ -146,16 +146,6 @@ class MergeParams:
         return replace(self, **{name: getattr(default, name) for name in names})
 
 
-@dataclass(frozen=True)
-class Quality:
-    """How well Gaussians explain views."""
-
-    iou: float
-    """Mean over views and instances of the IoU of rendered mask and target; 1 where there is no target."""
-    psnr: float
-    """Over the pixels inside masks, dB."""
-
-
 @task(
     name="splat.merge_pair",
     resources=Resources(cores=1, most_cores=8, memory_mb=2000, gpus=0.25),
@@ -171,7 +161,7 @@ def merge_pair(
     w_mask: float,
     visibility: VisibilityParams = VisibilityParams(),
 ) -> Gaussians:
-    """Two groups as one, refined together where they collide (Split&Splat, Eqs. of l and l_mask).
+    """Two groups as one, refined together where they collide (Split&Splat, Eq. 5, 6).
 
     What collides are, with `local`, the Gaussians inside the box of the smaller group, and the instances they belong
     to; all else is kept as it is, and with it the time that a merge takes grows with the smaller group, not with the
@@ -256,23 +246,6 @@ def _shows(gaussians: Gaussians, views: Sequence[TrainView], params: MergeParams
     return opaque & (strongest >= params.prune_contribution)
 
 
-def quality(gaussians: Gaussians, views: Sequence[TrainView], ids: Int32) -> Quality:
-    """Mean mask IoU and PSNR of Gaussians over views with mask targets; ids: [L] the instance of each channel."""
-    overlaps: list[float] = []
-    error, count = 0.0, 0
-    for view in views:
-        rendering = render(gaussians, view.camera, label_ids=ids.tolist(), winners=False)
-        error += float(((rendering.rgb - view.image)[view.inside].astype(np.float64) ** 2).sum())
-        count += 3 * int(view.inside.sum())
-        assert view.ids is not None
-        counts = view.ids != -1
-        for channel in np.unique(view.ids[view.inside]):
-            mask, target = (rendering.label_masks[channel] >= 0.5) & counts, view.ids == channel
-            overlaps.append(float((mask & target).sum() / (mask | target).sum()))
-    mse = max(error / max(1, count), 1e-10)
-    return Quality(float(np.mean(overlaps)) if overlaps else 1.0, -10 * float(np.log10(mse)))
-
-
 def _group_views(
     scene: SceneViews,
     masks: Sequence[LabelMap],
@@ -307,36 +280,3 @@ def channels(masks: Sequence[LabelMap], ids: Int32, rest: int, others: Int32) ->
     channel_of[others] = IGNORED
     channel_of[ids] = np.arange(len(ids))
     return (channel_of[label_map.ids] for label_map in masks)
-
-
-def guarded(before: Gaussians, after: Gaussians, views: list[TrainView], ids: Int32, params: MergeParams) -> Gaussians:
-    """What a training made of Gaussians, or with a warning what they were, if views lose more by it than allowed.
-
-    ids: [L] the instance of each channel of the views.
-    """
-    if not params.guard_views:
-        return after
-    step = max(1, -(-len(views) // params.guard_views))
-    old, new = quality(before, views[::step], ids), quality(after, views[::step], ids)
-    if acceptable(old, new, params):
-        return after
-    warn(
-        f"Refining instances {', '.join(map(str, ids))} together was undone: it took the IoU of their masks from "
-        f"{old.iou:.3f} to {new.iou:.3f} and the PSNR from {old.psnr:.1f} to {new.psnr:.1f} dB."
-    )
-    return before
-
-
-def acceptable(old: Quality, new: Quality, params: MergeParams) -> bool:
-    """Whether neither IoU nor PSNR is lost beyond its limit, or what the other one gains makes up for it."""
-    iou, psnr = new.iou - old.iou, new.psnr - old.psnr
-
-    def allowed(change: float, limit: float, other: float, others_limit: float) -> bool:
-        price = params.guard_trade * -change * others_limit
-        # A gain cannot be counted in limits of 0.
-        paid = params.guard_trade > 0 and others_limit > 0 and other * limit > price
-        return change >= -limit or paid
-
-    return allowed(iou, params.guard_iou, psnr, params.guard_psnr) and allowed(
-        psnr, params.guard_psnr, iou, params.guard_iou
-    )

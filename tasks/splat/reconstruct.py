@@ -198,9 +198,9 @@ def _trained(
     instance = _evenly(instance, params.iterations(instance))
     surface = PointSurface.of(instance.points)
     build = background_view if instance.instance_id == 0 else group_view
-    row = {frame.name: i for i, frame in enumerate(scene.frames)}
+    row_of = scene.row_of()
     views = [
-        build(scene, row[name], channels, surface, crop=params.crop, ignore_occluded=params.ignore_occluded)
+        build(scene, row_of[name], channels, surface, crop=params.crop, ignore_occluded=params.ignore_occluded)
         for name, channels in zip(instance.views, _channels(scene, instance, params), strict=True)
     ]
     views = [view for view in views if view.inside.any()]

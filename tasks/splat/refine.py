@@ -171,7 +171,7 @@ def rendered(
         return instance
     scene = views.compared(visibility)
     solid = _solid(gaussians, params)
-    view_of = {frame.name: view for view, frame in enumerate(views.frames)}
+    view_of = views.row_of()
     rows, masks = [], []
     for row, name in enumerate(instance.views):
         view = view_of[name]

@@ -43,8 +43,8 @@ def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) ->
     found, row, size = np.unique(pair, axis=0, return_inverse=True, return_counts=True)
     alone = np.isin(found[:, 0], np.unique(labels.label))
     number = np.where(alone, found[:, 2], 0)
-    for name in np.unique(found[~alone, 0]):
-        rows = np.flatnonzero(found[:, 0] == name)
+    for instance in np.unique(found[~alone, 0]):
+        rows = np.flatnonzero(found[:, 0] == instance)
         number[rows[np.argsort(-size[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
     return PointParts(number[row].astype(np.int32))
 

@@ -47,14 +47,14 @@ def convex_edges(
     visibility: of all views, which tells the outside of a surface. label: [N] of the points, 0 = none; ends: its
     borders. Both labels must fall off behind the other's plane at most of the points where they touch.
     """
-    names = np.unique(label[label > 0])
+    labels = np.unique(label[label > 0])
     row, other = ends.touches
     sinks = _sinking(points, _towards_cameras(points, cameras, visibility), label, ends)
-    a, b = np.searchsorted(names, label[ends.rows[row]]), np.searchsorted(names, other)
-    meets, convex = np.zeros((2, len(names), len(names)))
+    a, b = np.searchsorted(labels, label[ends.rows[row]]), np.searchsorted(labels, other)
+    meets, convex = np.zeros((2, len(labels), len(labels)))
     np.add.at(meets, (a, b), 1)
     np.add.at(convex, (a, b), sinks >= _SINKS)
-    border = np.bincount(np.searchsorted(names, label[ends.rows[np.unique(row)]]), minlength=len(names))
+    border = np.bincount(np.searchsorted(labels, label[ends.rows[np.unique(row)]]), minlength=len(labels))
     mostly = convex > _CONVEX * meets
     along = convex >= _ALONG * (border[:, None] + _PRESUMED)
     return np.asarray(mostly & mostly.T & (along | along.T))

@@ -105,27 +105,27 @@ def hierarchy(
     Then, round by round, the sets of pieces with the highest agreement are, each piece once a round, until none reaches
     `min_agreement`; a thing and stuff never are. The order of the views does not matter, nor that of the masks.
     """
-    names = np.unique(labels.label[labels.label > 0]).astype(np.int32)
+    leaves = np.unique(labels.label[labels.label > 0]).astype(np.int32)
     ends = borders(labels.label, points, TouchingParams())
     surface = lit_surfaces(points, cameras, labels.label, ends, params.shadows)
-    _, surface_of = np.unique(surface[names], return_inverse=True)
+    _, surface_of = np.unique(surface[leaves], return_inverse=True)
     is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)
     contact = find_contact(ends, labels.label)
     sheets = find_sheets(points, labels, ends, flush=params.flush, height=params.bulge)
-    edges = np.zeros((len(names), len(names)), bool)
+    edges = np.zeros((len(leaves), len(leaves)), bool)
     if params.convex:
         edges = convex_edges(points, cameras, visibility, labels.label, ends)
-    own: list[tuple[int, ...]] = [(row,) for row in range(len(names))]
-    pieces = _Pieces(views_of(names, tallies), is_stuff, contact, edges, own, mounds, sheets, params)
-    node, parent, agreement, stuff = names.tolist(), [0] * len(names), [1.0] * len(names), is_stuff.tolist()
-    top = list(range(len(names)))  # the tree's row of each piece
+    own: list[tuple[int, ...]] = [(row,) for row in range(len(leaves))]
+    pieces = _Pieces(views_of(leaves, tallies), is_stuff, contact, edges, own, mounds, sheets, params)
+    node, parent, agreement, stuff = leaves.tolist(), [0] * len(leaves), [1.0] * len(leaves), is_stuff.tolist()
+    top = list(range(len(leaves)))  # the tree's row of each piece
     lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
     united = [(members, params.shadows.agreement) for members in lit] or pieces.best_unions()
     while united:
         for members, share in united:
             row = len(node)
-            node.append(labels.num_labels + 1 + row - len(names))
+            node.append(labels.num_labels + 1 + row - len(leaves))
             parent.append(0)
             agreement.append(share)
             stuff.append(stuff[top[members[0]]])

@@ -107,7 +107,7 @@ def spread(
     prompts = spread_prompts(painted, photo.frame.width, set(clicked.label.tolist()), params)
     found = prompt(photo, prompts, model, params.speckle)
     masks = found.dense()
-    fits = [_fits(painted, mask, name) for mask, name in zip(masks, found.label.tolist(), strict=True)]
+    fits = [_fits(painted, mask, label_id) for mask, label_id in zip(masks, found.label.tolist(), strict=True)]
     kept = np.array(fits, bool)
     return mask_set(
         photo.frame.name,
@@ -118,8 +118,8 @@ def spread(
     )
 
 
-def _fits(painted: PaintedView, mask: Bool, name: int) -> bool:
+def _fits(painted: PaintedView, mask: Bool, label_id: int) -> bool:
     """Whether a mask [H, W] holds most pixels of a label, and this label is most of what it holds."""
     held = painted.label[mask.ravel()[painted.pixel]]
-    own = int((held == name).sum())
-    return own >= _MOST * int((painted.label == name).sum()) and own >= _MOST * int((held > 0).sum())
+    own = int((held == label_id).sum())
+    return own >= _MOST * int((painted.label == label_id).sum()) and own >= _MOST * int((held > 0).sum())

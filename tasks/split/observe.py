@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,9 +24,6 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.geometry.clustering import main_clusters
 from ss_flow.tasks.masks.erosion import ErosionParams, interiors
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 
 @dataclass(frozen=True)
@@ -97,12 +93,3 @@ def observe(
         row=np.concatenate([np.zeros(0, np.int32), *rows]),
         standing=np.concatenate([np.zeros(0, np.uint8), *standings]),
     )
-
-
-def membership(groups: list[Int32], num_points: int) -> csr_array:
-    """Groups of points as a sparse matrix [groups, points] of ones."""
-    from scipy.sparse import csr_array
-
-    bounds = np.cumsum([0, *(len(group) for group in groups)])
-    columns = np.concatenate([np.zeros(0, np.int32), *groups])
-    return csr_array((np.ones(len(columns), np.float32), columns, bounds), shape=(len(groups), num_points))

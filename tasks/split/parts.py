@@ -13,8 +13,7 @@ from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import STRAY, Bool, Int32, MaskSet, Observation, PointLabels, PointParts
 from ss_flow.tasks.ranges import Count, Fraction
-from ss_flow.tasks.split.observe import membership
-from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence
+from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence, membership
 from ss_flow.tasks.split.votes.votes import Votes
 
 
@@ -89,8 +88,8 @@ def _owners(seen: Observation, shown: Int32, label: Int32) -> Int32:
     """
     owner = np.full(len(label), -1, np.int32)
     for j, mask in enumerate(seen.mask.tolist()):  # smaller ones come later
-        part = slice(seen.first[j], seen.first[j + 1])
-        row = seen.row[part][seen.standing[part] != STRAY]
+        row, standing = seen.under(j)
+        row = row[standing != STRAY]
         owner[row[label[row] == shown[mask]]] = mask
     return owner
 

@@ -166,15 +166,15 @@ def _sightings(label: Int32, observations: Sequence[Observation], matched: Match
     worth = np.zeros(3)
     worth[[BORDER, INSIDE]] = 1 / 3, 1.0
     seen, shown = np.zeros(len(label), np.int32), np.zeros(len(label))
-    name_of = {(k, mask): name for k, mask, name in zip(matched.view, matched.mask, matched.label, strict=True)}
+    label_of = {(k, mask): given for k, mask, given in zip(matched.view, matched.mask, matched.label, strict=True)}
     for k, observation in enumerate(observations):
         seen[observation.point_index] += 1
         best = np.zeros(len(label))
         for j, mask in enumerate(observation.mask.tolist()):
-            part = slice(observation.first[j], observation.first[j + 1])
-            under = observation.point_index[observation.row[part]]
-            own = label[under] == name_of.get((k, mask), -1)
-            best[under[own]] = np.maximum(best[under[own]], worth[observation.standing[part][own]])
+            row, standing = observation.under(j)
+            under = observation.point_index[row]
+            own = label[under] == label_of.get((k, mask), -1)
+            best[under[own]] = np.maximum(best[under[own]], worth[standing[own]])
         shown += best
     return seen, shown
 
@@ -185,8 +185,8 @@ def _settle(label: Int32, points: PointCloud, sightings: tuple[Int32, Float64], 
         label = merge_touching(label, points, params.touching)
     label = label.copy()
     reach = params.label_clusters.eps * points.spacing
-    for name, rows in rows_by_label(label).items():
-        if name:
+    for label_id, rows in rows_by_label(label).items():
+        if label_id:
             rest = rows[~params.label_clusters.kept(points.points[rows], points.spacing)]
             piece = dbscan(points.points[rest], reach, min_samples=1)
             seen, shown = (np.bincount(piece, of[rest]) for of in sightings)

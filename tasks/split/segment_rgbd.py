@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Int32, MaskSet
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, Int32, MaskSet
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size, pixels_under
@@ -18,6 +20,7 @@ from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Natural, NonNegative, Positive
 from ss_flow.tasks.split.regions.graph_segmentation import (
     RegionGraph,
+    Surface,
     boundaries,
     find_planes,
     superpixels,
@@ -90,12 +93,23 @@ def segment_rgbd(frame: Frame, depth: DepthMap, cameras: Cameras, *, params: Seg
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
     graph = RegionGraph(regions, lab, boundary, params.color_weight, params.color_scale)
 
-    areas = np.bincount(regions[regions >= 0], minlength=graph.size)
+    found = [*_merged(graph, regions, params), *_planes(surface, valid_small, params)]
+    return _finish(frame, valid, found, params)
 
-    masks: list[Bool] = []
-    quality: list[float] = []
-    stability: list[float] = []
-    grid: list[int] = []
+
+class _Mask(NamedTuple):
+    """One mask, and what `MaskSet` says of it."""
+
+    mask: Bool
+    """[h, w] at the working size."""
+    quality: float
+    stability: float
+    grid: int
+
+
+def _merged(graph: RegionGraph, regions: Int32, params: SegmentRgbdParams) -> Iterator[_Mask]:
+    """The regions of each level, the finest level first. regions: [h, w], -1 = none."""
+    areas = np.bincount(regions[regions >= 0], minlength=graph.size)
     for step, level in enumerate(sorted(params.levels)):
         graph.merge(level * 0.9)
         before = graph.owners()
@@ -110,62 +124,49 @@ def segment_rgbd(frame: Frame, depth: DepthMap, cameras: Cameras, *, params: Seg
             members = owners == region
             inner = np.bincount(before[members], areas[members]).max()
             outer = areas[after == after[region]].sum()
-            masks.append(labels == region)
-            quality.append(min(1.0, enclosure[int(region)]))
-            stability.append(float(inner / outer))
-            grid.append(len(params.levels) - 1 - step)
-    for plane in find_planes(surface, valid_small, params.plane_share, params.plane_tolerance):
-        opened = cv2.morphologyEx(plane.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        masks.append(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)).astype(bool) & valid_small)
-        quality.append(0.5)
-        stability.append(1.0)
-        grid.append(0)
-    found = _Masks(
-        np.array(masks).reshape(-1, height, width),
-        np.array(quality, np.float32),
-        np.array(stability, np.float32),
-        np.array(grid, np.int32),
-    )
-    return _finish(frame, valid, found, params)
+            quality = min(1.0, enclosure[int(region)])
+            yield _Mask(labels == region, quality, float(inner / outer), len(params.levels) - 1 - step)
 
 
-@dataclass(frozen=True)
-class _Masks:
-    masks: Bool
-    """[N, h, w] at the working size."""
-    quality: Float32
-    stability: Float32
-    grid: Int32
-
-    def __getitem__(self, rows: Int32) -> _Masks:
-        return _Masks(self.masks[rows], self.quality[rows], self.stability[rows], self.grid[rows])
-
-
-def _finish(frame: Frame, valid: Bool, found: _Masks, params: SegmentRgbdParams) -> MaskSet:
-    """Drop small masks and duplicates, scale the rest to the frame, and put them in canonical order."""
+def _planes(surface: Surface, valid: Bool, params: SegmentRgbdParams) -> Iterator[_Mask]:
+    """Large planes, with smooth borders."""
     import cv2
 
-    share = params.min_area * found.masks.shape[1] * found.masks.shape[2]
-    found = found[np.flatnonzero(found.masks.sum(axis=(1, 2)) >= max(1, share)).astype(np.int32)]
-    found = found[drop_duplicates(found.masks, found.quality, params.duplicate_iou)]
+    for plane in find_planes(surface, valid, params.plane_share, params.plane_tolerance):
+        opened = cv2.morphologyEx(plane.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)).astype(bool)
+        yield _Mask(closed & valid, 0.5, 1.0, 0)
+
+
+def _finish(frame: Frame, valid: Bool, found: Sequence[_Mask], params: SegmentRgbdParams) -> MaskSet:
+    """Drop small masks and duplicates, scale the rest to the frame, and put them in canonical order.
+
+    valid: [H, W] of the frame.
+    """
+    import cv2
+
+    found = [one for one in found if one.mask.sum() >= max(1, params.min_area * one.mask.shape[0] * one.mask.shape[1])]
+    if found:
+        quality = np.array([one.quality for one in found], np.float32)
+        kept = drop_duplicates(np.array([one.mask for one in found]), quality, params.duplicate_iou)
+        found = [found[row] for row in kept]
     size = (frame.width, frame.height)
-    full = np.zeros((len(found.masks), frame.height, frame.width), bool)
-    for index, mask in enumerate(found.masks):
-        full[index] = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) >= 0.5
+    full = np.zeros((len(found), frame.height, frame.width), bool)
+    for mask, one in zip(full, found, strict=True):
+        mask[:] = cv2.resize(one.mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) >= 0.5
     full &= valid
-    rows = np.flatnonzero(
-        full.sum(axis=(1, 2)) >= max(params.min_pixels, params.min_area * frame.width * frame.height)
-    ).astype(np.int32)
+    least = max(params.min_pixels, params.min_area * frame.width * frame.height)
+    rows = np.flatnonzero(full.sum(axis=(1, 2)) >= least).astype(np.int32)
     rows = rows[canonical_order(full[rows])]
-    full, found = full[rows], found[rows]
+    full, found = full[rows], [found[row] for row in rows]
     return MaskSet(
         **vars(Masks.of(full)),
         name=frame.name,
         height=frame.height,
         width=frame.width,
-        predicted_iou=found.quality,
-        stability=found.stability,
-        grid=found.grid,
+        predicted_iou=np.array([one.quality for one in found], np.float32),
+        stability=np.array([one.stability for one in found], np.float32),
+        grid=np.array([one.grid for one in found], np.int32),
         parent=mask_tree(full, params.contained),
         source="rgbd-graph",
     )

@@ -192,9 +192,8 @@ def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
     monkeypatch.setattr(file_digests, "digest_file", lambda p: reads.append(p) or real(p))
     photo = tmp_path / "photo"
     photo.write_text("one")
-    first = FileDigests(tmp_path / "files.json")
-    value = first(photo)
-    first.save()
+    with FileDigests(tmp_path / "files.json") as first:
+        value = first(photo)
     again = FileDigests(tmp_path / "files.json")
     assert again(photo) == value
     assert len(reads) == 1

@@ -48,6 +48,7 @@ def applied(*steps: object) -> tuple[EditedScene, Objects]:
         ({"op": "transform", "instances": 2, "move": [1, 2, "x"]}, "it must be three numbers"),
         ({"op": "transform", "instances": 2, "scale": 0}, "scale is 0; it must be a number above 0."),
         ({"op": "transform", "instances": 2, "scale": float("nan")}, "it must be a number above 0."),
+        ({"op": "transform", "instances": 2, "scale": 10**400}, "it must be a number above 0."),
         (
             {"op": "transform", "instances": 2, "rotate": {"axis": [0, 0, 0], "degrees": 9}},
             'it must be such as {"axis": [0, 0, 1], "degrees": 90}, with an axis that is not 0.',

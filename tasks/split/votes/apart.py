@@ -12,8 +12,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Int32, Observation, PointCloud
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
-from ss_flow.tasks.split.observe import membership
-from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence
+from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence, membership
 
 
 def part_labels(
@@ -40,12 +39,12 @@ def part_labels(
     of: list[int] = []
     rows_of = rows_by_label(label)
     rows_of.pop(0, None)
-    for name, rows in rows_of.items():
+    for label_id, rows in rows_of.items():
         component = dbscan(cloud.points[rows], reach, min_samples=1)
         large = np.flatnonzero(np.bincount(component) >= max(min_points, share * len(rows)))
         if len(large) > 1:
             pieces += [rows[component == number].astype(np.int32) for number in large]
-            of += [name] * len(large)
+            of += [label_id] * len(large)
     if not pieces:
         return label
     whole = np.array(of, np.int32)

@@ -18,7 +18,6 @@ import numpy as np
 from ss_flow.running import progress
 from ss_flow.tasks.artifacts import INSIDE, STRAY, Float32, Float64, Int32, Observation
 from ss_flow.tasks.ranges import Count, Fraction
-from ss_flow.tasks.split.observe import membership
 from ss_flow.tasks.split.votes.votes import Votes
 
 if TYPE_CHECKING:
@@ -92,6 +91,15 @@ def _cluster(views: list[list[Int32]], num_points: int, params: MaskClusteringPa
         for (_, k, j), label in zip(found, number[cluster].tolist(), strict=True):
             labels[k][j] = label
     return [labels[k] for k in original]
+
+
+def membership(groups: list[Int32], num_points: int) -> csr_array:
+    """Groups of points as a sparse matrix [groups, points] of ones."""
+    from scipy.sparse import csr_array
+
+    bounds = np.cumsum([0, *(len(group) for group in groups)])
+    columns = np.concatenate([np.zeros(0, np.int32), *groups])
+    return csr_array((np.ones(len(columns), np.float32), columns, bounds), shape=(len(groups), num_points))
 
 
 def evidence(
@@ -185,11 +193,10 @@ def vote_at_once(
     for k, (seen, shown) in enumerate(zip(observations, labels, strict=True)):
         progress(k, len(labels), seen.name)
         for j in np.flatnonzero(shown).tolist():
-            part = slice(seen.first[j], seen.first[j + 1])
-            standing = seen.standing[part]
+            row, standing = seen.under(j)
             kept = standing != STRAY
             weight = np.where(standing == INSIDE, 1.0, params.border_vote)[kept]
-            votes.add(seen.point_index[seen.row[part][kept]], int(shown[j]), weight)
+            votes.add(seen.point_index[row[kept]], int(shown[j]), weight)
         if len(seen.mask):  # a view without masks knows nothing
             free = np.ones(len(seen.point_index), bool)
             free[seen.row] = False

@@ -112,8 +112,8 @@ def _match(
     mask: int, view: Visibility, seen: Observation, virtual: Int32, num_labels: int, params: SequentialParams
 ) -> Match:
     """The label that a mask overlaps most, or none when it hardly overlaps any (spec S4.2)."""
-    part = slice(seen.first[mask], seen.first[mask + 1])
-    pixels = np.unique(view.pixel[seen.row[part][seen.standing[part] != BORDER]])
+    row, standing = seen.under(mask)
+    pixels = np.unique(view.pixel[row[standing != BORDER]])
     overlap = np.bincount(virtual[pixels], minlength=num_labels + 1)[1:]
     total = int(overlap.sum())
     if total < max(params.min_overlap, params.min_overlap_share * len(pixels), 1):

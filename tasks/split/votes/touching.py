@@ -57,14 +57,14 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
     if not labels.any():
         return labels
     # Numbered by their first points, after 0.
-    names, first, inverse = np.unique(np.append(np.int32(0), labels), return_index=True, return_inverse=True)
+    originals, first, inverse = np.unique(np.append(np.int32(0), labels), return_index=True, return_inverse=True)
     order = np.argsort(first)
-    names = names[order]
+    originals = originals[order]
     label = np.argsort(order).astype(np.int32)[inverse[1:]]
     rows, beside, _, touches = borders(label, cloud, params)
     bins = bins_of(cloud.colors)
     colors: dict[int, Float32] = {}
-    united = np.arange(len(names), dtype=np.int32)
+    united = np.arange(len(originals), dtype=np.int32)
     while True:
         own = united[label[rows]]
         at_border = (united[label[beside]] != own[:, None]).sum(axis=1) >= _ACROSS
@@ -72,15 +72,15 @@ def merge_touching(labels: Int32, cloud: PointCloud, params: TouchingParams) -> 
         for a, b in _meeting(own, at_border, touches[0], united[touches[1]], params.contact):
             if taken & {a, b}:
                 continue
-            for name in {a, b} - colors.keys():
-                colors[name] = histogram(bins[label == name], params.color_spread)
+            for label_id in {a, b} - colors.keys():
+                colors[label_id] = histogram(bins[label == label_id], params.color_spread)
             if likeness(colors[a], colors[b]) >= params.similarity:
                 taken |= {a, b}
                 united[united == b] = a
                 colors[a] += colors.pop(b)
         if not taken:
-            lowest = np.full(len(names), np.iinfo(np.int32).max, np.int32)
-            np.minimum.at(lowest, united, names)
+            lowest = np.full(len(originals), np.iinfo(np.int32).max, np.int32)
+            np.minimum.at(lowest, united, originals)
             return lowest[united][label]
 
 
@@ -121,9 +121,9 @@ def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> Borders:
     even = np.abs(np.einsum("tc,tc->t", normal[i], normal[j])) >= np.cos(np.radians(params.angle))
     for end in (i, j):
         even &= np.abs(np.einsum("tc,tc->t", normal[end], ahead)) <= np.sin(np.radians(params.angle))
-    names = int(label.max(initial=0)) + 1
-    touches = i * names + label[rows[j]]
-    some, smooth = (np.stack(np.divmod(np.unique(of), names)).astype(np.int32) for of in (touches, touches[even]))
+    base = int(label.max(initial=0)) + 1
+    touches = i * base + label[rows[j]]
+    some, smooth = (np.stack(np.divmod(np.unique(of), base)).astype(np.int32) for of in (touches, touches[even]))
     return Borders(rows, beside, some, smooth)
 
 
@@ -152,12 +152,12 @@ def _meeting(own: Int32, at_border: Bool, point: Int32, touched: Int32, contact:
 
     own: [R] label of each point. at_border: [R] which lie at its border. point, touched: [T] which touches which label.
     """
-    names = int(max(own.max(initial=0), touched.max(initial=0))) + 1
+    base = int(max(own.max(initial=0), touched.max(initial=0))) + 1
     kept = at_border[point] & (own[point] != touched)
-    once = np.unique(point[kept].astype(np.int64) * names + touched[kept])
-    pairs, count = np.unique(own[once // names].astype(np.int64) * names + once % names, return_counts=True)
-    a, b = np.divmod(pairs, names)
-    share = count / np.bincount(own[at_border], minlength=names)[a]
+    once = np.unique(point[kept].astype(np.int64) * base + touched[kept])
+    pairs, count = np.unique(own[once // base].astype(np.int64) * base + once % base, return_counts=True)
+    a, b = np.divmod(pairs, base)
+    share = count / np.bincount(own[at_border], minlength=base)[a]
     low, high = np.minimum(a, b), np.maximum(a, b)
     order = np.lexsort((high, low, -share))
     order = order[share[order] >= contact]

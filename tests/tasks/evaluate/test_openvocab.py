@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import LabelMap
 from ss_flow.tasks.evaluate.openvocab import (
     labelled_frame,
-    object_ious,
     oracle_ious,
     oracle_scores,
     oracle_targets,
@@ -114,30 +112,6 @@ def test_no_labels_cannot_be_scored() -> None:
         with pytest.raises(InputError, match="no polygon"):
             scores([])
     assert iou(np.zeros((2, 2), bool), np.zeros((2, 2), bool)) == 0
-
-
-def _maps(*views: list[int]) -> tuple[LabelMap, ...]:
-    return tuple(LabelMap(str(i), np.array([ids], np.uint16)) for i, ids in enumerate(views))
-
-
-def test_objects_are_scored_with_one_id_and_frame_by_frame() -> None:
-    truth = _maps([1, 1, 2, 2], [1, 1, 0, 0], [0, 0, 0, 0])
-    predicted = _maps([5, 5, 6, 0], [6, 6, 0, 0], [0, 0, 0, 5])
-    result = object_ious(predicted, truth)
-    assert result.object_ids == (1, 2) and result.best_id == (5, 6)
-    # Object 1: id 5 covers 2 of 4 pixels and one elsewhere, id 6 covers 2 and one elsewhere; the lower id of equals.
-    np.testing.assert_allclose(result.pooled, [2 / 5, 1 / 4])
-    np.testing.assert_allclose(result.per_frame, [1, 1 / 2])
-    assert result.scores() == {"pooled_iou": pytest.approx(0.325), "per_frame_iou": pytest.approx(0.75)}
-    void = object_ious(predicted, truth, zero_is_void=True)
-    np.testing.assert_allclose(void.pooled, [1 / 2, 1 / 4])
-
-
-def test_an_object_that_nothing_touches_scores_zero() -> None:
-    result = object_ious(_maps([0, 3]), _maps([1, 2]))
-    assert result.best_id == (0, 3) and result.pooled.tolist() == [0, 1]
-    with pytest.raises(InputError, match="no object"):
-        object_ious(_maps([1]), _maps([0]))
 
 
 @pytest.mark.skipif(not SHELF.is_dir(), reason="the capture apc_shelf is not beside the project")

@@ -24,7 +24,8 @@ from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.splat import merge as module
 from ss_flow.tasks.splat import reconstruct as reconstruct_module
 from ss_flow.tasks.splat.global_pass import assemble, global_pass
-from ss_flow.tasks.splat.merge import MergeParams, Quality, acceptable, merge_pair
+from ss_flow.tasks.splat.guard import Quality, acceptable
+from ss_flow.tasks.splat.merge import MergeParams, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
 from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
 from ss_flow.tasks.splat.render_masks import RenderMasksParams, render_masks
