@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from zarr.codecs import BloscCodec
 
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import digest
@@ -32,6 +35,39 @@ def test_a_small_array_reads_back_as_zarr_reads_it(tmp_path_factory, content):
     assert ours.dtype == theirs.dtype == content.dtype.newbyteorder("=")
     np.testing.assert_array_equal(ours, theirs)
     np.testing.assert_array_equal(ours, content)
+
+
+def files_of(folder: Path) -> dict[str, object]:
+    files = {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+    return {name: json.loads(data) if name.endswith("json") else data for name, data in files.items()}
+
+
+@given(
+    st.sampled_from(KINDS),
+    st.sampled_from([(20_001,), (300, 80), (90, 20, 13)]),
+    st.booleans(),
+    st.integers(3000, 70_000),
+)
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_large_array_is_written_as_zarr_writes_it(tmp_path_factory, kind, shape, by_columns, chunk_bytes):
+    folder = tmp_path_factory.mktemp("codec")
+    content = np.random.default_rng(0).integers(0, 4, shape).astype(kind, order="F" if by_columns else "C")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "CHUNK_BYTES", chunk_bytes)
+        patch.setattr(codec, "PLAIN_BYTES", 0)
+        codec.write(LabelMap("x", content), folder / "ours")
+        theirs = zarr.create_array(
+            folder / "theirs",
+            shape=shape,
+            dtype=content.dtype.newbyteorder("="),
+            chunks=codec._chunks(content),
+            compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
+            fill_value=0,
+            config={"write_empty_chunks": True},
+        )
+        theirs[...] = content
+        np.testing.assert_array_equal(codec.read(folder / "ours").ids, content)
+    assert files_of(folder / "ours/ids") == files_of(folder / "theirs")
 
 
 @dataclass(frozen=True)
