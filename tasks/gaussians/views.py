@@ -13,7 +13,7 @@ from ss_flow.tasks.artifacts import Bool, ColourTransform, DepthMap, Float32, Fl
 from ss_flow.tasks.geometry.cameras import Camera, pixels_in_view
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
-from ss_flow.tasks.geometry.images import averaged_valid, decode_valid, pixels_under, shared_rgb, transformed
+from ss_flow.tasks.geometry.images import averaged_valid, pixels_under, shared_rgb, shared_valid, transformed
 from ss_flow.tasks.geometry.visibility import VisibilityParams, surface_points
 from ss_flow.tasks.ranges import Count, Natural
 
@@ -259,7 +259,7 @@ def _crop(
     column, row = _pixels_of_crop(full, camera)
     x0, y0, width, height = _box(full, camera)
     photo = shared_rgb(frame)[y0 : y0 + height, x0 : x0 + width]
-    valid = decode_valid(frame)[y0 : y0 + height, x0 : x0 + width]
+    valid = shared_valid(frame)[y0 : y0 + height, x0 : x0 + width]
     if photo.shape[:2] != (camera.height, camera.width):
         photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         valid = averaged_valid(valid, camera.width, camera.height)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,31 +22,36 @@ def decode_rgb(frame: Frame) -> UInt8:
 
 def shared_rgb(frame: Frame) -> UInt8:
     """The same, read-only; for the many small steps of one scene, which cut their parts out of the same photos."""
-    return _decoded.of(frame)
+    return _decoded.of(frame.encoded, lambda: decode_rgb(frame))
+
+
+def shared_valid(frame: Frame) -> Bool:
+    """As `decode_valid`, likewise."""
+    return _decoded.of(frame.valid, lambda: decode_valid(frame)) if frame.valid.size else decode_valid(frame)
 
 
 class _Decoded:
-    """The photos that were decoded last, up to a number of bytes, for all threads of a process."""
+    """The images that were decoded last, up to a number of bytes, for all threads of a process."""
 
     def __init__(self, most_bytes: int) -> None:
         self._most_bytes = most_bytes
         self._lock = threading.Lock()
         # With the encoded bytes, or another array might come to have the id of one that is gone.
-        self._photos: OrderedDict[int, tuple[UInt8, UInt8]] = OrderedDict()
+        self._images: OrderedDict[int, tuple[UInt8, np.ndarray]] = OrderedDict()
 
-    def of(self, frame: Frame) -> UInt8:
-        name = id(frame.encoded)
+    def of(self, encoded: UInt8, decode: Callable[[], np.ndarray]) -> np.ndarray:
+        name = id(encoded)
         with self._lock:
-            if name in self._photos:
-                self._photos.move_to_end(name)
-                return self._photos[name][1]
-        photo = decode_rgb(frame)
-        photo.flags.writeable = False
+            if name in self._images:
+                self._images.move_to_end(name)
+                return self._images[name][1]
+        image = decode()
+        image.flags.writeable = False
         with self._lock:
-            self._photos[name] = frame.encoded, photo
-            while sum(kept.nbytes for _, kept in self._photos.values()) > self._most_bytes:
-                self._photos.popitem(last=False)
-        return photo
+            self._images[name] = encoded, image
+            while sum(kept.nbytes for _, kept in self._images.values()) > self._most_bytes:
+                self._images.popitem(last=False)
+        return image
 
 
 _decoded = _Decoded(256 << 20)

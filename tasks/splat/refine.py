@@ -16,7 +16,7 @@ from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.views import CropParams, SceneViews, Views, crop_camera, sample_depth
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.geometry.images import decode_valid
+from ss_flow.tasks.geometry.images import shared_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -176,7 +176,7 @@ def rendered(
     for row, name in enumerate(instance.views):
         view = view_of[name]
         shown = render_mask(solid, scene, view, params.alpha_threshold, cut_occluded=params.cut_occluded).mask
-        shown &= decode_valid(views.frames[view])
+        shown &= shared_valid(views.frames[view])
         if shown.any():
             rows.append(row)
             masks.append(Masks.of([shown]))
@@ -250,7 +250,7 @@ def _replacement(
     rows, column, row, _ = scene.surface_points(view, gaussians.means)
     if len(rows) < params.min_visible:
         return None
-    valid = decode_valid(scene.frames[view])
+    valid = shared_valid(scene.frames[view])
     rendered = render_mask(gaussians, scene, view, params.alpha_threshold, cut_occluded=params.cut_occluded)
     shown = rendered.mask & valid
     if not shown.any():

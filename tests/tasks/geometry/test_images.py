@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Frame
 from ss_flow.tasks.geometry import images
-from ss_flow.tasks.geometry.images import decode_rgb, encode_png, pixels_under, shared_rgb
+from ss_flow.tasks.geometry.images import decode_rgb, encode_png, pixels_under, shared_rgb, shared_valid
 
 
 def frame(seed: int) -> Frame:
@@ -39,6 +40,14 @@ def test_a_photo_is_decoded_once_and_nobody_may_write_on_it(decoded):
     np.testing.assert_array_equal(photo, decode_rgb(one))
     assert shared_rgb(one) is photo and decoded == ["v0"]
     assert not photo.flags.writeable and decode_rgb(one).flags.writeable
+
+
+def test_the_valid_pixels_are_decoded_once_too():
+    keep = np.random.default_rng(0).random((6, 8)) < 0.5
+    one = replace(frame(0), valid=encode_png(keep.astype(np.uint8) * 255))
+    np.testing.assert_array_equal(shared_valid(one), keep)
+    assert shared_valid(one) is shared_valid(one) and shared_valid(frame(0)).all()
+    np.testing.assert_array_equal(shared_rgb(one), decode_rgb(one))
 
 
 def test_what_was_asked_for_least_recently_is_forgotten_first(decoded):
