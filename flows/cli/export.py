@@ -17,8 +17,9 @@ from ss_flow.flows import export as formats
 from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run, references
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.deliver import STATUS_EXIT
-from ss_flow.flows.results import FinishedRun
+from ss_flow.flows.results import BACKGROUND, FinishedRun
 from ss_flow.task import FileRef
+from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.export.coco import coco
 from ss_flow.tasks.deliver.output import check_named, check_place, replacing
@@ -72,8 +73,8 @@ class Export:
         self._check_suffix(out, folder=folder)
         if workspace:
             return self._write_workspace(out, run)
-        if self.format != "coco" and not len(run.results.one("scene")):
-            raise InputError(f"{run.folder} has no Gaussians, so there is nothing to export as {self.format}.")
+        if self.format != "coco":
+            _check_there(run.results.one("scene"), ids, run.folder)
         pixels = _masks_and_photos(run) if self.format == "coco" else ((), ())
 
         def build() -> dict[str, Any]:
@@ -200,6 +201,13 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
         if name not in photos:
             photos[name] = f"{name}.{suffix_of(run.store.get(value))}"
     return masks, tuple(photos[name] for name in names)
+
+
+def _check_there(scene: Gaussians, ids: tuple[int, ...] | None, folder: Path) -> None:
+    """Raises InputError where a file would hold no Gaussian: other instances are known to have some."""
+    what = f"the background of {folder}" if ids == (BACKGROUND,) else str(folder)
+    if not (len(scene) if ids != (BACKGROUND,) else (scene.instance_id == BACKGROUND).any()):
+        raise InputError(f"{what} has no Gaussians, so there is nothing to export.")
 
 
 def _check_place(out: Path, *, folder: bool) -> None:

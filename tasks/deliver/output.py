@@ -24,6 +24,10 @@ from ss_flow.tasks.deliver import ply
 from ss_flow.tasks.geometry.images import encode_png
 
 RUN_FILE = "run.json"
+OWN_FILES = {RUN_FILE, "report.html", "instances.json", "descriptors.npz", "descriptors.png"}
+OWN_FILES |= {"scene.ply", "scene_labeled.ply", "cloud_labeled.ply"}
+OWN_FOLDERS = {"instances", "masks", "masks_split"}
+"""What a result consists of; other files beside these are the user's."""
 GRACE_SECONDS = 3600.0
 """For so long after its last change an unfinished folder counts as being filled, where no lock tells."""
 
@@ -62,11 +66,12 @@ def check_file(file: Path, instead: str) -> None:
 
 
 def check_named(file: Path, option: str) -> None:
-    """Raises InputError unless the file that an option names can be written here, which no file of a result can."""
+    """Raises InputError unless the file that an option names can be written here, which those of a result cannot."""
     instead = f"name another file with {option}"
-    folders = Path(os.path.realpath(file)).parents[:2]  # of a file in instances/, the second
-    if any(os.path.isfile(folder / RUN_FILE) for folder in folders):
-        raise InputError(f"{file} cannot be written: its folder is that of a result; {instead}.")
+    place = Path(os.path.realpath(file))
+    own = place.parent if place.name in OWN_FILES else place.parents[1] if place.parent.name in OWN_FOLDERS else None
+    if own and (own / RUN_FILE).is_file():
+        raise InputError(f"{file} cannot be written: it is part of a result; {instead}.")
     check_file(file, instead)
 
 

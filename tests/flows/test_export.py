@@ -211,12 +211,13 @@ def test_bad_usage_gets_one_sentence(tiny, tmp_path, more, said):
 
 
 @pytest.mark.parametrize(
-    ("format", "name"), [("ply", "scene.ply"), ("ply", "instances/0001.ply"), ("coco", "run.json"), ("ply", "new.ply")]
+    ("format", "name"),
+    [("ply", "scene.ply"), ("ply", "instances/0001.ply"), ("coco", "run.json"), ("ply", "masks/new.ply")],
 )
 def test_the_files_of_a_result_are_never_written_over(tiny, format, name):
     before = {path: path.stat().st_mtime_ns for path in tiny.out.rglob("*")}
     answer = export(tiny, "--format", format, "--out", tiny.out / name)
-    assert answer.code == 2 and "its folder is that of a result; name another file with --out." in answer.err
+    assert answer.code == 2 and "it is part of a result; name another file with --out." in answer.err
     assert {path: path.stat().st_mtime_ns for path in tiny.out.rglob("*")} == before
 
 

@@ -154,8 +154,13 @@ def test_what_the_encoder_is_shown_changes_the_descriptors_and_nothing_before_th
 
 
 def test_a_search_reads_the_prompt_of_the_run(warm):
-    run_tiny(warm.scene, warm.store, "--set", "query.prompt=an image", out=warm.out)
-    refused = ss_flow("query", warm.out, "red")
+    assert ss_flow("query", warm.out, "mug").code == 2  # names no colour
+    run_tiny(warm.scene, warm.store, "--set", "query.prompt=a red {text}", out=warm.out)
+    assert ss_flow("query", warm.out, "mug").code == 0
+
+
+def test_a_prompt_without_a_place_for_the_text_is_refused_before_the_run(warm):
+    refused = ss_flow("run", warm.scene, "--cache", warm.store, "--set", "query.prompt=an image", "--dry-run")
     assert refused.code == 2 and "'an image' has no {text} in it" in refused.err
 
 
