@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, UInt8
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
 from ss_flow.tasks.capture.colmap import load_pycolmap
 from ss_flow.tasks.capture.features import UNIT, Features
-from ss_flow.tasks.models.onnx import run, session_of
-
-if TYPE_CHECKING:
-    import onnxruntime
 
 Allowed = Callable[[slice], Bool]
 """For some features of a photo, which of the other photo's they may match: [n, M]."""
@@ -94,19 +89,19 @@ def match(photo: Features, others: Sequence[Features], *, guided: bool = False, 
     )
 
 
-def descriptor_matches(a: UInt8, b: UInt8, allowed: Allowed | None = None) -> Int32:
+def descriptor_matches(a: Float32, b: Float32, allowed: Allowed | None = None) -> Int32:
     """[M, 2] rows of descriptors that are each other's nearest, clearly nearer than the next (Lowe 2004, Sec. 7.1).
 
-    a, b: [N, 128], [M, 128] of length 512. allowed: which may match at all.
+    a, b: [N, 128], [M, 128] whole numbers of length 512, so that their products are exact in whatever order they are
+    added. allowed: which may match at all.
     """
     if len(a) == 0 or len(b) == 0:
         return np.zeros((0, 2), np.int32)
     least = np.float32(UNIT**2 * np.cos(_MAX_ANGLE))
-    upright = np.ascontiguousarray(b.T)
     rows, columns = [np.zeros(0, int)], [np.zeros(0, int)]
     for start in range(0, len(a), _BLOCK):
         block = slice(start, min(start + _BLOCK, len(a)))
-        product = _products(a[block], upright)
+        product = a[block] @ b.T
         if allowed is not None:
             product[~allowed(block)] = 0
         near = np.flatnonzero(product.max(axis=1) >= least)
@@ -122,7 +117,7 @@ def descriptor_matches(a: UInt8, b: UInt8, allowed: Allowed | None = None) -> In
         mutual = _nearest(b[column], a) == row
     else:
         # Of several that chose the same feature along their lines, the nearest stays.
-        product = np.einsum("ij,ij->i", a[row], b[column], dtype=np.int32)
+        product = np.einsum("ij,ij->i", a[row], b[column])
         order = np.lexsort((row, -product, column))
         mutual = np.zeros(len(row), bool)
         mutual[order] = np.diff(column[order], prepend=-1) != 0
@@ -153,7 +148,7 @@ class _Prepared:
     def __init__(self, pycolmap: Any, photo: Features) -> None:
         self._pycolmap = pycolmap
         self.points = photo.points.astype(np.float64)
-        self.descriptors = photo.descriptors
+        self.descriptors = photo.descriptors.astype(np.float32)
         focal = FIRST_FOCAL * max(photo.width, photo.height)
         model = pycolmap.CameraModelId.SIMPLE_PINHOLE
         self.camera = pycolmap.Camera.create_from_model_id(1, model, focal, photo.width, photo.height)
@@ -166,33 +161,14 @@ class _Prepared:
         )
 
 
-def _products(a: UInt8, b: UInt8) -> Int32:
-    """[N, M] int32 the products of a [N, K] and b [K, M], by ONNX Runtime: NumPy adds floats, in twice the time."""
-    (found,) = run(_product_of_bytes(), {"a": a, "b": b})
-    return np.asarray(found, np.int32)
-
-
-@functools.cache
-def _product_of_bytes() -> onnxruntime.InferenceSession:
-    import onnx
-
-    kinds = (("a", onnx.TensorProto.UINT8), ("b", onnx.TensorProto.UINT8), ("c", onnx.TensorProto.INT32))
-    *given, result = (onnx.helper.make_tensor_value_info(name, kind, [None, None]) for name, kind in kinds)
-    node = onnx.helper.make_node("MatMulInteger", ["a", "b"], ["c"])
-    graph = onnx.helper.make_graph([node], "products", given, [result])
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=9)
-    return session_of(bytes(model.SerializeToString()))
-
-
-def _nearest(a: UInt8, b: UInt8) -> Int32:
+def _nearest(a: Float32, b: Float32) -> Int32:
     """[N] the row of b that is nearest to each of a."""
-    upright = np.ascontiguousarray(b.T)
-    found = [_products(a[start : start + _BLOCK], upright).argmax(axis=1) for start in range(0, len(a), _BLOCK)]
+    found = [(a[start : start + _BLOCK] @ b.T).argmax(axis=1) for start in range(0, len(a), _BLOCK)]
     return np.concatenate([np.zeros(0, np.int32), *found]).astype(np.int32)
 
 
-def _angle(product: Int32) -> Float32:
-    angle: Float32 = np.arccos(np.minimum(product.astype(np.float32) / np.float32(UNIT**2), np.float32(1)))
+def _angle(product: Float32) -> Float32:
+    angle: Float32 = np.arccos(np.minimum(product / np.float32(UNIT**2), np.float32(1)))
     return angle
 
 

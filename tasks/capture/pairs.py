@@ -91,8 +91,8 @@ def partners(photo: Look, others: Sequence[Look], *, place: int, params: PairPar
 
 def _similar(photo: Look, others: Sequence[Look], count: int) -> Int32:
     """[len(others)] how many of the first `count` features of a photo match those of each other one."""
-    own = photo.descriptors[:count]
-    found = [len(descriptor_matches(own, other.descriptors[:count])) for other in others]
+    own = photo.descriptors[:count].astype(np.float32)
+    found = [len(descriptor_matches(own, other.descriptors[:count].astype(np.float32))) for other in others]
     return np.array(found, np.int32)
 
 

@@ -155,15 +155,6 @@ def _session(source: str | bytes, path: str, but: tuple[str, ...] = ()) -> onnxr
         raise _unreadable(path, error) from error
 
 
-def session_of(model: bytes) -> onnxruntime.InferenceSession:
-    """The session of a network that is made here, as a file's content, on the CPU; one a caller."""
-    onnxruntime = load_onnxruntime()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(model, options, providers=[_CPU])
-
-
 def read_graph(file: FileRef) -> tuple[Sequence[onnx.NodeProto], dict[str, Float32]]:
     """The nodes of an ONNX file, and its constant arrays by name. Raises InputError when the file is missing or holds
     no network."""
