@@ -67,10 +67,8 @@ def main() -> None:
             seconds, spent, peak = measured([*RUN, str(folder / "room"), *options])
             found = len(json.loads((folder / "out/instances.json").read_text())["instances"])
             store = folder_bytes(folder / "store") / 1e9
-        print(
-            f"{frames} frames: {seconds:.0f} s, {spent:.0f} CPU s, {peak:.2f} GB, {found} instances, store {store:.2f} GB",
-            flush=True,
-        )
+        print(f"{frames} frames: {seconds:.0f} s, {spent:.0f} CPU s, {peak:.2f} GB,", end=" ")
+        print(f"{found} instances, store {store:.2f} GB", flush=True)
 
 
 if __name__ == "__main__":
