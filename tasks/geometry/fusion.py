@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,8 @@ _SAMPLE = 20_000
 """So many points tell how noisy the depth is."""
 _ELSEWHERE = 0.05
 """Share of the depth from which on a view sees another surface than the point's."""
+_AT_ONCE = 1 << 22
+"""So many sums are held at once, or twice as many as there are voxels; each takes 56 bytes, thrice while added."""
 _CELLS = 1 << 21
 """Voxels a side that fit the 63-bit code of a voxel; farther points wrap around, which needs 40 km at 2 cm."""
 
@@ -42,11 +45,23 @@ class VoxelSums:
         return VoxelSums(self.position[keep], self.color[keep], self.weight[keep])
 
 
-def sum_by_voxel(parts: list[VoxelSums], voxel: float) -> VoxelSums:
+def sum_by_voxel(parts: Iterable[VoxelSums], voxel: float) -> VoxelSums:
     """Add up the points whose means lie in the same cube of side `voxel`; the order is that of the cubes in space.
 
     The origin is the centre of a cube, not a corner: a floor at height zero must not fall apart into two layers.
+    Of an iterator, hundreds of views are never held at once: what has come is added up in between.
     """
+    held: list[VoxelSums] = []
+    most = _AT_ONCE
+    for part in parts:
+        held.append(part)
+        if len(held) > 1 and sum(len(one.weight) for one in held) > most:
+            held = [_added_up(held, voxel)]
+            most = max(_AT_ONCE, 2 * len(held[0].weight))
+    return _added_up(held, voxel)
+
+
+def _added_up(parts: list[VoxelSums], voxel: float) -> VoxelSums:
     position, color, weight = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("position", "color", "weight")
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -48,11 +49,13 @@ def dense(
     Raises InputError when no two views agree.
     """
     voxel = voxel_side(cameras, depths, unit, params)
-    views = []
-    for view, (frame, depth) in enumerate(zip(frames, depths, strict=True)):
-        progress(view, len(frames), frame.name)
-        views.append(sum_by_voxel([depth_samples(frame, cameras, view, depth)], voxel))
-    cloud = consistent_cloud(sum_by_voxel(views, voxel), cameras, depths, voxel=voxel, unit=unit, params=params)
+
+    def views() -> Iterator[VoxelSums]:
+        for view, (frame, depth) in enumerate(zip(frames, depths, strict=True)):
+            progress(view, len(frames), frame.name)
+            yield sum_by_voxel([depth_samples(frame, cameras, view, depth)], voxel)
+
+    cloud = consistent_cloud(sum_by_voxel(views(), voxel), cameras, depths, voxel=voxel, unit=unit, params=params)
     if not len(cloud.points):
         raise InputError(
             "The depth maps of this scene agree in no point; they should be z-depths in the unit of the camera poses."

@@ -79,10 +79,10 @@ def dense_splatting(
     seeds = with_sparse_points(cameras, depths)
     known = depths if any(depth.depth.any() for depth in depths) else seeds
     voxel = voxel_side(cameras, known, unit, params)
-    samples = [
+    samples = (
         sum_by_voxel([depth_samples(frame, cameras, view, seed)], voxel)
         for view, (frame, seed) in enumerate(zip(frames, seeds, strict=True))
-    ]
+    )
     initial = _first_gaussians(sum_by_voxel(samples, voxel), voxel, splatting.initial_points)
     seen = SceneViews(frames, cameras_by_view(cameras), depths, unit, colours, VisibilityParams())
     everything = [np.zeros((frame.height, frame.width), np.int32) for frame in frames]

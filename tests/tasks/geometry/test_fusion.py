@@ -1,9 +1,12 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap
+from ss_flow.tasks.geometry import fusion
 from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_at, depth_noise, sum_by_voxel
 
 
@@ -19,6 +22,23 @@ def test_points_of_one_voxel_are_averaged_by_weight():
     np.testing.assert_allclose(position, [[-0.1, 0.1, 0.1], [1.0, 0, 0]])
     np.testing.assert_allclose(color, [[50] * 3, [30] * 3])
     assert twice.weight.tolist() == [3, 1]
+
+
+def test_many_views_are_added_up_as_they_come_and_never_held_at_once(monkeypatch):
+    def views():
+        for seed in range(60):
+            yield samples(np.random.default_rng(seed).uniform(-5, 5, (4000, 3)), seed)
+
+    whole = sum_by_voxel(list(views()), 1.0)
+    monkeypatch.setattr(fusion, "_AT_ONCE", 6000)
+    tracemalloc.start()
+    found = sum_by_voxel(views(), 1.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60 * 4000 * 56 / 4
+    np.testing.assert_allclose(found.position, whole.position, atol=1e-9)
+    np.testing.assert_allclose(found.color, whole.color)
+    assert found.weight.tolist() == whole.weight.tolist()
 
 
 @settings(deadline=None)
