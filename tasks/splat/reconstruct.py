@@ -30,7 +30,7 @@ from ss_flow.tasks.geometry.cameras import camera_extent
 from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.masks.packing import dilated
+from ss_flow.tasks.masks.dilation import dilated
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive, Range
 from ss_flow.tasks.splat.consensus import agreed, completed
 

@@ -20,8 +20,8 @@ from ss_flow.tasks.geometry.images import shared_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
+from ss_flow.tasks.masks.dilation import grown
 from ss_flow.tasks.masks.overlap import iou
-from ss_flow.tasks.masks.packing import grown
 from ss_flow.tasks.masks.pool import without_speckles
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity

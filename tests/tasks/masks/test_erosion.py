@@ -4,8 +4,8 @@ from box_scene import mask_set
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ss_flow.tasks.masks.dilation import grown
 from ss_flow.tasks.masks.erosion import ErosionParams, erode, interiors
-from ss_flow.tasks.masks.packing import grown
 
 
 def square(size, low, high):
