@@ -205,8 +205,10 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
 
 def _check_there(scene: Gaussians, ids: tuple[int, ...] | None, folder: Path) -> None:
     """Raises InputError where a file would hold no Gaussian: other instances are known to have some."""
-    what = f"the background of {folder}" if ids == (BACKGROUND,) else str(folder)
-    if not (len(scene) if ids != (BACKGROUND,) else (scene.instance_id == BACKGROUND).any()):
+    held, what = scene.instance_id, str(folder)
+    if ids == (BACKGROUND,):
+        held, what = held[held == BACKGROUND], f"the background of {folder}"
+    if not len(held):
         raise InputError(f"{what} has no Gaussians, so there is nothing to export.")
 
 
