@@ -18,6 +18,10 @@ from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_no
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, pixels_under
 from ss_flow.tasks.ranges import Count, NonNegative, Positive, Range
 
+SIDES_PER_OCTAVE = 8
+"""Sides that a sampling cube may have between a length and its double. Were the side any number, one photo more would
+move all points, those of objects that it does not show too."""
+
 
 @dataclass(frozen=True)
 class DenseParams:
@@ -88,8 +92,8 @@ def consistent_cloud(
         )
         if kept.sum() <= params.max_points:
             break
-        # On surfaces the count falls with the square of the side; a slightly larger side ends the loop soon.
-        voxel *= 1.05 * float(np.sqrt(kept.sum() / params.max_points))
+        # On surfaces the count falls with the square of the side.
+        voxel = _one_of_few(voxel * np.sqrt(kept.sum() / params.max_points), np.ceil)
         cloud = sum_by_voxel([cloud.take(kept)], voxel)
     points = means[kept].astype(np.float32)
     rounded = np.rint(colors[kept]).astype(np.uint8)
@@ -98,7 +102,13 @@ def consistent_cloud(
 
 def voxel_side(cameras: Cameras, depths: tuple[DepthMap, ...], unit: SceneUnit, params: DenseParams) -> float:
     """Side of the sampling cube, in world units."""
-    return min(params.voxel * unit.length, params.voxel_pixels * _pixel_footprint(cameras, depths))
+    footprint = params.voxel_pixels * _pixel_footprint(cameras, depths)
+    return min(params.voxel * unit.length, _one_of_few(footprint, np.rint))
+
+
+def _one_of_few(side: float, to_integer: np.ufunc) -> float:
+    """One of `SIDES_PER_OCTAVE` sides."""
+    return float(2 ** (to_integer(SIDES_PER_OCTAVE * np.log2(side)) / SIDES_PER_OCTAVE))
 
 
 def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:

@@ -8,7 +8,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import DepthMap, SceneUnit
 from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.split.dense import DenseParams, dense
+from ss_flow.tasks.split.dense import DenseParams, dense, voxel_side
 
 
 def fuse(**changes):
@@ -33,6 +33,14 @@ def test_points_are_spaced_by_the_voxel():
 
 def test_no_more_points_remain_than_asked_for():
     assert 500 < len(fuse(max_points=1000).points) <= 1000
+
+
+def test_one_view_less_leaves_the_cubes_where_they_are():
+    fine = DenseParams(voxel=1.0)  # the footprint of a pixel decides
+    every = box_scene.depths()
+    fewer = (*every[:-1], replace(every[-1], depth=np.zeros_like(every[-1].depth)))
+    sides = [voxel_side(box_scene.cameras(), depths, SceneUnit(1.0), fine) for depths in (every, fewer)]
+    assert sides[0] == sides[1]
 
 
 def test_the_same_input_gives_the_same_bits():
