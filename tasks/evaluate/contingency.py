@@ -14,7 +14,7 @@ Labels = NDArray[np.integer]
 Counts = NDArray[np.int64]
 
 _LARGEST_TABLE = 1 << 24
-_AT_ONCE = 1 << 22
+_AT_ONCE = 1 << 20
 """So many elements are counted at once, which takes 32 bytes of each."""
 
 
