@@ -146,5 +146,5 @@ class Targets:
 
 def _mean(where: Bool, over: Bool | None = None) -> Float32:
     """Weights of a mean over some pixels, or of a sum of theirs over the number of others."""
-    count = np.count_nonzero(where if over is None else over)
+    count = int(np.count_nonzero(where if over is None else over))
     return where * np.float32(1 / max(count, 1))

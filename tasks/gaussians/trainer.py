@@ -215,7 +215,7 @@ class _Training:
         if params.max_scale:
             parameters.limit_scale(self._longest[parameters.origin])
         if self._control is not None:
-            pixels = np.count_nonzero(params.objective.counted(self._views[view]))
+            pixels = int(np.count_nonzero(params.objective.counted(self._views[view])))
             seen = Seen(found.gradients["centers"], found.radii, pixels)
             self._control.after(self.step, parameters, seen, self._generator)
 
