@@ -45,6 +45,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
@@ -53,8 +55,9 @@ from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, ren
 from ss_flow.cache.plain_json import reader
 from ss_flow.cache.recent import Recent
 
-MEMORY_BYTES = 2 << 30
-"""How much of what was read lately a process keeps in memory."""
+MEMORY_BYTES = min(1 << 30, psutil.virtual_memory().total // 16)
+"""How much of what was read lately a process keeps in memory: photos and depth maps of hundreds of views, at which each
+instance looks again, but no more than a small machine can spare."""
 GRACE_SECONDS = 3600.0
 """What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
 

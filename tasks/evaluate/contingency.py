@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ Labels = NDArray[np.integer]
 Counts = NDArray[np.int64]
 
 _LARGEST_TABLE = 1 << 24
+_AT_ONCE = 1 << 20
+"""So many elements are counted at once, which takes 32 bytes of each."""
 
 
 @dataclass(frozen=True)
@@ -64,29 +67,37 @@ class Contingency:
 
 
 def contingency(truth: Labels, predicted: Labels) -> Contingency:
-    """Count label pairs with one `bincount`: O(N) time, no mask per label.
+    """Count label pairs with `bincount`: O(N) time, no mask per label.
 
     truth, predicted: integer labels of the same shape, any values. Raises ValueError when the shapes differ.
     """
     if truth.shape != predicted.shape:
         raise ValueError(f"labellings of different shapes: {truth.shape} and {predicted.shape}")
-    truth_ids, g = _indexed(truth)
-    predicted_ids, p = _indexed(predicted)
+    truth_ids, place = _indexed(truth)
+    predicted_ids, predicted_place = _indexed(predicted)
     shape = len(truth_ids), len(predicted_ids)
-    pairs = np.bincount(g * shape[1] + p, minlength=shape[0] * shape[1]).reshape(shape).astype(np.int64)
+    pairs = np.zeros(shape[0] * shape[1], np.int64)
+    for some in _pieces(truth.size):
+        pairs += np.bincount(place(some) * shape[1] + predicted_place(some), minlength=len(pairs))
+    pairs = pairs.reshape(shape)
     return Contingency(truth_ids, predicted_ids, pairs, pairs.sum(axis=1), pairs.sum(axis=0))
 
 
-def _indexed(labels: Labels) -> tuple[Counts, Counts]:
-    """The distinct labels, ascending, and each element's place among them: [L], [N]."""
-    flat = labels.ravel().astype(np.int64)
-    if not flat.size:
-        return np.zeros(0, np.int64), flat
-    low, high = int(flat.min()), int(flat.max())
+def _indexed(labels: Labels) -> tuple[Counts, Callable[[slice], Counts]]:
+    """The distinct labels, ascending: [L]; and what tells the places of some elements among them."""
+    flat = labels.ravel()
+    low, high = (int(flat.min()), int(flat.max())) if flat.size else (0, -1)
     if high - low >= _LARGEST_TABLE:
-        ids, index = np.unique(flat, return_inverse=True)
-        return ids, index.ravel().astype(np.int64)
-    present = np.flatnonzero(np.bincount(flat - low))
+        ids, index = np.unique(flat.astype(np.int64), return_inverse=True)
+        return ids, lambda some: index[some]
     table = np.zeros(high - low + 1, np.int64)
+    for some in _pieces(flat.size):
+        table[flat[some].astype(np.int64) - low] = 1
+    present = np.flatnonzero(table)
     table[present] = np.arange(len(present))
-    return present + low, table[flat - low]
+    return present + low, lambda some: table[flat[some].astype(np.int64) - low]
+
+
+def _pieces(count: int) -> Iterator[slice]:
+    """All elements, some at a time."""
+    return (slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE))

@@ -19,7 +19,7 @@ from ss_flow.tasks.artifacts import Float32
 from ss_flow.tasks.gaussians.library import Workspace, address, library
 from ss_flow.tasks.gaussians.losses import gradients_of
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
-from ss_flow.tasks.gaussians.objective import Target, Weights
+from ss_flow.tasks.gaussians.objective import Target, Targets, Weights
 
 Array = Any
 """An array of a backend's device."""
@@ -75,6 +75,9 @@ class Backend(Protocol):
     def target(self, target: Target, num_labels: int) -> Any:
         """A view as `descent` and `strongest` take it."""
 
+    def targets(self, targets: Targets) -> Any:
+        """All views of a training, by their rows; on a device of its own they are all there from the start."""
+
     def descent(
         self, values: Values, labels: Array | None, target: Any, settings: Settings, weights: Weights
     ) -> Descent:
@@ -111,6 +114,9 @@ class NativeBackend:
 
     def target(self, target: Target, num_labels: int) -> Target:
         return target
+
+    def targets(self, targets: Targets) -> Targets:
+        return targets
 
     def descent(
         self, values: Values, labels: Array | None, target: Target, settings: Settings, weights: Weights

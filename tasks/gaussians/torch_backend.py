@@ -18,7 +18,7 @@ from torch.optim.adam import adam
 
 from ss_flow.tasks.gaussians.backends import EPSILON, AdamStep, Descent, Values
 from ss_flow.tasks.gaussians.native_pass import Settings
-from ss_flow.tasks.gaussians.objective import Target, Weights
+from ss_flow.tasks.gaussians.objective import Target, Targets, Weights
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered, renderer_on
 
 _RADIUS, _SIGMA = 5, 1.5
@@ -117,6 +117,9 @@ class TorchBackend:
             self.put(one_hot),
             self.put(channel_of_label),
         )
+
+    def targets(self, targets: Targets) -> list[_Target]:
+        return [self.target(target, targets.num_labels) for target in targets]
 
     def descent(
         self, values: Values, labels: Tensor | None, target: _Target, settings: Settings, weights: Weights

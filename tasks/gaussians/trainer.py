@@ -18,7 +18,7 @@ from ss_flow.tasks.gaussians.backends import AdamStep, Backend, Values, backend_
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecord, Schedule, Seen
 from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import Settings
-from ss_flow.tasks.gaussians.objective import Objective, Target, Weights
+from ss_flow.tasks.gaussians.objective import Objective, Target, Targets, Weights
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.gaussians.render import channels_of
@@ -148,8 +148,7 @@ class _Training:
     ) -> None:
         num_labels = len(label_ids) if params.mask_weight else 0
         self._initial, self._params, self._num_labels, self._backend = initial, params, num_labels, backend
-        self._targets = [Target.of(view, params.objective, num_labels) for view in views]
-        self._there = [backend.target(target, num_labels) for target in self._targets]
+        self._views, self._there = views, backend.targets(Targets(views, params.objective, num_labels))
         self._parts = (
             [(slice(p.start, p.stop), backend.target(p.target, 0)) for p in parts] if params.part_weight else []
         )
@@ -196,7 +195,7 @@ class _Training:
         """One step: render a view, compare, go down the gradient, mind the number of Gaussians."""
         params, parameters = self._params, self.parameters
         if not self._order:
-            self._order = self._generator.permutation(len(self._targets)).tolist()
+            self._order = self._generator.permutation(len(self._views)).tolist()
         view = self._order.pop()
         done_share = self.step / max(params.iterations - 1, 1)
         self.step += 1
@@ -216,7 +215,8 @@ class _Training:
         if params.max_scale:
             parameters.limit_scale(self._longest[parameters.origin])
         if self._control is not None:
-            seen = Seen(found.gradients["centers"], found.radii, self._targets[view].pixels)
+            pixels = int(np.count_nonzero(params.objective.counted(self._views[view])))
+            seen = Seen(found.gradients["centers"], found.radii, pixels)
             self._control.after(self.step, parameters, seen, self._generator)
 
     def _towards_parts(self, settings: Settings) -> Iterator[tuple[slice, Values]]:

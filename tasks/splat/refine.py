@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -97,7 +98,7 @@ def refine(
     views: Views,
     instance: InstanceMasks,
     gaussians: Gaussians,
-    embeddings: tuple[Embedding, ...],
+    embeddings: Sequence[Embedding],
     *,
     params: RefineParams,
     model: Model | None = None,
@@ -127,7 +128,7 @@ def refine(
         row = held.get(frame.name)
         old = None if row is None else instance.mask(row)
         drawn = row is not None and instance.origin[row] == DRAWN
-        prompt = segmenter.image(embeddings[view], few=True).predict_prompt if segmenter else None
+        prompt = functools.partial(_ask, segmenter, embeddings, view) if segmenter else None
         new = _replacement(scene, view, solid, old, drawn, params, prompt)
         if new is not None:
             masks.append(Masks.of([new]))
@@ -147,6 +148,12 @@ def refine(
         origin=np.array(origins, np.uint8),
         weak=instance.weak and len(names) < params.min_views,
     )
+
+
+def _ask(segmenter: Sam, embeddings: Sequence[Embedding], view: int, points: Float32) -> tuple[Bool, float]:
+    """The segmenter's mask of a view, and its score, for points in the photo. Few views are asked, so the embedding, by
+    far the largest of what belongs to a view, is read here only."""
+    return segmenter.image(embeddings[view], few=True).predict_prompt(points)
 
 
 @task(

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int64, LabelMap
+from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import neighbour_spread
 from ss_flow.tasks.gaussians.objective import Target
 from ss_flow.tasks.gaussians.trainer import PartView
@@ -79,7 +79,7 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
     """
     every = max(1, round(np.sqrt(sum(m.ids.size for m in masks) / SURFACE_PIXELS)))
     places: list[Float32] = []
-    shown_there: list[Int64] = []
+    shown_there: list[NDArray[np.uint16]] = []
     area = np.zeros(np.iinfo(np.uint16).max + 1, np.int64)
     known, nearby = np.zeros_like(area), np.zeros_like(area)
     for camera, depth, shown in zip(views.cameras, views.depths, masks, strict=True):
@@ -91,8 +91,9 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
         row, column = np.nonzero(z > 0)
         surface = surface_of_pixels(every * column, every * row, z[row, column], camera)
         places.append(surface.astype(np.float32))
-        shown_there.append(ids[row, column].astype(np.int64))
+        shown_there.append(ids[row, column])
     points, ids = np.concatenate(places), np.concatenate(shown_there)
+    del places, shown_there
     if not len(points):
         return {}
     most = int(ids.max()) + 1

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import psutil
 
 from ss_flow.cache.recent import Recent
-from ss_flow.cache.store import Store
+from ss_flow.cache.store import MEMORY_BYTES, Store
 from ss_flow.tasks.artifacts import LabelMap
 
 
@@ -38,6 +39,10 @@ def test_what_is_dropped_counts_no_longer():
     recent.drop("a")
     recent.drop("b")
     assert recent.get("a") is None and recent.bytes == 0
+
+
+def test_a_process_keeps_no_more_than_a_sixteenth_of_the_machines_memory():
+    assert 0 < MEMORY_BYTES <= psutil.virtual_memory().total / 16
 
 
 def test_a_store_gives_the_same_value_again_while_there_is_room_for_it(tmp_path):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from ss_flow.tasks.evaluate import contingency as module
 from ss_flow.tasks.evaluate.contingency import contingency
 
 _LABELS = hnp.arrays(np.int64, 40, elements=st.sampled_from([-1, 0, 1, 2, 7, 65535]))
@@ -23,6 +26,20 @@ def test_counts_and_ious_are_those_of_masks_compared_one_by_one(truth: np.ndarra
             a, b = truth == g, predicted == p
             assert table.intersection[i, j] == (a & b).sum()
             assert table.iou[i, j] == pytest.approx((a & b).sum() / (a | b).sum())
+
+
+def test_elements_are_counted_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth, predicted = np.random.default_rng(0).integers(0, 9, (2, 1_000_001)).astype(np.uint16)
+    at_once = contingency(truth, predicted)
+    monkeypatch.setattr(module, "_AT_ONCE", 1 << 12)
+    tracemalloc.start()
+    try:
+        table = contingency(truth, predicted)
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(table.intersection, at_once.intersection)
+    assert table.intersection.sum() == len(truth)
 
 
 def test_labels_far_apart_are_counted_without_a_table_of_their_range() -> None:

@@ -273,7 +273,7 @@ def test_a_step_carries_nothing_to_the_host_or_from_it(stand_in, with_labels):
         settings, weights = Settings((0.2, 0.4, 0.6), 7, 1, winners=False), Objective().at(0.5, 0.7)
         found = backend.descent(moved, channels, there, settings, weights)
         backend.adam(moved, found.gradients, first, second, AdamStep(1, {**rates, "means": 0.1 * longest}, 1))
-        record.add(found.gradients["centers"], found.radii, target.pixels)
+        record.add(found.gradients["centers"], found.radii, int(target.counted.sum()))
         parameters.limit_scale(longest)
     assert heard.moves == []
     for name in PARAMETERS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -204,6 +205,20 @@ def test_colours_gain_a_degree_every_so_many_steps(iterations, coefficients):
     assert sh.shape[1] == coefficients
     used = np.abs(sh).max(axis=(0, 2)) > 0
     assert used.sum() == coefficients  # the last step is the first of the highest degree
+
+
+def test_only_the_view_of_the_step_is_laid_out_for_the_losses():
+    laid_out = []
+
+    class Watching(NativeBackend):
+        def descent(self, values, labels, target, *rest):
+            laid_out.append(weakref.ref(target))
+            assert sum(one() is not None for one in laid_out) == 1
+            return super().descent(values, labels, target, *rest)
+
+    params = TrainParams(iterations=2 * len(VIEWS))
+    train(ball_points(), VIEWS, params=params, extent=1.6, seed=1, backend=Watching(1))
+    assert len(laid_out) == params.iterations
 
 
 def test_bad_input_is_refused():

@@ -94,6 +94,26 @@ def test_onnx_runtime_is_told_not_to_report_its_use_before_it_is_imported():
     assert others == ["onnx.py"]
 
 
+def test_networks_share_the_memory_that_they_work_in(tmp_path):
+    """Two that need 200 MB each while they run, one after the other."""
+    value = lambda name, side: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [side, side])  # noqa: E731
+    nodes = [
+        onnx.helper.make_node("Exp", ["x"], ["a"]),
+        onnx.helper.make_node("Concat", ["a"] * 50, ["b"], axis=0),
+        onnx.helper.make_node("ReduceMax", ["b"], ["y"], keepdims=1),
+    ]
+    graph = onnx.helper.make_graph(nodes, "large", [value("x", 1024)], [value("y", 1)])
+    opset = onnx.helper.make_opsetid("", 17)
+    file = tmp_path / "large.onnx"
+    file.write_bytes(onnx.helper.make_model(graph, opset_imports=[opset], ir_version=9).SerializeToString())
+    code = "import sys, psutil, numpy; from pathlib import Path; from ss_flow.task import FileRef; "
+    code += "from ss_flow.tasks.models.onnx import open_session, run; x = numpy.zeros((1024, 1024), numpy.float32); "
+    code += "sessions = [open_session(FileRef(Path(sys.argv[1]), name)) for name in 'ab']; held = []\n"
+    code += "for session in sessions: run(session, {'x': x}); held.append(psutil.Process().memory_info().rss)\n"
+    code += "assert held[1] - held[0] < 50e6, held"
+    subprocess.run([sys.executable, "-c", code, str(file)], check=True)
+
+
 class Runtime:
     """An ONNX Runtime with the CUDA provider; whether that starts is said when it is made."""
 

@@ -177,6 +177,24 @@ def test_the_segmenter_is_not_asked_where_no_answer_could_be_taken(small, box, m
     assert views_asked(sliver, margin=0.5, max_change=0.0) == VIEWS
 
 
+def test_an_embedding_is_read_where_the_segmenter_is_asked_and_nowhere_else(small, box, monkeypatch):
+    assert "embeddings" in refine.streamed
+
+    class Stored(tuple):
+        def __getitem__(self, view):
+            read.append(view)
+            return view
+
+    monkeypatch.setattr(module, "Sam", Scripted)
+    monkeypatch.setattr(Scripted, "answer", staticmethod(lambda view, _: small.ids[view] == 1))
+    for margin, expected in ((1.0, [1, 2]), (0.0, list(range(VIEWS)))):
+        read = []
+        instance = small.instance(1, views=[view for view in range(VIEWS) if view not in (1, 2)])
+        params = RefineParams(margin=margin)
+        found = refine(small.views, instance, box, Stored(range(VIEWS)), params=params, model=SEGMENTER)
+        assert found.views == NAMES and read == expected
+
+
 def test_an_answer_that_the_segmenter_itself_doubts_is_not_taken(small, box, monkeypatch):
     monkeypatch.setattr(Scripted, "score", 0.7)
     right = lambda view, _: small.ids[view] == 1  # noqa: E731
