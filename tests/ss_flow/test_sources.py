@@ -18,4 +18,4 @@ class LoadsAnother(str):
 def test_loaded_modules_can_be_looked_through_while_others_are_loaded(monkeypatch):
     modules = {LoadsAnother("probe.a"): ModuleType("probe.a"), "other": ModuleType("other")}
     monkeypatch.setattr(sources, "sys", SimpleNamespace(modules=modules))
-    assert sources._loaded.__wrapped__(("probe",), 2) == ["probe.a"]
+    assert sources._loaded.__wrapped__(("probe",), False, 2) == ["probe.a"]
