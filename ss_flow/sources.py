@@ -105,8 +105,13 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
             continue
         try:
             source = _read(name)
-            as_written = name.startswith("ss_flow.") or is_as_written(name)
-        except (OSError, ValueError, SyntaxError):  # its file has gone, or is no text; who needs it will say so
+            as_written = source is None or name.startswith("ss_flow.") or is_as_written(name)
+        except (
+            OSError,
+            ValueError,
+            SyntaxError,
+            ImportError,
+        ):  # its file has gone, or is no text; who needs it will say so
             continue
         changed = changed or (name in _known and _known[name][1] != source)
         _known[name] = specification, source
