@@ -181,13 +181,23 @@ class Flow:
 
         given = task.arguments(args, kwargs)
         inputs: dict[str, Any] = {
-            n: value if isinstance(value, Node) else gather(value) for n, value in given[0].items()
+            name: value if isinstance(value, Node) else _gathered_input(task, name, value)
+            for name, value in given[0].items()
         }
         for name, node in inputs.items():
             if node.flow is not self:
                 raise TypeError(f"the input {name} of {task.name} is a node of another flow")
         parameters = {name: own_copy(name, value, task.hints.get(name)) for name, value in given[1].items()}
         return Call(self, task.name, _item.get(), task, inputs, parameters)
+
+
+def _gathered_input(task: Task[..., Any], name: str, value: Any) -> Any:
+    if isinstance(value, Iterable) and not hasattr(value, "dtype"):
+        return gather(list(value))
+    kind = type(value).__name__
+    raise TypeError(
+        f'the input {name} of {task.name} is a {kind}, no node; an artifact becomes one by stored("x", store.put(it))'
+    )
 
 
 def nodes_by_step(outputs: Iterable[Node]) -> dict[str, list[Node]]:
