@@ -320,9 +320,7 @@ def type_named(name: str) -> type:
     """
     module, _, qualified = str(name).partition(":")
     if not module.startswith(TRUSTED_PREFIXES):
-        raise ValueError(
-            f"refused the foreign type {name}; only modules whose name begins with ss_flow_ have types here"
-        )
+        raise ValueError(f"refused the foreign type {name}: its module's name does not begin with ss_flow_")
     try:
         found: Any = importlib.import_module(module)
         for part in qualified.split("."):
