@@ -237,8 +237,12 @@ def gather(nodes: Sequence[A]) -> tuple[A, ...]:
 
 
 def pick(nodes: Sequence[A], positions: Iterable[int]) -> tuple[A, ...]:
-    """Some artifacts of a list, as a list: a task that gets them does not depend on the others."""
-    assert isinstance(nodes, Node)
+    """Some artifacts of a list, as a list: a task that gets them does not depend on the others.
+
+    Raises TypeError when the list is no node.
+    """
+    if not isinstance(nodes, Node):
+        raise TypeError(f"pick takes a node that stands for a list, not a {type(nodes).__name__}")
     picked = Pick(_building(), nodes.step, nodes.item, nodes, tuple(positions))
     return cast(tuple[A, ...], picked)
 

@@ -156,8 +156,14 @@ class Task(Generic[P, R]):
 
     @functools.cached_property
     def hints(self) -> dict[str, Any]:
-        """The declared types of all arguments, and of the result as "return"."""
-        return typing.get_type_hints(self.function)
+        """The declared types of all arguments, and of the result as "return".
+
+        Raises TypeError where one of them is imported for type checkers alone.
+        """
+        try:
+            return typing.get_type_hints(self.function)
+        except NameError as error:
+            raise TypeError(f"a type that the task {self.name} declares is not there at run time: {error}") from None
 
     @functools.cached_property
     def _defaults(self) -> dict[str, Any]:

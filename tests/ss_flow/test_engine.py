@@ -738,6 +738,32 @@ def test_a_task_declares_the_types_of_its_artifacts_and_of_its_result():
         task(name="t")(untyped)
 
 
+def test_a_type_that_only_type_checkers_import_is_told_with_the_task():
+    def hidden(x: Linear) -> Linear:
+        return x
+
+    hidden.__annotations__["x"] = "NDArray"
+    with Flow("x").building(), pytest.raises(TypeError, match="that the task t declares is not there at run time"):
+        task(name="t")(hidden)(None)
+
+
+def test_only_a_node_has_items_to_pick():
+    with Flow("x").building(), pytest.raises(TypeError, match="not a list"):
+        pick([1, 2], [0])
+
+
+def test_a_report_tells_one_output_from_a_list_and_from_a_failure(store):
+    report = run(store, lambda: {"xs": (xs := toy.source(values=(1.0, 2.0))), "x": xs[0], "far": xs[5]})
+    assert report.all("xs") == report.values["xs"] and report.one("x") == report.all("xs")[0]
+    for ask, name, error in (
+        (report.one, "xs", TypeError),
+        (report.all, "x", TypeError),
+        (report.one, "far", IndexError),
+    ):
+        with pytest.raises(error):
+            ask(name)
+
+
 def test_a_task_names_its_arguments_one_by_one():
     def several(*xs: Linear) -> Linear:
         return xs[0]
