@@ -96,14 +96,15 @@ def check(value: Any) -> tuple[str, dict[str, np.ndarray]]:
             arrays[item.name] = content
         else:
             attributes[item.name] = _plain(content, f"{kind.__name__}.{item.name}")
-    header = {"format": FORMAT, "type": f"{kind.__module__}:{kind.__qualname__}", "values": attributes}
+    name = f"{kind.__module__}:{kind.__qualname__}"
+    header = {"format": FORMAT, "type": name, "values": attributes}
     group = json.dumps({"zarr_format": 3, "node_type": "group", "attributes": header})
     if len(group) > MOST_HEADER_BYTES:
         raise TypeError(
             f"{kind.__name__} holds {len(group)} bytes of plain data, where {MOST_HEADER_BYTES} are the most; make the "
             "large field an array"
         )
-    _check_type(value, header["type"])
+    _check_type(value, name)
     return group, arrays
 
 

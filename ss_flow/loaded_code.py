@@ -14,8 +14,8 @@ from typing import Any
 
 def is_as_written(module_name: str) -> bool:
     """Whether the functions of a loaded module are those of its file as it is now."""
-    loader = getattr(sys.modules[module_name].__spec__, "loader", None)
-    code = loader.get_code(module_name) if hasattr(loader, "get_code") else None
+    read = getattr(getattr(sys.modules[module_name].__spec__, "loader", None), "get_code", None)
+    code = read and read(module_name)
     if code is None:  # compiled by others, or a folder without an __init__.py
         return True
     written = set(_codes(code))

@@ -158,10 +158,12 @@ def _read(name: str) -> Source | None:
         spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):
         return None
-    folders = spec and spec.submodule_search_locations
+    if spec is None:
+        return None
+    folders = spec.submodule_search_locations
     if folders and spec.origin is None:  # a folder without an __init__.py
         return Source(Path(next(iter(folders))) / "__init__.py", True, "")
-    if spec is None or spec.origin is None or not spec.has_location:
+    if spec.origin is None or not spec.has_location:
         return None
     path = Path(spec.origin)
     content = path.read_bytes()
