@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import operator
 import typing
+import weakref
 from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
@@ -13,6 +15,8 @@ from typing import Any
 import numpy as np
 
 _PLAIN = (str, int, float, bool, type(None))
+_unchanging: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
+"""Dataclasses in which nothing can be changed, by their ids: many calls share one, and it is looked through once."""
 
 
 def own_copy(name: str, value: Any, hint: Any = None) -> Any:
@@ -45,6 +49,8 @@ def own_copy(name: str, value: Any, hint: Any = None) -> Any:
 
 def _own_dataclass(name: str, value: Any) -> Any:
     """The same object where nothing in it can be changed: calls that share it share its digest."""
+    if _unchanging.get(id(value)) is value:
+        return value
     own = value
     for field in dataclasses.fields(value):
         content = getattr(value, field.name)
@@ -55,4 +61,7 @@ def _own_dataclass(name: str, value: Any) -> Any:
             if inner is not content:
                 own = copy.copy(value) if own is value else own
                 object.__setattr__(own, field.name, inner)
+    if own is value:
+        with contextlib.suppress(TypeError):  # of a class with slots
+            _unchanging[id(value)] = value
     return own
