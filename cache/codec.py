@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import enum
 import importlib
 import itertools
 import json
@@ -26,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ss_flow.cache.canonical import digest_of_fields
+from ss_flow.cache.canonical import digest, digest_of_fields
 
 CHUNK_BYTES = 4 << 20
 PLAIN_BYTES = 64 << 10
@@ -58,11 +59,28 @@ UNFIT = (*NOT_THERE, KeyError, TypeError, AttributeError, RecursionError, Overfl
 def write(value: Any, folder: Path) -> None:
     """Write a dataclass instance as a Zarr group at `folder`, which must not exist.
 
+    Raises TypeError as `check` does.
+    """
+    header, arrays = check(value)
+    folder.mkdir()
+    for name, array in arrays.items():
+        if array.nbytes <= PLAIN_BYTES:
+            _write_plain(array, folder / name)
+        else:
+            _write_zarr(array, folder / name)
+    (folder / "zarr.json").write_text(header)
+
+
+def check(value: Any) -> tuple[str, dict[str, np.ndarray]]:
+    """What is written of a value: the header of its group, and its arrays by name.
+
     Raises TypeError for a value that is not a frozen dataclass, for a field that neither Zarr nor JSON can hold, for
-    one that could not be given back to the type, and for more plain data than `read` takes.
+    one that could not be given back to the type or as it was, for a type that is not found again or makes something
+    else of its fields, and for more plain data than `read` takes.
     """
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        raise TypeError(f"a task returned {type(value).__name__}; only dataclasses of arrays are stored")
+        returned = type(value).__name__
+        raise TypeError(f"a task returned {returned}; only dataclasses of arrays are stored, or tuple[X, ...] of such")
     kind = type(value)
     if not kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
         raise TypeError(f"{kind.__name__} is not frozen; tasks share what is stored: declare @dataclass(frozen=True)")
@@ -78,20 +96,38 @@ def write(value: Any, folder: Path) -> None:
             arrays[item.name] = content
         else:
             attributes[item.name] = _plain(content, f"{kind.__name__}.{item.name}")
-    header = {"format": FORMAT, "type": f"{kind.__module__}:{kind.__qualname__}", "values": attributes}
+    name = f"{kind.__module__}:{kind.__qualname__}"
+    header = {"format": FORMAT, "type": name, "values": attributes}
     group = json.dumps({"zarr_format": 3, "node_type": "group", "attributes": header})
     if len(group) > MOST_HEADER_BYTES:
         raise TypeError(
             f"{kind.__name__} holds {len(group)} bytes of plain data, where {MOST_HEADER_BYTES} are the most; make the "
             "large field an array"
         )
-    folder.mkdir()
-    for name, array in arrays.items():
-        if array.nbytes <= PLAIN_BYTES:
-            _write_plain(array, folder / name)
-        else:
-            _write_zarr(array, folder / name)
-    (folder / "zarr.json").write_text(group)
+    _check_type(value, name)
+    return group, arrays
+
+
+def _check_type(value: Any, name: str) -> None:
+    """Raise TypeError for a value that could not be built again, or would be another one."""
+    kind = type(value)
+    try:
+        type_named(name)
+        given = {item.name: _read_only(getattr(value, item.name)) for item in dataclasses.fields(value)}
+        again = kind(**given)
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever a type raises
+        raise TypeError(f"{kind.__name__} could not be built again from its fields: {error}") from None
+    if any(getattr(again, one) is not content for one, content in given.items()) and digest(again) != digest(value):
+        raise TypeError(f"{kind.__name__} makes something else of its own fields when it is built from them again")
+
+
+def _read_only(content: Any) -> Any:
+    if isinstance(content, np.ndarray):
+        content = content.view()
+        content.flags.writeable = False
+    return content
 
 
 def _write_plain(array: np.ndarray, folder: Path) -> None:
@@ -285,7 +321,7 @@ def type_named(name: str) -> type:
     """
     module, _, qualified = str(name).partition(":")
     if not module.startswith(TRUSTED_PREFIXES):
-        raise ValueError(f"refused to build an object of the foreign type {name}")
+        raise ValueError(f"refused the foreign type {name}: its module's name does not begin with ss_flow_")
     try:
         found: Any = importlib.import_module(module)
         for part in qualified.split("."):
@@ -308,12 +344,16 @@ def _plain(content: Any, where: str) -> Any:
     """A field as JSON; a NumPy scalar or a nested tuple becomes its plain twin."""
     if isinstance(content, np.generic):
         content = content.item()
+    if isinstance(content, enum.Enum) or hasattr(content, "_fields"):  # would come back as a number, a text or a list
+        raise TypeError(f"{where} holds a {type(content).__name__}, which would not come back; store plain values")
     if content is None or isinstance(content, bool | int | float | str):
         return content
     if isinstance(content, tuple | list):
         return [_plain(item, where) for item in content]
     if isinstance(content, dict) and all(isinstance(name, str) for name in content):
         return {name: _plain(item, where) for name, item in content.items()}
+    if isinstance(content, np.ndarray):
+        raise TypeError(f"{where} holds arrays in a list or a dict; give each a field of its own")
     raise TypeError(f"{where} holds a {type(content).__name__}, which is neither an array nor plain data")
 
 
@@ -337,7 +377,9 @@ def _restored(content: Any, hint: Any) -> Any:
     """
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         among = typing.get_args(hint)
-        hint = next((one for one in among if one is list or typing.get_origin(one) in (tuple, list)), None)
+        hint = next((one for one in among if (typing.get_origin(one) or one) in (tuple, list)), None)
+    if hint is tuple:
+        hint = tuple[Any, ...]
     if typing.get_origin(hint) is not tuple or not isinstance(content, list):
         return content
     inner = typing.get_args(hint)

@@ -157,7 +157,11 @@ class Store:
 
         Raises StoreFailure when it cannot be written, TypeError for a value that cannot be stored.
         """
-        object_digest = digest(value)
+        try:
+            object_digest = digest(value)
+        except (TypeError, RecursionError):
+            codec.check(value)  # names the field
+            raise
         target = self.object_path(object_digest)
         with writing(self.root):
             if target.is_dir() and not codec.is_current(target):

@@ -43,6 +43,9 @@ class Shown:
     digests: tuple[str, ...]
     around: Around
 
+    def __repr__(self) -> str:  # not what it is drawn with
+        return f"Shown({len(self.digests)} of {self.store.location})"
+
     def _repr_html_(self) -> str:
         values = [self.store.get(digest) for digest in self.digests]
         first = as_html(values[0], self._repr_png_(), provenance(self.store, self.digests[0])) if values else ""

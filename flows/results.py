@@ -83,6 +83,9 @@ class FinishedRun:
     """instances.json."""
     results: Results
 
+    def __repr__(self) -> str:  # not the whole of the documents
+        return f"FinishedRun({str(self.folder)!r}, {len(self.results.digests)} results)"
+
     @property
     def store(self) -> Store:
         return self.results.store

@@ -20,12 +20,12 @@ from typing import Any
 from blake3 import blake3
 
 from ss_flow.code_text import canonical_code, dotted
-from ss_flow.distributions import is_distributed
 from ss_flow.sources import (
     Imports,
     Module,
     forget_sources,
     imports_of,
+    is_loose,
     module_of,
     module_without_stars,
     native_sources,
@@ -104,13 +104,14 @@ def _forget_trees() -> None:
 def fix_sources(own: str = "") -> int:
     """Read the sources of all that is loaded and followed, so that keys stand for what runs, whatever is edited later.
 
-    own: a package whose modules are followed, too, from now on. Returns a number that is another one after a source was
-    edited before it was loaded: what was said of closures before then does not hold for what runs now.
+    own: a package whose modules are followed, too, from now on, as are those that no distribution holds. Returns a
+    number that is another one after a source was edited before it was loaded: what was said of closures before then
+    does not hold for what runs now.
     """
     with reading:
         if own and own != ENGINE:
             _packages.add(own)
-        if read_loaded((*FOLLOWED, *_packages)):
+        if read_loaded((*FOLLOWED, *_packages), loose=bool(_packages)):
             _forget_trees()
         return _generation
 
@@ -131,6 +132,8 @@ def _closure(module_name: str, function_name: str) -> Closure:
         sources.add(module_name)
         module = module_of(module_name)
         if module is None:
+            if compiled := source_digest(module_name):
+                found[module_name] = compiled
             continue
         sources.update(module.stars)
         for origin, attribute in module.imports.get(name, ()):
@@ -146,6 +149,8 @@ def _closure(module_name: str, function_name: str) -> Closure:
         sources |= needs.looked_for
     sources |= {name for name in found if ":" in name}
     others = {name for name in modules - sys.stdlib_module_names - {ENGINE} if not _is_followed(name, own)}
+    if own != ENGINE:  # a module that is not there would be followed if it were
+        sources |= set(filter(is_loose, others))
     return Closure(
         dict(sorted(found.items())), frozenset(others), {name: source_digest(name) for name in sorted(sources)}
     )
@@ -155,20 +160,14 @@ def _closure(module_name: str, function_name: str) -> Closure:
 def _is_followed(module_name: str, own: str) -> bool:
     """Whether definitions of a module count one by one. own: the top-level module of the function.
 
-    They do in a module beside that one that no distribution holds: no version would tell an edit of it.
+    They do in a module that no distribution holds: no version would tell an edit of it.
     """
     top = module_name.partition(".")[0]
     if module_name.startswith(FOLLOWED):
         return True
     if own == ENGINE or top == own:
         return top == own != ENGINE
-    if top in (ENGINE, *sys.stdlib_module_names) or is_distributed(top):
-        return False
-    here, there = source_of(own), source_of(top)
-    if here is None or there is None or here.folder != there.folder:
-        return False
-    _packages.add(top)
-    return True
+    return is_loose(top) and source_of(top) is not None
 
 
 @functools.cache
@@ -230,8 +229,9 @@ def _dependencies(
 
 
 def _all_of(module_name: str | None) -> Iterator[tuple[str, str]]:
-    if module_name is not None and (module := module_of(module_name)) is not None:
-        yield from ((module_name, name) for name in module.definitions)
+    if module_name is not None:
+        module = module_of(module_name)
+        yield from ((module_name, name) for name in (module.definitions if module else ("",)))
 
 
 def _module_at(module: str, path: list[str], own: str, looked_for: set[str]) -> str | None:

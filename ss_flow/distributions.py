@@ -20,9 +20,11 @@ def versions_of(module: str) -> dict[str, str]:
     return dict(map(_name_and_version, reversed(found))) if found else {module: ABSENT}
 
 
+@functools.cache
 def is_distributed(module: str) -> bool:
-    """Whether an installed distribution holds a top-level module."""
-    return module in _distributions()
+    """Whether an installed distribution holds a top-level module; not an editable one, whose version tells nothing."""
+    found = _distributions().get(module, [])
+    return bool(found) and not any('"editable": true' in (one.read_text("direct_url.json") or "") for one in found)
 
 
 def version(distribution: str) -> str:

@@ -59,12 +59,25 @@ class Report:
 
     def succeeded(self) -> dict[str, Value]:
         """The outputs by name. Raises the error of the first that failed."""
-        found: dict[str, Value] = {}
-        for name, value in self.values.items():
-            if isinstance(value, Failure):
-                raise value.error
-            found[name] = value
-        return found
+        return {name: self._made(name) for name in self.values}
+
+    def one(self, name: str) -> str:
+        """The digest of an output that is one artifact. Raises the output's error where it failed."""
+        if isinstance(value := self._made(name), str):
+            return value
+        raise TypeError(f"the output {name} is a list; ask for `all` of it")
+
+    def all(self, name: str) -> tuple[str, ...]:
+        """The digests of an output that is a list. Raises the output's error where it failed."""
+        if isinstance(value := self._made(name), tuple):
+            return value
+        raise TypeError(f"the output {name} is one artifact; ask for that `one`")
+
+    def _made(self, name: str) -> Value:
+        value = self.values[name]
+        if isinstance(value, Failure):
+            raise value.error
+        return value
 
 
 def usable_cores() -> int:

@@ -20,6 +20,7 @@ from ss_flow.cache.location import open_store
 from ss_flow.cache.store import Action, Store
 from ss_flow.errors import InputError
 from ss_flow.keys import Components, Value
+from ss_flow.own_copy import own_copy
 from ss_flow.running import Listener, Surroundings, remove_checkpoint, running
 from ss_flow.sameness import check_sameness
 from ss_flow.task import FileRef, Resources, Task, files_in
@@ -67,7 +68,7 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     _refuse([ref for ref in stamps if ref.has_changed()], invocation.label)
     started = time.monotonic()
     with running(surroundings), _peaks.watching() as peak:
-        result = task.run(arguments, invocation.parameters)
+        result = task.run(arguments, {name: own_copy(name, value) for name, value in invocation.parameters.items()})
     seconds = time.monotonic() - started
     check()  # a module that the task itself loaded may have been edited since its key was made
     _refuse([ref for ref, before in stamps.items() if ref.stamp_now() != before], invocation.label)
@@ -129,6 +130,21 @@ def execute_here(invocation: Invocation, listener: Listener) -> Action:
 @functools.cache
 def _store_of_this_process(location: str) -> Store:
     return open_store(location)
+
+
+def reference_to(task: Task[..., Any]) -> str:
+    """Where a task is declared, "module:function", as `find_task` takes it.
+
+    Raises TypeError when it is not to be found there: another process could not run it.
+    """
+    reference = f"{task.function.__module__}:{task.function.__qualname__}"
+    try:
+        found: Any = find_task(reference)
+    except (ImportError, AttributeError):
+        found = None
+    if not isinstance(found, Task) or found.name != task.name:
+        raise TypeError(f"the task {task.name} must be declared at the top of its module, under its function's name")
+    return reference
 
 
 def find_task(reference: str) -> Task[..., Any]:

@@ -181,13 +181,23 @@ class Flow:
 
         given = task.arguments(args, kwargs)
         inputs: dict[str, Any] = {
-            n: value if isinstance(value, Node) else gather(value) for n, value in given[0].items()
+            name: value if isinstance(value, Node) else _gathered_input(task, name, value)
+            for name, value in given[0].items()
         }
         for name, node in inputs.items():
             if node.flow is not self:
                 raise TypeError(f"the input {name} of {task.name} is a node of another flow")
         parameters = {name: own_copy(name, value, task.hints.get(name)) for name, value in given[1].items()}
         return Call(self, task.name, _item.get(), task, inputs, parameters)
+
+
+def _gathered_input(task: Task[..., Any], name: str, value: Any) -> Any:
+    if isinstance(value, Iterable) and not hasattr(value, "dtype"):
+        return gather(list(value))
+    kind = type(value).__name__
+    raise TypeError(
+        f'the input {name} of {task.name} is a {kind}, no node; an artifact becomes one by stored("x", store.put(it))'
+    )
 
 
 def nodes_by_step(outputs: Iterable[Node]) -> dict[str, list[Node]]:
@@ -227,8 +237,12 @@ def gather(nodes: Sequence[A]) -> tuple[A, ...]:
 
 
 def pick(nodes: Sequence[A], positions: Iterable[int]) -> tuple[A, ...]:
-    """Some artifacts of a list, as a list: a task that gets them does not depend on the others."""
-    assert isinstance(nodes, Node)
+    """Some artifacts of a list, as a list: a task that gets them does not depend on the others.
+
+    Raises TypeError when the list is no node.
+    """
+    if not isinstance(nodes, Node):
+        raise TypeError(f"pick takes a node that stands for a list, not a {type(nodes).__name__}")
     picked = Pick(_building(), nodes.step, nodes.item, nodes, tuple(positions))
     return cast(tuple[A, ...], picked)
 

@@ -101,7 +101,9 @@ class Keys:
         and inputs (a digest by name, also for a list, so that its length does not count in every record)."""
         flat: dict[str, Any] = {}
         for name, value in parameters.items():
-            flat |= _flat("" if name == "params" else name, value, task.hints.get(name))
+            fields = getattr(value, "__dataclass_fields__", {})
+            bare = name == "params" and not parameters.keys() & fields.keys()  # else one would hide the other
+            flat |= _flat("" if bare else name, value, task.hints.get(name))
         return {
             **self.recipe(task).components,
             "parameters": flat,

@@ -12,6 +12,7 @@ from ss_flow.errors import ExecutorLost
 from ss_flow.explain import first_difference
 from ss_flow.kept_closures import kept_closure
 from ss_flow.keys import Components, Recipe
+from ss_flow.loaded_code import left_behind
 from ss_flow.task import Task
 
 
@@ -38,4 +39,7 @@ def check_sameness(task: Task[..., Any], components: Components, label: str, clo
 
 @functools.cache
 def _recipe(task: Task[..., Any], closures: Path, generation: int) -> Components:
-    return Recipe.of(task, kept_closure(task.function, closures)).components
+    recipe = Recipe.of(task, kept_closure(task.function, closures))
+    if reason := left_behind(recipe.closure):
+        raise ExecutorLost(f"{task.name} would be computed otherwise than its key says: {reason}.")
+    return recipe.components

@@ -21,7 +21,7 @@ from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.store import Action, Store
 from ss_flow.errors import ExecutorLost, InputError
 from ss_flow.events import Reporter
-from ss_flow.execute import Invocation
+from ss_flow.execute import Invocation, reference_to
 from ss_flow.executors import Executor
 from ss_flow.executors.worker import WorkerDied
 from ss_flow.explain import changed_items, first_difference, nearest
@@ -167,11 +167,10 @@ class Scheduler:
         for name, value in inputs.items():
             if not isinstance(value, str):
                 self._store.put_part(parts["inputs"][name], value)
-        function = node.task.function
         invocation = Invocation(
             key=key,
             label=node.label,
-            task=f"{function.__module__}:{function.__qualname__}",
+            task=reference_to(node.task),
             inputs=inputs,
             parameters=node.parameters,
             components=parts,

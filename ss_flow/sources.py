@@ -13,6 +13,10 @@ from pathlib import Path
 
 from blake3 import blake3
 
+from ss_flow.distributions import is_distributed
+from ss_flow.errors import ExecutorLost
+from ss_flow.loaded_code import is_as_written
+
 STAR = "*"
 NATIVE_SOURCES = "NATIVE_SOURCES"
 """A module-level tuple of file names, relative to the module: sources of the native code it loads."""
@@ -30,11 +34,11 @@ class Source:
     path: Path
     is_package: bool
     text: str
+    """Of compiled code, the digest of its file; "" of a folder that is a package without an `__init__.py`."""
 
     @property
-    def folder(self) -> Path:
-        """Where a top-level module stands beside others."""
-        return (self.path.parent.parent if self.is_package else self.path.parent).resolve()
+    def is_compiled(self) -> bool:
+        return self.path.suffix != ".py"
 
 
 @dataclass
@@ -72,47 +76,72 @@ def source_digest(name: str) -> str:
 
 _known: dict[str, tuple[object, Source | None]] = {}
 """Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then."""
+_outdated: set[str] = set()
+"""Modules that are not loaded as they were read. Ours are read as soon as they are loaded."""
 
 
 def source_of(name: str) -> Source | None:
-    """A module as it is written; None when there is none, or none in Python. It is read once."""
+    """A module as it is written; None when there is none. It is read once.
+
+    Raises ExecutorLost when it was edited between being loaded and being read.
+    """
+    if name in _outdated:
+        raise ExecutorLost(f"{name} was edited after it was loaded: load it again (importlib.reload), or start anew.")
     if name not in _known:
         _known[name] = _specification(name), _read(name)
     return _known[name][1]
 
 
-def read_loaded(packages: tuple[str, ...]) -> bool:
+def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
     """Read the modules of these packages that are loaded, each as soon as possible after that, whoever asks later.
 
-    Returns whether any of them is not as it was when it was read last, before it was loaded, or loaded again.
+    loose: also those that no distribution holds. Returns whether any of them is not as it was when it was read last,
+    before it was loaded, or loaded again.
     """
     changed = False
-    for name in _loaded(packages, len(sys.modules)):
+    for name in _loaded(packages, loose, len(sys.modules)):
         specification = _specification(name)
         if name in _known and _known[name][0] is specification:
             continue
         try:
             source = _read(name)
-        except (OSError, ValueError):  # its file has gone; who needs it will say so
+            as_written = source is None or name.startswith("ss_flow.") or is_as_written(name)
+        except (
+            OSError,
+            ValueError,
+            SyntaxError,
+            ImportError,
+        ):  # its file has gone, or is no text; who needs it will say so
             continue
         changed = changed or (name in _known and _known[name][1] != source)
         _known[name] = specification, source
+        if as_written:
+            _outdated.discard(name)
+        else:
+            _outdated.add(name)
     return changed
 
 
 @functools.lru_cache(maxsize=1)
-def _loaded(packages: tuple[str, ...], count: int) -> list[str]:
-    """The loaded modules of these packages; they are looked for again only where others are loaded, thousands in all.
+def _loaded(packages: tuple[str, ...], loose: bool, count: int) -> list[str]:
+    """The loaded modules to read; they are looked for again only where others are loaded, thousands in all.
 
     count: of all that are loaded.
     """
     # A copy in one piece: another thread may load a module in the meantime.
-    return [name for name in list(sys.modules) if name.startswith(packages)]
+    return [name for name in list(sys.modules) if name.startswith(packages) or (loose and is_loose(name))]
+
+
+def is_loose(name: str) -> bool:
+    """Whether a module is neither ours nor Python's own, and no distribution holds it: no version tells of an edit."""
+    top = name.partition(".")[0]
+    return top != "ss_flow" and top not in sys.stdlib_module_names and not is_distributed(top)
 
 
 def forget_sources() -> None:
     """Read every module anew the next time."""
     _known.clear()
+    _outdated.clear()
 
 
 def _specification(name: str) -> object:
@@ -129,10 +158,17 @@ def _read(name: str) -> Source | None:
         spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):
         return None
-    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+    if spec is None:
+        return None
+    folders = spec.submodule_search_locations
+    if folders and spec.origin is None:  # a folder without an __init__.py
+        return Source(Path(next(iter(folders))) / "__init__.py", True, "")
+    if spec.origin is None or not spec.has_location:
         return None
     path = Path(spec.origin)
-    return Source(path, spec.submodule_search_locations is not None, path.read_text(encoding="utf-8"))
+    content = path.read_bytes()
+    text = importlib.util.decode_source(content) if path.suffix == ".py" else blake3(content).hexdigest()
+    return Source(path, folders is not None, text)
 
 
 @functools.cache
@@ -160,10 +196,10 @@ def module_of(name: str) -> Module | None:
 def module_without_stars(name: str) -> Module | None:
     """The same, with `from ... import *` as the import of a name "*"."""
     source = source_of(name)
-    if source is None:
+    if source is None or source.is_compiled:
         return None
     module = Module(name, source.is_package)
-    statements = list(_top_level(ast.parse(source.text).body, ()))
+    statements = list(_top_level(ast.parse(source.text, str(source.path)).body, ()))
     bound = {name for statement, _ in statements for name in _bound_at_top(statement)}
     changing = {s.name: _changed_by_call(s) for s, _ in statements if isinstance(s, ast.FunctionDef)}
     bound |= {name for several in changing.values() for name in several[0]}

@@ -156,8 +156,14 @@ class Task(Generic[P, R]):
 
     @functools.cached_property
     def hints(self) -> dict[str, Any]:
-        """The declared types of all arguments, and of the result as "return"."""
-        return typing.get_type_hints(self.function)
+        """The declared types of all arguments, and of the result as "return".
+
+        Raises TypeError where one of them is imported for type checkers alone.
+        """
+        try:
+            return typing.get_type_hints(self.function)
+        except NameError as error:
+            raise TypeError(f"a type that the task {self.name} declares is not there at run time: {error}") from None
 
     @functools.cached_property
     def _defaults(self) -> dict[str, Any]:
@@ -186,8 +192,7 @@ class Task(Generic[P, R]):
     @functools.cached_property
     def _artifacts(self) -> dict[str, Any]:
         """The types of the positional parameters by name."""
-        positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        return {p.name: self.hints[p.name] for p in self.signature.parameters.values() if p.kind in positional}
+        return {p.name: self.hints[p.name] for p in self.signature.parameters.values() if p.kind != p.KEYWORD_ONLY}
 
     @functools.cached_property
     def returns_list(self) -> bool:
@@ -231,8 +236,11 @@ def task(
     uses: distributions whose versions count in the key, besides those that the code imports.
     isolate: run in a process of its own (the library aborts on errors, or is not deterministic beside others).
     environment: what else of this machine the result depends on (say, the instruction set); its items enter the key.
-    Raises TypeError when the function does not declare the types of its artifacts and of its result.
+    Raises TypeError when the function does not declare the types of its artifacts and of its result, or does not name
+    each of its arguments.
     """
+    if isinstance(uses, str):
+        raise TypeError(f'uses takes a tuple of names: uses=("{uses}",)')
 
     def declare(function: Callable[P, R]) -> Task[P, R]:
         from ss_flow.closure import fix_sources  # not above: the bare `ss-flow` declares no task
@@ -244,6 +252,8 @@ def task(
         untyped += ["its result"] if of.return_annotation is of.empty else []
         if untyped:
             raise TypeError(f"the task {step} must declare the type of {', '.join(untyped)}")
+        if any(p.kind not in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) for p in of.parameters.values()):
+            raise TypeError(f"the task {step} must name its arguments one by one: no *args, no **kwargs, no `/`")
         declared: Any = Task(function, step, resources, uses, isolate, environment)
         functools.update_wrapper(declared, function)
         return typing.cast(Task[P, R], declared)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import enum
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+import ss_flow_toy as toy
 import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -107,9 +110,9 @@ def test_ragged_rows_texts_and_tables_read_back_equal(tmp_path_factory, rows, na
         count > 0,
     )
     folder = tmp_path_factory.mktemp("codec") / "object"
-    codec.write(value, folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(codec, "type_named", lambda name: Everything)
+        codec.write(value, folder)
         back = codec.read(folder)
     assert digest(back) == digest(value)
     assert (back.names, back.count, back.flag, back.nothing) == (value.names, value.count, value.flag, None)
@@ -202,6 +205,52 @@ def test_what_could_be_changed_or_not_be_read_back_is_refused(tmp_path):
     with pytest.raises(TypeError, match=r"Derived\.value has init=False"):
         codec.write(Derived(), tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
+
+
+class Kind(enum.IntEnum):
+    ONE = 1
+
+
+class Pair(NamedTuple):
+    a: int
+    b: int
+
+
+@dataclass(frozen=True)
+class Foreign:
+    value: float
+
+
+@pytest.mark.parametrize(
+    ("made", "what"),
+    [
+        (lambda: toy.Scaled(np.zeros(2), 2.0), "Scaled could not be built again .* 'by'"),
+        (lambda: toy.Shifted(np.zeros(2)), "Shifted makes something else of its own fields"),
+        (lambda: toy.Sorted(np.array([2.0, 1.0])), "Sorted could not be built again .* read-only"),
+        (lambda: toy.Table({}, [Kind.ONE]), r"Table\.names holds a Kind, which would not come back"),
+        (lambda: toy.Table({"a": Pair(1, 2)}, []), r"Table\.rows holds a Pair, which would not come back"),
+        (lambda: toy.Table({"a": np.zeros(2)}, []), r"Table\.rows holds arrays in a list or a dict"),
+        (
+            lambda: Foreign(1.0),
+            "Foreign could not be built .* its module's name does not begin with ss_flow_",
+        ),
+    ],
+    ids=["init variable", "other fields", "changed fields", "enum", "named tuple", "arrays in a dict", "foreign type"],
+)
+def test_what_the_store_could_not_give_back_is_refused(tmp_path, made, what):
+    with pytest.raises(TypeError, match=what):
+        codec.write(made(), tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_type_that_makes_the_same_of_its_fields_again_is_stored(tmp_path):
+    codec.write(toy.Rounded(np.array([0.6])), tmp_path / "a")
+    assert codec.read(tmp_path / "a").value == 1.0
+
+
+def test_a_field_that_is_declared_as_a_bare_tuple_reads_back_as_one(tmp_path):
+    codec.write(toy.Row((1, 2), ("m",)), tmp_path / "a")
+    assert codec.read(tmp_path / "a") == toy.Row((1, 2), ("m",))
 
 
 def test_gaussians_of_no_rows_keep_their_shapes(tmp_path):

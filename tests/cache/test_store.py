@@ -428,3 +428,8 @@ def test_the_digest_of_a_file_whose_name_is_no_text_is_remembered(tmp_path):
     known = digests(file)
     digests.save()
     assert FileDigests(tmp_path / "files.json")._known[str(file)][3] == known
+
+
+def test_what_cannot_be_digested_is_refused_with_the_name_of_its_field(store):
+    with pytest.raises(TypeError, match=r"Table\.rows holds a set, which is neither an array nor plain data"):
+        store.put(toy.Table({"a": {1}}, []))

@@ -28,6 +28,10 @@ def test_a_result_is_read_by_its_name(run, tiny):
         run.artifact("propagated")
 
 
+def test_a_run_and_what_it_shows_are_one_line_in_a_terminal(run):
+    assert max(len(repr(one)) for one in (run, run.show("propagate"), run.show("masks"))) < 200 + len(str(run.folder))
+
+
 def test_a_result_that_the_run_never_had_is_missing(run):
     assert run.results.missing(["scene", "truth_held_out"]) == ["truth_held_out"]
 

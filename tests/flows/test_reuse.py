@@ -197,17 +197,17 @@ def test_a_photo_that_was_only_touched_or_moved_computes_nothing(warm, tmp_path)
 @pytest.fixture
 def edited(monkeypatch):
     """Have the closure read a module with an edit, as if it had been saved between two runs."""
-    read = Path.read_text
+    read = Path.read_bytes
 
     def edit(module: str, old: str, new: str) -> None:
-        def read_edited(path: Path, *args, **kwargs):
-            text = read(path, *args, **kwargs)
+        def read_edited(path: Path) -> bytes:
+            content = read(path)
             if not path.as_posix().endswith(module):
-                return text
-            assert old in text, f"{module} no longer holds {old!r}"
-            return text.replace(old, new)
+                return content
+            assert old.encode() in content, f"{module} no longer holds {old!r}"
+            return content.replace(old.encode(), new.encode())
 
-        monkeypatch.setattr(Path, "read_text", read_edited)
+        monkeypatch.setattr(Path, "read_bytes", read_edited)
         closure.forget()
 
     yield edit

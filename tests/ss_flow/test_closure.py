@@ -3,6 +3,7 @@ from __future__ import annotations
 import importlib
 import sys
 import textwrap
+from importlib.machinery import EXTENSION_SUFFIXES
 
 import pytest
 
@@ -20,7 +21,7 @@ def package(tmp_path, monkeypatch):
     def closure_of(**modules: str) -> dict[str, str]:
         for name, text in modules.items():
             (folder / f"{name}.py").write_text(textwrap.dedent(text))
-        for name in [n for n in sys.modules if n.partition(".")[0] == "probe"]:
+        for name in [n for n in sys.modules if n.partition(".")[0].endswith("probe")]:
             del sys.modules[name]
         importlib.invalidate_caches()
         closure.forget()
@@ -327,3 +328,53 @@ def test_a_module_beside_that_no_distribution_holds_is_followed(package, tmp_pat
     step = "from beside_probe import f\nimport numpy as np\n\ndef run(x):\n    return np.abs(f(x))\n"
     assert {"beside_probe.f"} < set(package(step=step))
     assert modules_of(package, step=step) == {"numpy"}
+
+
+def test_a_module_elsewhere_that_no_distribution_holds_is_followed(package, tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "far_probe.py").write_text("def f(x):\n    return x\n")
+    monkeypatch.syspath_prepend(tmp_path / "elsewhere")
+    assert "far_probe.f" in package(step="import far_probe\n\ndef run(x):\n    return far_probe.f(x)\n")
+    assert modules_of(package, step="import far_probe\n\ndef run(x):\n    return far_probe.f(x)\n") == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("form", "call"),
+    [
+        ("import {}.ops", "{}.ops.edge"),
+        ("from {} import ops", "ops.edge"),
+        ("from {}.ops import edge", "edge"),
+        ("import {} as sub", "sub.ops.edge"),
+    ],
+)
+@pytest.mark.parametrize("name", ["loose_probe", "probe.sub"])
+def test_a_folder_without_an_init_is_followed(package, tmp_path, name, form, call):
+    folder = tmp_path / name.replace(".", "/")
+    folder.mkdir()
+    (folder / "ops.py").write_text("def edge(x):\n    return x\n")
+    step = f"{form}\n\ndef run(x):\n    return {call}(x)\n".replace("{}", name)
+    assert f"{name}.ops.edge" in package(step=step)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "def run(x):\n    import fast_probe\n    return fast_probe.f(x)\n",
+        "def run(x):\n    from fast_probe import f\n    return f(x)\n",
+        "def run(x):\n    import fast_probe\n    return vars(fast_probe)['f'](x)\n",
+    ],
+    ids=["attribute", "name", "as a value"],
+)
+def test_compiled_code_that_no_distribution_holds_counts_as_a_whole(package, tmp_path, step):
+    def digest_of(content: bytes) -> str:
+        (tmp_path / f"fast_probe{EXTENSION_SUFFIXES[0]}").write_bytes(content)
+        return package(step=step)["fast_probe"]
+
+    assert digest_of(b"2.0") != digest_of(b"7.0")
+
+
+def test_a_source_in_another_encoding_is_read_as_python_reads_it(package, tmp_path):
+    (tmp_path / "latin_probe.py").write_bytes(b"# -*- coding: latin-1 -*-\ndef f(x):\n    return '\xe9'\n")
+    (tmp_path / "marked_probe.py").write_bytes(b"\xef\xbb\xbfdef f(x):\n    return x\n")
+    step = "import latin_probe, marked_probe\n\ndef run(x):\n    return latin_probe.f(marked_probe.f(x))\n"
+    assert {"latin_probe.f", "marked_probe.f"} < set(package(step=step))

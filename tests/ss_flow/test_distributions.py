@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+from pathlib import Path
 
 import pytest
 
@@ -12,7 +13,7 @@ def installed(tmp_path, monkeypatch):
     """Put the metadata of a distribution that holds modules first on the path."""
     places: list[str] = []
 
-    def install(name: str, version: str, *modules: str, declared: bool = False) -> None:
+    def install(name: str, version: str, *modules: str, declared: bool = False) -> Path:
         folder = tmp_path / str(len(places)) / f"{name.replace('-', '_')}-{version}.dist-info"
         folder.mkdir(parents=True)
         (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n\nVersion: none\n")
@@ -22,10 +23,15 @@ def installed(tmp_path, monkeypatch):
             (folder / "top_level.txt").write_text("\n".join(modules))
         places.append(str(folder.parent))
         monkeypatch.syspath_prepend(folder.parent)
+        forget()
+        return folder
+
+    def forget():
         distributions._distributions.cache_clear()
+        distributions.is_distributed.cache_clear()
 
     yield install
-    distributions._distributions.cache_clear()
+    forget()
 
 
 def test_python_s_own_library_says_the_same_of_every_installed_module():
@@ -50,3 +56,10 @@ def test_of_a_distribution_that_is_installed_twice_the_one_that_is_imported_coun
 def test_a_module_of_no_distribution_is_absent_under_its_own_name():
     assert distributions.versions_of("no_such_module") == {"no_such_module": "absent"}
     assert distributions.version("no-such-distribution") == "absent"
+
+
+def test_the_version_of_an_editable_installation_tells_of_no_edit(installed):
+    folder = installed("pictures", "1.0", "pix")
+    installed("frames", "1.0", "frame")
+    (folder / "direct_url.json").write_text('{"dir_info": {"editable": true}, "url": "file:///src"}')
+    assert not distributions.is_distributed("pix") and distributions.is_distributed("frame")

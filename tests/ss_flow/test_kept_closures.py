@@ -95,6 +95,13 @@ def test_a_helper_that_is_gone_is_noticed(probe, walks):
     assert kept_closure(probe(), probe.folder) == closure_of(probe())
 
 
+def test_a_helper_of_no_distribution_that_is_there_at_last_is_noticed(probe, walks):
+    (probe.package / "step.py").write_text("def run(x):\n    import late_probe\n\n    return late_probe.f(x)\n")
+    assert "late_probe" in kept_closure(probe(), probe.folder).modules
+    (probe.package.parent / "late_probe.py").write_text("def f(x):\n    return x\n")
+    assert "late_probe.f" in kept_closure(probe(), probe.folder).definitions
+
+
 def test_a_module_that_became_a_package_is_read_anew(probe, walks):
     (probe.package / "helpers.py").write_text("from .late import factor\n\n\ndef double(x):\n    return factor * x\n")
     (probe.package / "late.py").write_text("factor = 2\n")

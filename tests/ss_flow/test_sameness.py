@@ -18,7 +18,7 @@ STEPS = """
 
     from ss_flow.task import task
     from ss_flow_toy import Number, number
-    from ss_flow_probed_helper import double
+    from probed_helper import double
 
 
     @task()
@@ -38,7 +38,7 @@ STEPS = """
 
     @task()
     def late(x: Number) -> Number:
-        from ss_flow_probed_late import double
+        from probed_late import double
 
         return number(double(float(x.value[0])))
 """
@@ -64,18 +64,21 @@ def probed(tmp_path, monkeypatch):
     folder.mkdir()
     (folder / "ss_flow_probed.py").write_text(textwrap.dedent(STEPS))
     for name in ("helper", "late"):
-        (folder / f"ss_flow_probed_{name}.py").write_text(HELPER)
+        (folder / f"probed_{name}.py").write_text(HELPER)
     monkeypatch.syspath_prepend(str(folder))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # whose times are too coarse for what is edited at once
 
-    def load():
-        for name in [n for n in sys.modules if n.startswith("ss_flow_probed")]:
+    def forget():
+        for name in [n for n in sys.modules if n.startswith(("ss_flow_probed", "probed_"))]:
             del sys.modules[name]
         importlib.invalidate_caches()
         closure.forget()
+
+    def load():
+        forget()
         return importlib.import_module("ss_flow_probed")
 
-    load.folder = folder
+    load.folder, load.forget = folder, forget
     yield load
     closure.forget()
 
@@ -88,16 +91,16 @@ def run(store, steps, name, reporter=None):
 
 
 def test_what_the_old_code_computed_is_no_result_of_the_code_that_was_edited_meanwhile(store, probed):
-    editing = Editing(probed.folder / "ss_flow_probed_helper.py", "finished", "ss_flow_probed.first")
+    editing = Editing(probed.folder / "probed_helper.py", "finished", "ss_flow_probed.first")
     assert run(store, probed(), "second", editing) == (6.0, "finished")
     assert run(store, probed(), "second") == (7.0, "finished")
-    (probed.folder / "ss_flow_probed_helper.py").write_text(HELPER)
+    (probed.folder / "probed_helper.py").write_text(HELPER)
     assert run(store, probed(), "second") == (6.0, "hit")
 
 
 def test_a_key_stands_for_the_code_as_it_was_loaded_long_before_the_run(store, probed):
     steps = probed()
-    (probed.folder / "ss_flow_probed_helper.py").write_text(EDITED)
+    (probed.folder / "probed_helper.py").write_text(EDITED)
     assert run(store, steps, "second") == (6.0, "finished")
     assert run(store, probed(), "second") == (7.0, "finished")
 
@@ -105,16 +108,43 @@ def test_a_key_stands_for_the_code_as_it_was_loaded_long_before_the_run(store, p
 def test_code_that_is_loaded_again_counts_as_it_is_then(store, probed):
     steps = probed()
     assert run(store, steps, "second") == (6.0, "finished")
-    (probed.folder / "ss_flow_probed_helper.py").write_text(EDITED)
-    importlib.reload(sys.modules["ss_flow_probed_helper"])
+    (probed.folder / "probed_helper.py").write_text(EDITED)
+    importlib.reload(sys.modules["probed_helper"])
+    assert run(store, importlib.reload(steps), "second") == (7.0, "finished")
+
+
+def test_a_function_of_before_its_module_was_loaded_again_is_refused(store, probed):
+    steps = probed()
+    assert run(store, steps, "second") == (6.0, "finished")
+    (probed.folder / "probed_helper.py").write_text(EDITED)
+    importlib.reload(sys.modules["probed_helper"])
+    with pytest.raises(ExecutorLost, match=r"ss_flow_probed holds probed_helper\.double as it was before"):
+        run(store, steps, "second")
+    assert run(store, importlib.reload(steps), "second") == (7.0, "finished")
+
+
+def test_a_module_that_is_loaded_again_unchanged_is_the_same(store, probed):
+    steps = probed()
+    importlib.reload(sys.modules["probed_helper"])
+    assert run(store, steps, "second") == (6.0, "finished")
+
+
+def test_a_helper_that_was_edited_between_being_loaded_and_the_first_task_is_refused(store, probed):
+    probed.forget()
+    importlib.import_module("probed_helper")
+    (probed.folder / "probed_helper.py").write_text(EDITED)
+    steps = importlib.import_module("ss_flow_probed")
+    with pytest.raises(ExecutorLost, match="probed_helper was edited after it was loaded"):
+        run(store, steps, "second")
+    importlib.reload(sys.modules["probed_helper"])
     assert run(store, importlib.reload(steps), "second") == (7.0, "finished")
 
 
 @pytest.mark.parametrize(
     ("step", "file", "moment"),
     [
-        ("alone", "ss_flow_probed_helper.py", ("finished", "ss_flow_probed.first")),
-        ("late", "ss_flow_probed_late.py", ("started", "ss_flow_probed.late")),
+        ("alone", "probed_helper.py", ("finished", "ss_flow_probed.first")),
+        ("late", "probed_late.py", ("started", "ss_flow_probed.late")),
     ],
     ids=["by a process that starts late", "within a task"],
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from types import ModuleType, SimpleNamespace
 
 from ss_flow import sources
@@ -18,4 +20,10 @@ class LoadsAnother(str):
 def test_loaded_modules_can_be_looked_through_while_others_are_loaded(monkeypatch):
     modules = {LoadsAnother("probe.a"): ModuleType("probe.a"), "other": ModuleType("other")}
     monkeypatch.setattr(sources, "sys", SimpleNamespace(modules=modules))
-    assert sources._loaded.__wrapped__(("probe",), 2) == ["probe.a"]
+    assert sources._loaded.__wrapped__(("probe",), False, 2) == ["probe.a"]
+
+
+def test_a_program_that_is_run_as_a_module_is_not_read(monkeypatch):
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", importlib.util.find_spec("pytest.__main__"))
+    assert not sources.read_loaded(("__main__",), False)
+    assert sources.source_of("__main__") is None

@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,8 +53,61 @@ class Table:
     names: list[str]
 
 
+@dataclass(frozen=True)
+class Row:
+    """A tuple that is declared as nothing else."""
+
+    cells: tuple
+    unit: tuple | None = None
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """A type that takes what it does not keep."""
+
+    value: np.ndarray
+    by: InitVar[float]
+
+
+@dataclass(frozen=True)
+class Shifted:
+    """A type that makes something else of its fields whenever it is made."""
+
+    value: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", self.value + 1)
+
+
+@dataclass(frozen=True)
+class Rounded:
+    """A type that makes the same of its fields again."""
+
+    value: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", self.value.round())
+
+
+@dataclass(frozen=True)
+class Sorted:
+    """A type that changes what it is given."""
+
+    value: np.ndarray
+
+    def __post_init__(self) -> None:
+        self.value.sort()
+
+
 def number(value: float) -> Number:
     return Number(np.array([value]))
+
+
+@task()
+def appended(*, rows: list[int], by: int) -> Number:
+    """Changes a parameter, as no task should."""
+    rows.append(by)
+    return number(len(rows))
 
 
 @task()

@@ -1,0 +1,68 @@
+"""Whether the functions that are loaded are those that are written: a key is made from what is written.
+
+Compared is compiled code, which of a value (a constant, a default) tells nothing.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterable, Iterator
+from types import CodeType, FunctionType
+from typing import Any
+
+
+def is_as_written(module_name: str) -> bool:
+    """Whether the functions of a loaded module are those of its file as it is now."""
+    read = getattr(getattr(sys.modules[module_name].__spec__, "loader", None), "get_code", None)
+    code = read and read(module_name)
+    if code is None:  # compiled by others, or a folder without an __init__.py
+        return True
+    written = set(_codes(code))
+    return all(f.__code__ in written for f in _functions(module_name) if f.__module__ == module_name)
+
+
+def left_behind(definitions: Iterable[str]) -> str:
+    """A sentence on a module that holds a function of another one as it was before that was loaded again; or "".
+
+    definitions: qualified names of all that may be called, "package.module.name".
+    """
+    called = set(definitions)
+    modules = {name.rpartition(".")[0] for name in called} & sys.modules.keys()
+    now: dict[str, set[CodeType]] = {}
+    for user in sorted(modules):
+        for held in _functions(user):
+            home, name = held.__module__, held.__qualname__.partition(".")[0]
+            if home == user or home not in modules or f"{home}.{name}" not in called:
+                continue
+            if home not in now:
+                now[home] = {function.__code__ for function in _functions(home)}
+            if held.__code__ not in now[home]:
+                return f"{user} holds {home}.{name} as it was before {home} was loaded again: load {user} again, too"
+    return ""
+
+
+def _functions(module_name: str) -> Iterator[FunctionType]:
+    """The functions that a loaded module holds, and the methods of its classes, bare of what wraps them.
+
+    Without those that a decorator generates.
+    """
+    for value in list(vars(sys.modules[module_name]).values()):
+        for held in list(vars(value).values()) if issubclass(type(value), type) else (value,):
+            if isinstance(held, staticmethod | classmethod | property):
+                held = held.fget if isinstance(held, property) else held.__func__
+            while (inner := inspect.getattr_static(held, "__wrapped__", None)) is not None:
+                held = inner
+            if type(held) is FunctionType and held.__code__.co_filename == _file(held.__module__):
+                yield held
+
+
+def _file(module_name: Any) -> str | None:
+    return getattr(sys.modules.get(module_name), "__file__", None)
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield constant
+            yield from _codes(constant)
