@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,7 +28,9 @@ T = TypeVar("T")
 
 AT_ONCE = 8
 """How many files of one object travel at the same time."""
-RETRIES: Any = {"max_retries": 8, "retry_timeout": timedelta(minutes=1)}
+FIRST_PAUSE = timedelta(seconds=0.1)
+"""Before a request is tried again; each further pause is twice as long."""
+RETRIES: Any = {"max_retries": 8, "retry_timeout": timedelta(minutes=1), "backoff": {"init_backoff": FIRST_PAUSE}}
 _LOCATION = re.compile(r"(s3|gs|az)://[^/\s]+(/\S*)?")
 
 
@@ -85,16 +88,29 @@ class Bucket:
             return _meta(name, self._store.head(name))
         return None
 
-    def files(self, folder: str) -> Iterator[Meta]:
+    def files(self, folder: str) -> list[Meta]:
         """All files below a folder."""
-        with self._reaching():
-            for some in self._store.list(folder, chunk_size=1000):
-                yield from (_meta(said["path"], said) for said in some)
+        pages = self._listed(lambda: list(self._store.list(folder, chunk_size=1000)))
+        return [_meta(said["path"], said) for some in pages for said in some]
 
     def folders(self, folder: str) -> list[str]:
         """The names of the folders in a folder."""
+        found = self._listed(lambda: self._store.list_with_delimiter(folder)["common_prefixes"])
+        return [path.rpartition("/")[2] for path in found]
+
+    def _listed(self, ask: Callable[[], T]) -> T:
+        """What a listing says. One whose answer was cut is asked for again, which the library does not do by itself."""
+        from obstore.exceptions import GenericError
+
         with self._reaching():
-            return [path.rpartition("/")[2] for path in self._store.list_with_delimiter(folder)["common_prefixes"]]
+            for tried in range(RETRIES["max_retries"]):
+                try:
+                    return ask()
+                except GenericError as error:
+                    if "response body" not in str(error):
+                        raise
+                    time.sleep(FIRST_PAUSE.total_seconds() * 2**tried)
+            return ask()
 
     def put(self, name: str, content: bytes | Path) -> None:
         """Write a file; one of that name is replaced."""
