@@ -66,7 +66,7 @@ def location(address, monkeypatch, tmp_path):
     }
     for name, value in settings.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(bucket_module, "RETRIES", {"max_retries": 1})
+    monkeypatch.setitem(bucket_module.RETRIES, "max_retries", 1)
     return f"s3://bucket/{uuid.uuid4().hex}"
 
 
@@ -666,30 +666,47 @@ def test_living_claims_are_known_and_stale_ones_swept(two, bucket):
 
 
 class Cutting(http.server.BaseHTTPRequestHandler):
-    """Answers every listing with nothing, and cuts as many answers as its server is to cut."""
+    """Holds nothing. Cuts the first `cut` answers of its server; `told` is the length that it tells of them, 0 = that
+    of what is left."""
 
     def do_GET(self):
-        answer = b"<ListBucketResult><IsTruncated>false</IsTruncated></ListBucketResult>"
+        listing = "list-type" in self.path
+        answer = (
+            b"<ListBucketResult><IsTruncated>false</IsTruncated></ListBucketResult>" if listing else b"<Error/>" * 9
+        )
         self.server.asked += 1
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(answer)))
+        told = len(answer)
+        if self.server.asked <= self.server.cut:
+            answer = answer[:9]
+            told = self.server.told or len(answer)
+        self.send_response(200 if listing else 404)
+        self.send_header("Content-Length", str(told))
         self.end_headers()
-        self.wfile.write(answer[:9] if self.server.asked <= self.server.cut else answer)
+        self.wfile.write(answer)
 
     def log_message(self, *_):
         pass
 
 
-@pytest.mark.parametrize("listing", [Bucket.files, Bucket.folders])
-def test_a_listing_whose_answer_was_cut_is_asked_for_again(location, monkeypatch, listing):
+@pytest.mark.parametrize(
+    ("ask", "told", "answer"),
+    [
+        (Bucket.files, 80, []),
+        (Bucket.files, 0, []),
+        (Bucket.folders, 80, []),
+        (Bucket.folders, 0, []),
+        (Bucket.get, 80, None),
+    ],
+)
+def test_what_was_asked_is_asked_again_where_the_answer_was_cut(location, monkeypatch, ask, told, answer):
     with http.server.HTTPServer(("127.0.0.1", 0), Cutting) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
-        server.asked, server.cut = 0, 1
-        assert listing(Bucket(location), "objects") == []
+        server.asked, server.cut, server.told = 0, 1, told
+        assert ask(Bucket(location), "objects") == answer
         server.asked, server.cut = 0, 9
         with pytest.raises(StoreFailure, match="cannot be used"):
-            listing(Bucket(location), "objects")
+            ask(Bucket(location), "objects")
         assert server.asked == 2, "no more often than other requests"
         server.shutdown()
 
