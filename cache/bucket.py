@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,7 +28,11 @@ T = TypeVar("T")
 
 AT_ONCE = 8
 """How many files of one object travel at the same time."""
-RETRIES: Any = {"max_retries": 8, "retry_timeout": timedelta(minutes=1)}
+FIRST_PAUSE = timedelta(seconds=0.1)
+"""Before a request is tried again; each further pause is twice as long."""
+RETRIES: Any = {"max_retries": 8, "retry_timeout": timedelta(minutes=1), "backoff": {"init_backoff": FIRST_PAUSE}}
+_CUT = re.compile("response body|list response")
+"""In what the library says of an answer that was cut."""
 _LOCATION = re.compile(r"(s3|gs|az)://[^/\s]+(/\S*)?")
 
 
@@ -70,36 +75,37 @@ class Bucket:
     def get(self, name: str) -> tuple[bytes, Meta] | None:
         """A file's content; None when it is not there."""
         with self._reaching(), contextlib.suppress(FileNotFoundError):
-            found = self._store.get(name)
+            found = _insist(self._store.get, name)
             return bytes(found.bytes()), _meta(name, found.meta)
         return None
 
     def blocks(self, name: str) -> Iterator[bytes]:
         """A file's content, piece by piece; nothing when it is not there."""
         with self._reaching(), contextlib.suppress(FileNotFoundError):
-            yield from self._store.get(name).stream()
+            yield from _insist(self._store.get, name).stream()
 
     def head(self, name: str) -> Meta | None:
         """What is said of a file; None when it is not there."""
         with self._reaching(), contextlib.suppress(FileNotFoundError):
-            return _meta(name, self._store.head(name))
+            return _meta(name, _insist(self._store.head, name))
         return None
 
-    def files(self, folder: str) -> Iterator[Meta]:
+    def files(self, folder: str) -> list[Meta]:
         """All files below a folder."""
         with self._reaching():
-            for some in self._store.list(folder, chunk_size=1000):
-                yield from (_meta(said["path"], said) for said in some)
+            pages = _insist(lambda: list(self._store.list(folder, chunk_size=1000)))
+        return [_meta(said["path"], said) for some in pages for said in some]
 
     def folders(self, folder: str) -> list[str]:
         """The names of the folders in a folder."""
         with self._reaching():
-            return [path.rpartition("/")[2] for path in self._store.list_with_delimiter(folder)["common_prefixes"]]
+            found = _insist(self._store.list_with_delimiter, folder)
+        return [path.rpartition("/")[2] for path in found["common_prefixes"]]
 
     def put(self, name: str, content: bytes | Path) -> None:
         """Write a file; one of that name is replaced."""
         with self._reaching():
-            self._store.put(name, content)
+            _insist(self._store.put, name, content)
 
     def create(self, name: str, content: bytes | Path) -> bool:
         """Write a file; False when one of that name is there already."""
@@ -107,7 +113,7 @@ class Bucket:
 
         with self._reaching():
             try:
-                self._store.put(name, content, mode="create")
+                _insist(self._store.put, name, content, mode="create")
             except AlreadyExistsError:
                 return False
         return True
@@ -118,7 +124,7 @@ class Bucket:
 
         with self._reaching():
             try:
-                self._store.put(seen.name, content, mode=seen.version)
+                _insist(self._store.put, seen.name, content, mode=seen.version)
             except (PreconditionError, FileNotFoundError):
                 return False
         return True
@@ -126,7 +132,7 @@ class Bucket:
     def delete(self, names: Iterable[str]) -> None:
         """Delete files, where they are there."""
         with self._reaching(), contextlib.suppress(FileNotFoundError):
-            self._store.delete([*names])
+            _insist(self._store.delete, [*names])
 
     def each(self, action: Callable[[T], object], items: Iterable[T]) -> None:
         """Do something for several files at once. Raises what the first of them raised, when all have ended."""
@@ -147,6 +153,23 @@ class Bucket:
                 f"the store {self.location} cannot be used: {_reason(error)}. What was finished is kept: when network "
                 "and permissions allow, run again to go on."
             ) from error
+
+
+def _insist(request: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Make a request; again where its answer was cut, which the library does not do for listings and refusals."""
+    from obstore.exceptions import GenericError
+
+    last = time.monotonic() + RETRIES["retry_timeout"].total_seconds()
+    pause = FIRST_PAUSE.total_seconds()
+    for _ in range(RETRIES["max_retries"]):
+        try:
+            return request(*arguments, **options)
+        except GenericError as error:
+            if not _CUT.search(str(error)) or time.monotonic() > last:
+                raise
+        time.sleep(pause)
+        pause *= 2
+    return request(*arguments, **options)
 
 
 def _meta(name: str, said: Any) -> Meta:

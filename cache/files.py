@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import shutil
+import time
 import uuid
 from pathlib import Path
 
+from blake3 import blake3
+
+AT_WORK_SECONDS = 3600.0
+"""For so long after its last change an unfinished file counts as being written."""
+_NAME_BYTES = 200
+"""How much of a name goes into a hidden one: file systems allow 255 bytes in all."""
+
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file so that a reader, and a crash, sees the old content or the new, never a part."""
+    """Write a file so that a reader, and a crash, sees the old content or the new, never a part.
+
+    What was written beside it by a process that was killed is taken away by a later call.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f".{path.name}.{uuid.uuid4().hex}"
+    _tidy(path)
+    temporary = path.parent / f"{hidden(path.name)}.{uuid.uuid4().hex}"
     try:
         with temporary.open("wb") as stream:
             stream.write(content.encode() if isinstance(content, str) else content)
@@ -20,6 +34,23 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def hidden(name: str) -> str:
+    """What the names begin with of things that will take the place of a file or a folder of this name."""
+    whole = os.fsencode(name)
+    if len(whole) > _NAME_BYTES:  # with a digest, since names may differ at their ends alone
+        name = f"{whole[: _NAME_BYTES - 9].decode(errors='ignore')}.{blake3(whole).hexdigest(4)}"
+    return f".{name}"
+
+
+def _tidy(path: Path) -> None:
+    """Remove what killed calls of `write_atomically` left beside a file."""
+    unfinished = re.compile(rf"{re.escape(hidden(path.name))}\.[0-9a-f]{{32}}")
+    with contextlib.suppress(OSError):  # a folder that may be written, but not be listed
+        for left in filter(lambda entry: unfinished.fullmatch(entry.name), entries(str(path.parent))):
+            if left.stat(follow_symlinks=False).st_mtime < time.time() - AT_WORK_SECONDS:
+                os.unlink(left.path)
 
 
 def rename_folder(source: Path, target: Path) -> None:

@@ -11,8 +11,8 @@ never read, and is written over or collected. The action comes after all of its 
 
 *Concurrent writers.* Two that write the same object write the same content; a reader checks what it gets.
 
-*Damage.* What is downloaded is checked before it gets its name here. A damaged copy here is downloaded again; one in
-the bucket is taken out, and its maker runs again.
+*Damage.* What is downloaded is checked before it gets its name here. A damaged copy here is downloaded again; what
+arrives damaged twice is taken out of the bucket, and its maker runs again.
 
 *Ages.* An object store cannot tell when something was used: in the bucket, the time of use is that of writing. What
 this machine uses, it remembers in its folder.
@@ -33,7 +33,7 @@ from ss_flow.cache.bucket import Bucket
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims, Seen
 from ss_flow.cache.errors import Gone, writing
-from ss_flow.cache.files import rename_folder, user_cache
+from ss_flow.cache.files import remove, rename_folder, user_cache
 from ss_flow.cache.store import GRACE_SECONDS, MEMORY_BYTES, Action, Entry, Store
 
 MANIFEST = "zarr.json"
@@ -133,12 +133,19 @@ class RemoteStore(Store):
                 with target.open("wb") as stream:
                     stream.writelines(self._bucket.blocks(f"{folder}/{name}"))
 
-        self._bucket.each(fetch, filter(_FILE.fullmatch, files))
+        def fetch_all() -> Any:
+            self._bucket.each(fetch, filter(_FILE.fullmatch, files))
+            return self._verified(place, object_digest)
+
         try:
-            value = self._verified(place, object_digest)
-        except ValueError as error:
-            self.discard(object_digest)
-            raise Gone(object_digest, f"was damaged ({error})") from None
+            value = fetch_all()
+        except ValueError:  # in the bucket, or only on the way
+            remove(place)
+            try:
+                value = fetch_all()
+            except ValueError as error:
+                self.discard(object_digest)
+                raise Gone(object_digest, f"was damaged ({error})") from None
         _stamp(place, max(meta.written for meta in files.values()))
         return value
 
@@ -268,9 +275,12 @@ class _BucketClaims:
 
     def remove(self, key: str, seen: Seen) -> bool:
         # A delete has no conditions: of several who find it stale, one writes over it, and then deletes what nobody
-        # else can have written.
-        if not self._bucket.replace(seen.version, b""):
-            return self._bucket.head(f"claims/{key}") is None
+        # else can have written. Where the answer to that was lost, asking again is refused: what is there then tells.
+        mark = b"\n" + uuid.uuid4().bytes
+        if not self._bucket.replace(seen.version, mark):
+            found = self._bucket.get(f"claims/{key}")
+            if found is None or found[0] != mark:
+                return found is None
         self._bucket.delete([f"claims/{key}"])
         return True
 

@@ -20,7 +20,7 @@ from ss_flow.executors import Executor, open_executor
 from ss_flow.graph import Flow, Node
 from ss_flow.keys import Value
 from ss_flow.resolution import Failure
-from ss_flow.runs import PreviousKeys, settled, start_run
+from ss_flow.runs import PreviousKeys, next_number, settled, start_run
 from ss_flow.scheduler import Listening, Scheduler
 from ss_flow.task import Resources
 
@@ -207,11 +207,12 @@ class _Run:
         runs = store.runs
         previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
         self._previous = [previous[request.scene] for request in requests]
+        number = next_number(runs) if recorded else 0
         for request in requests:
             events = None
             if recorded:
                 with writing(store.root):
-                    folder = start_run(runs, {"scene": request.scene, **request.header}).folder
+                    folder = start_run(runs, {"scene": request.scene, "number": number, **request.header}).folder
                 claims.take(RUN_CLAIM + folder.name)
                 events = folder / "events.jsonl"
             self._logs.append(Log(events, store.root))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import os
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -193,12 +194,21 @@ class _Peaks:
 
 
 def _resident_bytes() -> int:
-    return int(_process().memory_info().rss)
+    return int(_process(os.getpid()).memory_info().rss)
 
 
 @functools.cache
-def _process() -> psutil.Process:
-    return psutil.Process()
+def _process(pid: int) -> psutil.Process:  # by its number, since a fork copies what is remembered
+    return psutil.Process(pid)
 
 
 _peaks = _Peaks()
+
+
+def _after_fork() -> None:
+    """A fork copies neither the thread that samples, nor whoever would release the lock."""
+    global _peaks
+    _peaks = _Peaks()
+
+
+os.register_at_fork(after_in_child=_after_fork)

@@ -118,7 +118,7 @@ def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def start_run(runs: Path, header: dict[str, Any]) -> Run:
-    """Open a run: its folder, with what was asked."""
+    """Open a run: its folder, with what was asked. header: with "number", its place in the order (`next_number`)."""
     name = "".join(c if c.isalnum() else "-" for c in Path(header["scene"]).name)
     name = name.encode()[:NAME_BYTES].decode(errors="ignore")  # never in the middle of a character
     folder = runs / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}-{uuid.uuid4().hex[:6]}"
@@ -128,17 +128,22 @@ def start_run(runs: Path, header: dict[str, Any]) -> Run:
     return Run(folder, header)
 
 
+def next_number(runs: Path) -> int:
+    """The number of a run that starts now. Clocks are wrong at times, and differ: by it, later runs come later."""
+    return max((int(run.header.get("number", 0)) for run in latest_runs(runs)), default=0) + 1
+
+
 def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
     """Runs, the latest first; of one scene (a resolved path), or of all. A record that says no scene is passed over."""
-    found: list[tuple[float, Run]] = []
+    found: list[tuple[int, float, Run]] = []
     for file in runs.glob("*/run.json"):
         try:
             header = json.loads(file.read_text())
             if header["scene"] == scene or scene is None:
-                found.append((float(header["started"]), Run(file.parent, header)))
-        except (*ABSENT, ValueError, KeyError, TypeError):  # collected just now, or damaged
+                found.append((int(header.get("number", 0)), float(header["started"]), Run(file.parent, header)))
+        except (*ABSENT, ValueError, KeyError, TypeError, OverflowError):  # collected just now, or damaged
             continue
-    yield from (run for _, run in sorted(found, key=lambda one: one[0], reverse=True))
+    yield from (run for *_, run in sorted(found, key=lambda one: one[:2], reverse=True))
 
 
 class PreviousKeys:

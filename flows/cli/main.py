@@ -11,6 +11,7 @@ import gc
 import io
 import os
 import signal
+import stat
 import sys
 from pathlib import Path
 from typing import Any, TextIO
@@ -122,13 +123,48 @@ def _written_out(stream: TextIO) -> None:
         silence(stream)
 
 
+class _Screen(io.FileIO):
+    """A terminal. When it is closed, what is written to it goes nowhere, also what native code writes."""
+
+    def write(self, content: Any, /) -> int:
+        try:
+            return super().write(content)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            return super().write(content)
+
+
+def _open_streams() -> None:
+    """Have the three streams lead somewhere: a file that is opened later must not get the place of a closed one."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it gets the lowest free number, this one
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115 - it stays open
+        elif stat.S_ISCHR(os.fstat(number).st_mode):  # one that was closed just now says that it is none
+            screen = io.BufferedWriter(_Screen(number, "w", closefd=False))
+            setattr(sys, name, io.TextIOWrapper(screen, stream.encoding, stream.errors, line_buffering=True))
+
+
+def _hung_up(*_: object) -> None:
+    """The terminal was closed: as after Ctrl-C, and once, since both the shell and the system may tell."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
 def entry() -> None:
     """The console script."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by who called; a file opened later must not get its place
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - it stays open
+    _open_streams()
     # A cluster's queue stops a job with SIGTERM: the run then keeps what it has, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # not after `nohup`
+        signal.signal(signal.SIGHUP, _hung_up)
     # Hardly anything here is in a cycle: search for cycles less often than after every 700 objects more.
     gc.set_threshold(20_000)
     try:

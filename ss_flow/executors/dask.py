@@ -87,24 +87,31 @@ def _connected(address: str) -> Iterator[Any]:
         async with asyncio.timeout(CONNECT_SECONDS), distributed.rpc(address, connection_args=arguments) as scheduler:
             return str((await scheduler.versions())["packages"]["distributed"])
 
+    unheard = InputError(
+        f"no Dask scheduler answers at {address!r}; --executor dask://HOST:PORT takes the address that "
+        "`dask scheduler` prints."
+    )
     try:
         # First, since a client waits for ever for whoever gives no sensible answer; in a thread, since this one may
         # have a loop that runs.
         there = ThreadPoolExecutor(1).submit(asyncio.run, version()).result()
     except Exception as error:
-        raise InputError(
-            f"no Dask scheduler answers at {address!r}; --executor dask://HOST:PORT takes the address that "
-            "`dask scheduler` prints."
-        ) from error
+        raise unheard from error
     if there != (here := distributed.__version__):
         raise InputError(f"the Dask cluster at {address!r} has distributed {there}, not {here} as this host has.")
-    with distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False) as client:
+    try:
+        connected = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+    except OSError as error:  # it has gone since
+        raise unheard from error
+    with connected as client:
         try:
             client.wait_for_workers(1, CONNECT_SECONDS)
         except TimeoutError:
             raise InputError(
                 f"the Dask cluster at {address!r} has no workers; start one, as with: dask worker {address}"
             ) from None
+        except OSError as error:
+            raise unheard from error
         yield client
 
 

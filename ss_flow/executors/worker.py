@@ -24,6 +24,8 @@ from ss_flow.execute import Cancelled, Invocation, execute_here
 from ss_flow.running import Listener
 
 GRACE_SECONDS = 3.0
+LOOK_SECONDS = 1.0
+"""How often a process that says nothing is looked after."""
 _CANCEL = None
 
 
@@ -54,7 +56,7 @@ class Worker:
             self._send(invocation)
         while True:
             with self._reaching(invocation.label):
-                kind, content = self._connection.recv()
+                kind, content = self._heard()
             if kind == "progress":
                 listener(*content)
             elif kind == "raised":
@@ -87,6 +89,14 @@ class Worker:
             yield
         except (EOFError, BrokenPipeError, ConnectionResetError):
             raise WorkerDied(f"the process of {label} {self._ending()}") from None
+
+    def _heard(self) -> tuple[str, Any]:
+        """The next message. Raises EOFError when the process has ended."""
+        while not self._connection.poll(LOOK_SECONDS):
+            # A child that the task forked holds the other end open, for as long as it lives.
+            if self._process.poll() is not None and not self._connection.poll():
+                raise EOFError
+        return cast(tuple[str, Any], self._connection.recv())
 
     def _send(self, message: Any) -> None:
         with self._sending:

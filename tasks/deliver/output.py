@@ -16,6 +16,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from ss_flow.cache.files import hidden
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap
 from ss_flow.tasks.capture.lens import Lens
@@ -100,7 +101,7 @@ def replacing(folder: Path) -> Iterator[Path]:
     folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
     _tidy(folder)
-    filling = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}.partial"
+    filling = folder.parent / f"{hidden(folder.name)}.{uuid.uuid4().hex[:8]}.partial"
     filling.mkdir()
     lock = os.open(filling, os.O_RDONLY)
     try:
@@ -124,10 +125,10 @@ def replacing(folder: Path) -> Iterator[Path]:
 
 def _tidy(folder: Path) -> None:
     """Clear away what calls of `replacing` left that were killed."""
-    unfinished = re.compile(rf"\.{re.escape(folder.name)}\.([0-9a-f]{{8}})(\.old)?\.partial")
+    unfinished = re.compile(rf"{re.escape(hidden(folder.name))}\.([0-9a-f]{{8}})(\.old)?\.partial")
     for left in list(folder.parent.iterdir()):
         found = unfinished.fullmatch(left.name)
-        if found is None or _is_filled(folder.parent / f".{folder.name}.{found[1]}.partial"):
+        if found is None or _is_filled(folder.parent / f"{hidden(folder.name)}.{found[1]}.partial"):
             continue
         if found[2] and not folder.exists():
             with contextlib.suppress(OSError):  # another one has put its content there just now

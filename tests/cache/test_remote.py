@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.server
 import json
 import os
 import sys
@@ -65,7 +66,7 @@ def location(address, monkeypatch, tmp_path):
     }
     for name, value in settings.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(bucket_module, "RETRIES", {"max_retries": 1})
+    monkeypatch.setitem(bucket_module.RETRIES, "max_retries", 1)
     return f"s3://bucket/{uuid.uuid4().hex}"
 
 
@@ -247,6 +248,27 @@ def test_a_damaged_object_in_the_bucket_is_never_served_and_is_taken_out_and_mad
                 assert digest(value) == object_digest
             assert digest(emptied(here).get(object_digest)) == object_digest
             bucket.put(file, whole)
+
+
+@pytest.mark.parametrize("read", ["get", "read"])
+def test_what_is_damaged_only_on_its_way_is_downloaded_again_and_stays_in_the_bucket(
+    here, there, bucket, monkeypatch, read
+):
+    object_digest = here.put(label_map())
+    held = names(bucket, "objects")
+    real, damaged = Bucket.blocks, []
+
+    def once(self, name):
+        whole = b"".join(real(self, name))
+        if damaged:
+            return [whole]
+        damaged.append(name)
+        return [whole[: len(whole) // 2]]
+
+    monkeypatch.setattr(Bucket, "blocks", once)
+    assert digest(getattr(there, read)(object_digest)) == object_digest
+    assert damaged and names(bucket, "objects") == held
+    assert list((there.root / "tmp").iterdir()) == []
 
 
 def test_a_damaged_copy_here_is_downloaded_again(here, there):
@@ -599,6 +621,34 @@ def test_a_claim_that_was_touched_since_it_was_seen_is_not_removed(here, bucket)
     assert place.look("k") is None
 
 
+def test_a_claim_is_removed_though_the_answer_to_writing_over_it_was_lost(here, bucket, monkeypatch):
+    place = remote_module._BucketClaims(bucket)
+    assert place.create("k", b"holder")
+    seen, real = place.look("k"), Bucket.replace
+
+    def lost(self, seen, content):
+        assert real(self, seen, content)
+        return real(self, seen, content)  # as the library asks again
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Bucket, "replace", lost)
+        assert place.remove("k", seen)
+    assert place.look("k") is None
+
+
+def test_of_two_that_find_an_emptied_claim_one_removes_it(here, bucket, monkeypatch):
+    place = remote_module._BucketClaims(bucket)
+    assert place.create("k", b"holder")
+    seen = place.look("k")
+    with monkeypatch.context() as patched:
+        patched.setattr(Bucket, "delete", lambda *_: None)
+        assert place.remove("k", seen)  # and dies before it deletes it
+        emptied = place.look("k")
+        assert place.remove("k", emptied)
+    assert not place.remove("k", emptied)
+    assert place.remove("k", place.look("k"))
+
+
 def test_living_claims_are_known_and_stale_ones_swept(two, bucket):
     first, second = two
     first.take("run-küche")
@@ -613,6 +663,52 @@ def test_living_claims_are_known_and_stale_ones_swept(two, bucket):
 
 
 # What is wrong
+
+
+class Cutting(http.server.BaseHTTPRequestHandler):
+    """Holds nothing. Cuts the first `cut` answers of its server; `told` is the length that it tells of them, 0 = that
+    of what is left."""
+
+    def do_GET(self):
+        listing = "list-type" in self.path
+        answer = (
+            b"<ListBucketResult><IsTruncated>false</IsTruncated></ListBucketResult>" if listing else b"<Error/>" * 9
+        )
+        self.server.asked += 1
+        told = len(answer)
+        if self.server.asked <= self.server.cut:
+            answer = answer[:9]
+            told = self.server.told or len(answer)
+        self.send_response(200 if listing else 404)
+        self.send_header("Content-Length", str(told))
+        self.end_headers()
+        self.wfile.write(answer)
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("ask", "told", "answer"),
+    [
+        (Bucket.files, 80, []),
+        (Bucket.files, 0, []),
+        (Bucket.folders, 80, []),
+        (Bucket.folders, 0, []),
+        (Bucket.get, 80, None),
+    ],
+)
+def test_what_was_asked_is_asked_again_where_the_answer_was_cut(location, monkeypatch, ask, told, answer):
+    with http.server.HTTPServer(("127.0.0.1", 0), Cutting) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+        server.asked, server.cut, server.told = 0, 1, told
+        assert ask(Bucket(location), "objects") == answer
+        server.asked, server.cut = 0, 9
+        with pytest.raises(StoreFailure, match="cannot be used"):
+            ask(Bucket(location), "objects")
+        assert server.asked == 2, "no more often than other requests"
+        server.shutdown()
 
 
 def test_a_server_that_has_gone_is_told_in_one_sentence_that_names_the_store(location, tmp_path, monkeypatch):

@@ -184,6 +184,25 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["x.json"]
 
 
+@pytest.mark.parametrize(
+    "name", ["x" * 255, "\u5199" * 85, os.fsdecode(b"\xff" * 250)], ids=["long", "3 bytes", "no text"]
+)
+def test_a_file_may_have_the_longest_name_that_file_systems_take(tmp_path, name):
+    write_atomically(tmp_path / name, "content")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "content"}
+
+
+def test_what_killed_writers_left_beside_a_file_is_taken_away_by_age_and_nothing_else_is(tmp_path):
+    left, young = (tmp_path / f".a[1].ply.{digit * 32}" for digit in "0f")
+    others = [tmp_path / name for name in (".a[1].ply.0123", f".a1.ply.{'0' * 32}", f".b.a[1].ply.{'0' * 32}")]
+    for path in (left, young, *others):
+        path.write_text("x")
+        if path != young:
+            os.utime(path, (0, time.time() - 2 * GRACE_SECONDS))
+    write_atomically(tmp_path / "a[1].ply", "new")
+    assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "a[1].ply", young, *others])
+
+
 def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
     from ss_flow.cache import file_digests
 

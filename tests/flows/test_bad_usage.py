@@ -498,6 +498,54 @@ def test_a_stream_that_is_closed_is_no_failure(closed, tiny):
         assert (called.returncode, called.stderr) == (0, "")
 
 
+def test_a_run_whose_terminal_was_closed_goes_on(warm):
+    screen, terminal = os.openpty()
+    os.close(screen)
+    options = ["--cache", warm.store, "--out", warm.out, "--preset", "fast", *SHORT, "--undistorted"]
+    words = [sys.executable, "-c", ENTRY, "run", warm.scene, *options]
+    called = subprocess.run(list(map(str, words)), stdin=terminal, stdout=terminal, stderr=terminal)
+    os.close(terminal)
+    assert called.returncode == 0
+    assert (warm.out / "undistorted").is_dir()
+
+
+def test_no_file_gets_the_place_of_a_closed_stream(tmp_path):
+    child = "import os; print([os.fstat(n).st_rdev == os.stat(os.devnull).st_rdev for n in (0, 2)])"
+    before = (
+        "import subprocess, sys\n"
+        "from ss_flow.flows.cli import main\n"
+        "def opens(arguments):\n"
+        "    with open(arguments[0], 'w') as file:\n"
+        "        print('noise'), print('noise', file=sys.stderr)\n"
+        f"        return subprocess.call([sys.executable, '-c', {child!r}], stdout=file)\n"
+        "main.main = opens\n"
+    )
+    words = [sys.executable, "-c", before + ENTRY, str(tmp_path / "opened")]
+    assert subprocess.call(["sh", "-c", 'exec "$0" "$@" <&- >&- 2>&-', *words]) == 0
+    assert (tmp_path / "opened").read_text() == "[True, True]\n"
+
+
+@pytest.mark.parametrize(("action", "code"), [("SIG_DFL", 130), ("SIG_IGN", 0)], ids=["alone", "under nohup"])
+def test_a_terminal_that_is_closed_ends_a_command_as_ctrl_c_does_though_it_is_told_twice(action, code):
+    before = (
+        "import signal\n"
+        f"signal.signal(signal.SIGHUP, signal.{action})\n"
+        "from ss_flow.flows.cli import main\n"
+        "class Command:\n"
+        "    def run(self):\n"
+        "        try:\n"
+        "            signal.raise_signal(signal.SIGHUP)\n"
+        "            return 0\n"
+        "        finally:\n"
+        "            signal.raise_signal(signal.SIGHUP)\n"
+        "            print('kept')\n"
+        "main._read = lambda arguments: Command()\n"
+    )
+    called = run_entry(["run"], before)
+    assert (called.returncode, called.stdout) == (code, "kept\n")
+    assert called.stderr.startswith("ss-flow: interrupted") == (code == 130)
+
+
 def test_an_interrupt_before_the_command_is_known_ends_as_any_other():
     before = (
         "import sys\n"

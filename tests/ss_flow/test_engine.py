@@ -14,7 +14,7 @@ import pytest
 import ss_flow_toy as toy
 from aged_store import age_all
 
-from ss_flow import engine, keys, scheduler
+from ss_flow import engine, keys, runs, scheduler
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
@@ -488,7 +488,11 @@ def test_the_folder_of_a_run_has_a_name_that_file_systems_take(store, name):
 
 
 @pytest.mark.parametrize(
-    "content", ["{}", "[]", '"scene"', '{"scene": "toy"}', '{"scene": "toy", "started": "x"}', "{"]
+    "content",
+    [
+        *("{}", "[]", "{", '"scene"', '{"scene": "toy"}', '{"scene": "toy", "started": "x"}'),
+        *(f'{{"scene": "toy", "started": 1, "number": {number}}}' for number in ('"x"', "null", "1e999", "NaN")),
+    ],
 )
 def test_a_run_whose_record_is_damaged_is_passed_over(store, content):
     first = run(store, toy.flow)
@@ -497,6 +501,27 @@ def test_a_run_whose_record_is_damaged_is_passed_over(store, content):
     (folder / "run.json").write_text(content)
     assert run(store, toy.flow).values == first.values
     assert folder not in [one.folder for one in latest_runs(store.runs)]
+
+
+def test_a_run_whose_clock_was_ahead_is_the_latest_only_until_the_next(store, monkeypatch):
+    with monkeypatch.context() as ahead:
+        ahead.setattr(runs.time, "time", lambda: 4e9)
+        run(store, lambda: toy.flow(limit=5.0))
+    for limit in (6.0, 7.0):
+        run(store, lambda limit=limit: toy.flow(limit=limit))
+    keys = [{node["key"] for node in one.nodes()} for one in latest_runs(store.runs, "toy")]
+    again = run(store, lambda: toy.flow(limit=7.0))
+    assert {node["key"] for node in again.nodes} == keys[0] and len(keys) == 3
+    assert [one.header["started"] > 3e9 for one in latest_runs(store.runs)] == [False, False, False, True]
+
+
+def test_runs_of_a_store_without_numbers_are_in_the_order_of_their_times_and_before_all_others(store):
+    for started in (2, 3, 1):
+        folder = store.runs / str(started)
+        folder.mkdir(parents=True)
+        (folder / "run.json").write_text(json.dumps({"scene": "toy", "started": started * 1e10}))
+    run(store, toy.flow)
+    assert [one.folder.name for one in latest_runs(store.runs)][1:] == ["3", "2", "1"]
 
 
 def test_a_damaged_event_log_keeps_no_later_run_from_its_work(store):

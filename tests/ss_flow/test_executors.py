@@ -450,6 +450,24 @@ def test_a_cluster_without_workers_is_refused_in_one_sentence(store, monkeypatch
         run_flow(toy.flow, store, scene="toy", executor=at(cluster))
 
 
+@pytest.mark.parametrize("at_once", [True, False], ids=["while we connect", "while we look for workers"])
+def test_a_scheduler_that_goes_while_we_connect_is_refused_in_one_sentence(store, servers, monkeypatch, at_once):
+    import distributed
+
+    monkeypatch.setattr("ss_flow.executors.dask.CONNECT_SECONDS", 1.0)
+    method = "__init__" if at_once else "wait_for_workers"
+    real = getattr(distributed.Client, method)
+
+    def bereft(self, *arguments, **options):
+        servers.scheduler.kill()
+        servers.scheduler.wait()
+        return real(self, *arguments, **options)
+
+    monkeypatch.setattr(distributed.Client, method, bereft)
+    with pytest.raises(InputError, match="no Dask scheduler answers at"):
+        open_executor(f"dask://{servers.address}", 1, store, print)
+
+
 def test_without_the_package_the_refusal_says_what_to_install(store, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'ss-flow\[dask\]'"):

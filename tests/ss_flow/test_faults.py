@@ -337,6 +337,40 @@ def test_a_task_whose_process_was_killed_is_tried_once_more_alone(store, tmp_pat
     assert all("memory runs out" in because for _, because in told)
 
 
+def test_a_killed_process_is_not_waited_for_until_a_child_that_its_task_forked_ends(store, tmp_path):
+    child = tmp_path / "child"
+    report = run(store, one(lambda x: toy.killed_beside_its_child(x, child_file=str(child))))
+    assert computed(report) == ["ss_flow_toy.killed_beside_its_child", "ss_flow_toy.source"]
+    left = psutil.Process(int(child.read_text()))
+    assert left.status() != psutil.STATUS_ZOMBIE
+    left.kill()
+
+
+AFTER_A_FORK = """
+import os, sys, threading
+sys.path.insert(0, {support!r})
+import ss_flow_toy as toy
+from ss_flow import execute
+from ss_flow.cache.store import Store
+from ss_flow.engine import run_flow
+run_flow(toy.flow, Store({store!r}), scene="toy")
+end, held = os.pipe()
+execute._peaks._lock.acquire()
+if os.fork():
+    os._exit(0)
+os.close(held)
+os.read(end, 1)  # until the parent has gone
+report = run_flow(lambda: toy.flow(values=(5.0, 6.0)), Store({store!r}), scene="toy")
+print(report.failures, any(thread.name == "peak-memory" for thread in threading.enumerate()), flush=True)
+"""
+
+
+def test_a_forked_process_runs_flows_when_its_parent_has_gone(store):
+    program = AFTER_A_FORK.format(support=str(Path(toy.__file__).parent), store=str(store.root))
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert (ran.stdout, ran.stderr) == ("[] True\n", "")
+
+
 PROGRAM = """
 import sys
 {before}

@@ -260,6 +260,18 @@ def killed_once(x: Number, *, marker: str) -> Number:
 
 
 @task(isolate=True)
+def killed_beside_its_child(x: Number, *, child_file: str) -> Number:
+    """Forks a child that outlives it, and dies, the first time."""
+    if not Path(child_file).exists():
+        if (child := os.fork()) == 0:
+            time.sleep(60)
+            os._exit(0)
+        Path(child_file).write_text(str(child))
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+@task(isolate=True)
 def killed(x: Number) -> Number:
     os.kill(os.getpid(), signal.SIGKILL)
     return x

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ss_flow.cache.files import hidden
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, LabelMap
 from ss_flow.tasks.deliver.output import RUN_FILE, check_place, replacing, write_masks
@@ -55,6 +56,20 @@ def test_what_a_killed_run_left_is_taken_away_and_the_neighbours_are_not(tmp_pat
     with replacing(tmp_path / "out[1]"):
         pass
     assert names(tmp_path) == sorted([*others, "out[1]"])
+
+
+def test_a_folder_may_have_the_longest_name_that_file_systems_take_and_takes_nothing_of_its_neighbour(tmp_path):
+    folder, neighbour = tmp_path / ("o" * 255), tmp_path / ("o" * 254 + "x")
+    left = tmp_path / f"{hidden(neighbour.name)}.0123abcd.old.partial"
+    left.mkdir()
+    for content in ("old", "new"):
+        with replacing(folder) as filling:
+            (filling / "a").write_text(content)
+        assert (folder / "a").read_text() == content
+        assert names(tmp_path) == sorted([folder.name, left.name])
+    with pytest.raises(OSError, match="full"), replacing(neighbour):
+        raise OSError("disk full")
+    assert names(tmp_path) == sorted([folder.name, neighbour.name])
 
 
 def killed_in_the_middle(folder, monkeypatch, error):
