@@ -106,12 +106,8 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
         try:
             source = _read(name)
             as_written = source is None or name.startswith("ss_flow.") or is_as_written(name)
-        except (
-            OSError,
-            ValueError,
-            SyntaxError,
-            ImportError,
-        ):  # its file has gone, or is no text; who needs it will say so
+        # Its file has gone, or is no text; who needs it will say so.
+        except (OSError, ValueError, SyntaxError, ImportError):
             continue
         changed = changed or (name in _known and _known[name][1] != source)
         _known[name] = specification, source
