@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from types import ModuleType, SimpleNamespace
 
+import pytest
+
 from ss_flow import sources
 
 
@@ -19,3 +21,15 @@ def test_loaded_modules_can_be_looked_through_while_others_are_loaded(monkeypatc
     modules = {LoadsAnother("probe.a"): ModuleType("probe.a"), "other": ModuleType("other")}
     monkeypatch.setattr(sources, "sys", SimpleNamespace(modules=modules))
     assert sources._loaded.__wrapped__(("probe",), 2) == ["probe.a"]
+
+
+@pytest.mark.parametrize("changed", ["probe.a", "probe.b"])
+def test_of_several_modules_that_are_loaded_anew_each_one_that_changed_is_told(monkeypatch, changed):
+    text = {"probe.a": "1", "probe.b": "1"}
+    monkeypatch.setattr(sources, "_known", {})
+    monkeypatch.setattr(sources, "_loaded", lambda *_: list(text))
+    monkeypatch.setattr(sources, "_specification", lambda name: object())  # another one each time
+    monkeypatch.setattr(sources, "_read", text.__getitem__)
+    assert not sources.read_loaded(("probe",)) and not sources.read_loaded(("probe",))
+    text[changed] = "2"
+    assert sources.read_loaded(("probe",)) and not sources.read_loaded(("probe",))
