@@ -107,7 +107,7 @@ def match_pairs(
     The overlap of a pair is s_ab = max(C_ab, C_ba). The pair with the largest s above `min_score` whose groups are both
     free is taken, until there is none; ties go to the pair with fewer Gaussians, then to the lowest ids.
 
-    collisions: [G, G]; sizes: [G] numbers of Gaussians; ids: [G] lowest instance id of each group, unique.
+    collisions: [G, G]; sizes: [G] Gaussians; ids: [G] lowest instance id of each group, unique if it collides.
     collision_free: the paper's text taken literally: a pair waits while a group of it collides with another pair's.
     Returns pairs [P, 2] of positions, lower id first, and their scores [P], descending.
     """

@@ -58,13 +58,10 @@ def plan(groups: tuple[Gaussians, ...], shown: Appearances, *, params: PlanParam
     """
     last = round >= params.max_rounds
     collisions = np.zeros((len(groups), len(groups))) if last else _collisions(groups, params)
-    background = [i for i, g in enumerate(groups) if len(g) and not g.instance_id.any()]
+    background = [i for i, g in enumerate(groups) if not g.instance_id.any()]
     collisions[background, :] = collisions[:, background] = 0
     sizes = np.array([len(g) for g in groups], np.int32)
-    # An empty group collides with nothing; its number keeps the ids unique.
-    ids = np.array(
-        [int(g.instance_id.min()) if len(g) else np.iinfo(np.int32).max - i for i, g in enumerate(groups)], np.int32
-    )
+    ids = np.array([g.instance_id.min(initial=np.iinfo(np.int32).max) for g in groups], np.int32)
     pairs, scores = match_pairs(
         collisions, sizes, ids, min_score=params.min_score, collision_free=params.pairing == "collision_free"
     )

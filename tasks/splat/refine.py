@@ -139,8 +139,6 @@ def refine(
         if new is not None or row is not None:
             names.append(frame.name)
         progress(view + 1, len(views.frames), frame.name)
-    if not names:
-        return instance
     return replace(
         instance,
         **vars(Masks.joined(masks)),

@@ -106,7 +106,7 @@ def part_masks(
     for row, mask in enumerate(dense):
         inside = mask.ravel()[old.pixel]
         votes = np.bincount(old.label[inside], minlength=1)
-        of_most = (old.label == votes.argmax()) & (old.label > 0)
+        of_most = old.label == votes.argmax()
         held, total = (
             np.bincount(new.label[here], minlength=after.num_labels + 1) for here in (of_most & inside, of_most)
         )

@@ -214,7 +214,7 @@ def _most_held(
     for a, (k, mask) in enumerate(zip(matched.view, matched.mask, strict=True)):
         inside = observations[k].inside(row_of[k][mask])
         held = np.bincount(parted[inside[whole[inside] == match_label[a]]])
-        if match_label[a] and len(held):
+        if len(held):
             renamed[a] = held.argmax()
     return renamed
 
@@ -237,7 +237,7 @@ def _unconfirmed(
             seen += 10 * np.bincount(label[observation.point_index], minlength=len(size)) >= np.maximum(size, 1)
             support[shown[1, shown[0] == k]] += 1
     few = (support < params.min_label_views) & (support < params.min_label_share * seen)
-    dropped = few & (seen >= params.min_label_views) & (size > 0)
+    dropped = few & (seen >= params.min_label_views)
     dropped[0] = False
     if dropped.any():
         warn(

@@ -108,6 +108,14 @@ def test_the_claim_of_another_host_expires_by_our_own_clock_only(store, claims, 
     assert claims.take("k")
 
 
+def test_a_touch_shows_that_the_holder_lives_and_changes_nothing_else(store):
+    folder = Folder(store.root)
+    assert folder.create("k", b"mine")
+    os.utime(place(store), (0, 0))
+    folder.touch("k", folder.look("k"))
+    assert folder.look("k").touched > 1e9 and folder.look("k").content == b"mine"
+
+
 def test_a_claim_that_was_taken_over_is_neither_touched_nor_released_by_its_first_holder(store, monkeypatch):
     monkeypatch.setattr(module, "HEARTBEAT_SECONDS", 0.05)
     monkeypatch.setattr(module, "EXPIRY_SECONDS", 0.0)

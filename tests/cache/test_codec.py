@@ -85,6 +85,7 @@ class Everything:
     unit: float
     count: int
     flag: bool
+    rows: tuple[tuple[int, ...], ...] = ((1, 2), (3,), ())
     nothing: None = None
 
 
@@ -116,6 +117,7 @@ def test_ragged_rows_texts_and_tables_read_back_equal(tmp_path_factory, rows, na
         back = codec.read(folder)
     assert digest(back) == digest(value)
     assert (back.names, back.count, back.flag, back.nothing) == (value.names, value.count, value.flag, None)
+    assert back.rows == ((1, 2), (3,), ())
     assert [type(x) for x in vars(back).values()] == [type(x) for x in vars(value).values()]
 
 

@@ -70,6 +70,10 @@ def ball_points(n: int = 300):
     return initialise(points.astype(np.float32), (255 * color_at(points)).astype(np.uint8), 4, 0.5)
 
 
+def three_gaussians() -> Gaussians:
+    return initialise(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8), 1, 1.0)
+
+
 def same_bytes(a: Gaussians, b: Gaussians) -> bool:
     return all(getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in PARAMETERS)
 
@@ -189,6 +193,13 @@ def test_the_means_alone_slow_down_in_3dgs():
     assert rates.at(0.5) == replace(rates, position=pytest.approx(0.1))
 
 
+def test_colours_above_degree_0_learn_a_twentieth_as_fast():
+    rates = LearningRates(1.0, 0.01, 2.0, 4.0, 6.0, 8.0).by_parameter(0.5)
+    assert rates == {
+        "means": 0.5, "quaternions": 8.0, "log_scales": 6.0, "opacity_logits": 4.0, "sh": 2.0, "sh_rest": 0.1
+    }  # fmt: skip
+
+
 def test_a_step_whose_rates_have_fallen_to_nothing_moves_nothing():
     ball = ball_points()
     params = TrainParams(iterations=1, densify="none", prune_contribution=0.0, prune_opacity=0.0)
@@ -250,7 +261,7 @@ def test_a_loss_that_is_not_finite_is_told_with_its_step_wherever_training_ends(
 
 
 def test_large_gaussians_are_split_and_small_ones_cloned():
-    points = initialise(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8), 1, 1.0)
+    points = three_gaussians()
     parameters = {"means": points.means, "quaternions": points.quaternions, "log_scales": points.log_scales.copy()}
     parameters["log_scales"][0] = np.log(0.001)
     values, source, fresh = densify(
@@ -263,28 +274,93 @@ def test_large_gaussians_are_split_and_small_ones_cloned():
     assert not np.array_equal(values["means"][3], values["means"][4])
 
 
-def test_densification_ends_at_the_limit_with_the_largest_gradients_first():
+@pytest.mark.parametrize(("most", "sources"), [(8, [0, 1, 2, 3, 4, 5, 1, 3]), (4, [0, 1, 2, 3, 4, 5])])
+def test_densification_ends_at_the_limit_with_the_largest_gradients_first(most, sources):
     points = initialise(np.random.default_rng(0).random((6, 3)).astype(np.float32), np.zeros((6, 3), np.uint8), 1, 1.0)
     parameters = {"means": points.means, "quaternions": points.quaternions, "log_scales": points.log_scales - 9}
     gradient = np.array([1, 6, 2, 5, 3, 4.0])
     _, source, _ = densify(
-        parameters, gradient, threshold=0.5, extent=1, most=8, generator=np.random.default_rng(0),
+        parameters, gradient, threshold=0.5, extent=1, most=most, generator=np.random.default_rng(0),
         backend=NativeBackend(1),
     )  # fmt: skip
-    assert source.tolist() == [0, 1, 2, 3, 4, 5, 1, 3]
+    assert source.tolist() == sources
+
+
+def test_the_halves_of_a_split_gaussian_lie_along_it_as_it_is_turned():
+    half = np.sqrt(0.5)
+    needle = {
+        "means": np.zeros((1, 3), np.float32),
+        "quaternions": np.array([[half, 0, 0, half]], np.float32),  # a quarter turn about z: x becomes y
+        "log_scales": np.log(np.array([[1, 1e-4, 1e-4]], np.float32)),
+    }
+    values, *_ = densify(
+        needle, np.ones(1), threshold=0.5, extent=1.0, most=9, generator=np.random.default_rng(0),
+        backend=NativeBackend(1),
+    )  # fmt: skip
+    away = np.abs(values["means"])
+    assert (away[:, 1] > 0.05).all() and (away[:, [0, 2]] < 1e-3).all()
+
+
+def densified(given: Gaussians, step: int, **changes) -> list[int]:
+    """Which of three Gaussians are left after a step, when they are looked at every 10, and reset every 20."""
+    backend = NativeBackend(1)
+    rules = {"threshold": 1.0, "extent": 2.0, "most": 9, "prune_opacity": 0.0, **changes}
+    control = AdaptiveControl(GradientRecord(3, backend), Schedule(0, 100, 10, 20), **rules)
+    parameters, nothing = Parameters(given, 0, backend), Seen(np.zeros((3, 2), np.float32), np.ones(3, np.float32), 1)
+    control.after(step, parameters, nothing, np.random.default_rng(0))
+    return parameters.origin.tolist()
 
 
 @pytest.mark.parametrize(("step", "kept"), [(20, [0, 1, 2]), (30, [0, 1])])
 def test_what_is_larger_than_a_tenth_of_the_scene_is_dropped_once_opacities_have_been_reset(step, kept):
-    given = initialise(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8), 1, 1.0)
+    given = three_gaussians()
     given.log_scales[:] = np.log([[0.01], [0.19], [0.21]])
-    backend = NativeBackend(1)
-    control = AdaptiveControl(
-        GradientRecord(3, backend), Schedule(0, 100, 10, 20), threshold=1.0, extent=2.0, most=9, prune_opacity=0.0
-    )
-    parameters, nothing = Parameters(given, 0, backend), Seen(np.zeros((3, 2), np.float32), np.ones(3, np.float32), 1)
-    control.after(step, parameters, nothing, np.random.default_rng(0))
-    assert parameters.origin.tolist() == kept
+    assert densified(given, step) == kept
+
+
+def test_what_is_faint_is_dropped_whenever_gaussians_are_cloned_and_split():
+    given = three_gaussians()
+    given.opacity_logits[:] = np.log([0.1 / 0.9, 0.01 / 0.99, 0.1 / 0.9])
+    assert densified(given, 10, prune_opacity=0.05) == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("rules", "left"), [({}, 300), ({"prune_opacity": 0.02}, 290), ({"prune_contribution": 1e-9}, 280)]
+)
+def test_what_is_faint_and_what_no_view_shows_are_dropped_in_the_end(rules, left):
+    ball = ball_points()
+    ball.opacity_logits[:10] = -5
+    ball.means[10:30] = (0, 50, 0)  # beside all views
+    params = TrainParams(iterations=1, densify="none", **{"prune_opacity": 0.0, "prune_contribution": 0.0, **rules})
+    assert len(train(ball, VIEWS, params=params, extent=1.6, seed=1).gaussians) == left
+
+
+def moving() -> Parameters:
+    """Three Gaussians, with momenta of 1 in everything."""
+    parameters = Parameters(three_gaussians(), 0, NativeBackend(1))
+    state = parameters.state()
+    parameters.restore({name: np.ones_like(a) if is_momentum(name) else a for name, a in state.items()})
+    return parameters
+
+
+def is_momentum(name: str) -> bool:
+    return name.startswith(("first.", "second."))
+
+
+def test_new_rows_start_without_momentum_and_old_ones_keep_theirs():
+    parameters, rows = moving(), np.array([2, 0, 0])
+    parameters.rearrange({n: a[rows] for n, a in parameters.values.items()}, rows, np.array([False, False, True]))
+    state = parameters.state()
+    assert state["origin"].tolist() == [2, 0, 0]
+    assert all(a[:2].all() and not a[2].any() for name, a in state.items() if is_momentum(name))
+
+
+def test_opacities_that_are_reset_lose_their_momentum_and_nothing_else_does():
+    parameters = moving()
+    parameters.limit_opacity(0.01)
+    assert parameters.opacities() == pytest.approx(0.01)
+    momenta = {name: a.any() for name, a in parameters.state().items() if is_momentum(name)}
+    assert {name for name, kept in momenta.items() if not kept} == {"first.opacity_logits", "second.opacity_logits"}
 
 
 def test_a_limit_of_none_lets_densification_go_on():

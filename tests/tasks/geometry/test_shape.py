@@ -8,14 +8,15 @@ import pytest
 from ss_flow.tasks.geometry.shape import plane_of_most, plane_through
 
 
+@pytest.mark.parametrize("away", [5, -5])
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (1.0, 2.0, -2.0)])
-def test_points_beside_a_plane_do_not_draw_away_the_plane_of_most(normal):
+def test_points_beside_a_plane_do_not_draw_away_the_plane_of_most(normal, away):
     rng = np.random.default_rng(0)
     normal = np.array(normal) / np.linalg.norm(normal)
     rows, _ = np.linalg.qr(np.column_stack([normal, rng.normal(size=(3, 2))]))
-    flat = rng.uniform(-1, 1, (700, 2)) @ rows[:, 1:].T + 5
-    pole = [5, 5, 5] + rows[:, 1] + rng.uniform(0, 1, (300, 1)) * normal  # at an edge, where it tilts a fit to all most
+    flat = rng.uniform(-1, 1, (700, 2)) @ rows[:, 1:].T + away
+    pole = away + rows[:, 1] + rng.uniform(0, 1, (300, 1)) * normal  # at an edge, where it tilts a fit to all most
     points = np.concatenate([flat, pole])
     centre, found = plane_of_most(points, 0.02, rounds=8)
-    assert abs(found @ normal) > 0.9999 and abs((centre - 5) @ normal) < 0.01
+    assert abs(found @ normal) > 0.9999 and abs((centre - away) @ normal) < 0.01
     assert abs(plane_through(points)[1] @ normal) < 0.99

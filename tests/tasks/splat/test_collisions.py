@@ -148,6 +148,39 @@ def test_a_group_without_gaussians_collides_with_nothing():
     assert not len(result.pairs) and result.singles.tolist() == [0, 1, 2]
 
 
+def pairs(*groups: Gaussians, **changes) -> list[list[int]]:
+    return plan(groups, NOWHERE_SHOWN, params=replace(EXACT, **changes), round=0).pairs.tolist()
+
+
+def test_the_background_is_in_no_pair_whichever_lies_in_the_other():
+    room = group(spread(20, [0, 0, 0], [9, 9, 9]), 0)
+    cup, book = group(spread(20, [4, 4, 4], [5, 5, 5]), 2), group(spread(20, [4.5, 4.5, 4.5], [6, 6, 6]), 3)
+    assert pairs(room, cup) == pairs(cup, room) == []
+    assert pairs(room, cup, book) == [[1, 2]]
+
+
+def test_a_plan_pairs_by_boxes_without_the_faint_and_outlying_centres_that_it_is_told_of():
+    lamp, far = spread(400, [0, 0, 0], [1, 1, 1]), [[9, 9, 9]]
+    cup = group(spread(10, [4, 4, 4], [5, 5, 5]), 2)  # between the lamp and what is far from it
+    stray = group(np.concatenate([lamp, far]), 1)
+    assert pairs(stray, cup) == [[0, 1]] and pairs(stray, cup, bbox_quantile=0.005) == []
+    faint = union(group(lamp, 1), group(far, 1, opacity=0.05))
+    assert pairs(faint, cup) == [] and pairs(faint, cup, min_opacity=0.01) == [[0, 1]]
+
+
+def test_a_plan_by_cubes_makes_none_for_fainter_gaussians_than_it_is_told():
+    pane, mirror = (group([[x, y, z] for x in range(10) for y in range(10)], 1 + z, opacity=0.05) for z in range(2))
+    assert pairs(pane, mirror, overlap="voxel") == []
+    assert pairs(pane, mirror, overlap="voxel", min_opacity=0.01) == [[0, 1]]
+
+
+def test_a_plan_lets_pairs_wait_that_collide_with_another_only_where_it_is_told():
+    # Ten points each on a line: 1 and 2 share nine, so do 3 and 4; 2 and 3 share one.
+    row = [group([[x, 0, 0] for x in range(start, start + 10)], 1 + k) for k, start in enumerate((0, 1, 10, 11))]
+    assert pairs(*row) == [[0, 1], [2, 3]]
+    assert pairs(*row, pairing="collision_free") == [[0, 1]]
+
+
 def test_pairs_below_the_least_score_stay_apart():
     a, b, *_ = table_cup_book_floor_lamp().values()
     assert not len(plan((a, b), NOWHERE_SHOWN, params=replace(EXACT, min_score=0.95), round=0).pairs)

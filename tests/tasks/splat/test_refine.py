@@ -151,6 +151,10 @@ def test_a_mask_of_the_photo_is_not_replaced_by_one_of_quite_another_size(small,
         assert found.same(expected)
     drawn = replace(part, origin=np.full(VIEWS, DRAWN, np.uint8))
     assert refined(small, box, drawn, monkeypatch, right).same(truth)
+    around = [cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0 for mask in masks]  # twice as large
+    wide = replace(truth, **as_fields(np.array(around)))
+    for limit, expected in ((1.5, wide), (3.0, truth)):
+        assert refined(small, box, wide, monkeypatch, right, margin=0.0, max_change=limit).same(expected)
 
 
 def test_the_segmenter_is_not_asked_where_no_answer_could_be_taken(small, box, monkeypatch):
@@ -216,6 +220,8 @@ def test_new_masks_leave_out_what_is_not_valid(small, box, monkeypatch):
         result = refined(masked, box, part, monkeypatch, answer)
         new = np.array(result.dense())[result.origin == REFINED]
         assert len(new) and new.any() and not new[:, :, 48:].any()
+    shown = np.array(rendered(masked.views, small.instance(1), box, params=PARAMS).dense())
+    assert shown.any() and not shown[:, :, 48:].any()
 
 
 def test_a_missing_mask_is_added_only_above_tau_iou(small, box, monkeypatch):
@@ -242,6 +248,27 @@ def test_an_answer_is_taken_without_its_speckles(small, box, monkeypatch):
     assert wrong() < 0.5 * wrong(speckle=0.0)
 
 
+def test_an_answer_is_dilated_as_asked(small, box, monkeypatch):
+    part, right = small.instance(1, views=(0, 1)), lambda view, _: small.ids[view] == 1
+    plain, wide = (refined(small, box, part, monkeypatch, right, dilation=pixels) for pixels in (0, 1))
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    for view in range(2, VIEWS):
+        grown = cv2.dilate(right(view, None).astype(np.uint8), cross) > 0
+        assert (wide.mask(view) & grown).sum() == grown.sum() > plain.mask(view).sum()
+
+
+def test_prompts_are_chosen_as_asked_at_the_middles_of_pixels(small, box, monkeypatch):
+    def asked(**params) -> np.ndarray:
+        found = []
+        nothing = lambda view, points: found.append(points) or np.zeros(small.ids[0].shape, bool)  # noqa: E731
+        refined(small, box, small.instance(1), monkeypatch, nothing, margin=0.1, **params)
+        return np.concatenate(found)
+
+    usual = asked()
+    assert (usual % 1 == 0.5).all()
+    assert not np.array_equal(asked(drop_hull=False), usual) and not np.array_equal(asked(prompt_alpha=3.0), usual)
+
+
 def test_prompts_lie_on_visible_parts_of_the_instance(small, box, monkeypatch):
     asked = {}
 
@@ -261,6 +288,7 @@ def test_a_weak_instance_with_enough_masks_is_weak_no_more(small, box):
     weak = replace(small.instance(1, views=(0,)), weak=True)
     assert not refined(small, box, weak).weak
     assert refined(small, box, weak, min_views=20).weak
+    assert not refined(small, box, replace(weak, weak=False), min_views=20).weak
 
 
 def test_faint_and_huge_gaussians_do_not_draw(small, box):
@@ -277,6 +305,28 @@ def test_faint_and_huge_gaussians_do_not_draw(small, box):
     for allowed in ({"min_opacity": 0.0}, {"max_scale": 0.0}):
         drawn = refined(small, cluttered, part, min_support=0.0, cut_occluded=False, **allowed)
         assert drawn.areas()[drawn.origin == REFINED].sum() > 1.02 * clean.areas()[clean.origin == REFINED].sum()
+
+
+def test_faint_gaussians_alone_are_drawn_all_the_same(small, box):
+    faint = replace(box, opacity_logits=np.full(len(box), -4, np.float32))
+    assert refined(small, faint, small.instance(1, views=(0, 3)), min_support=0.0).views == NAMES
+
+
+def test_a_view_that_sees_too_few_centres_is_not_looked_at(small, box):
+    part = small.instance(1, views=(0, 3))
+    assert refined(small, box, part, min_visible=10_000).views == part.views
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_masks_are_drawn_with_what_is_hidden_and_as_solid_as_asked(small, box, missing):
+    def drawn(**params) -> np.ndarray:
+        if missing:
+            return refined(small, box, small.instance(1, views=(3, 4)), min_support=0.0, **params).mask(0)
+        return rendered(small.views, small.instance(1), box, params=RefineParams(**params)).mask(0)
+
+    ball = small.ids[0] == 2
+    assert (drawn(cut_occluded=False) & ball).sum() > 5 * (drawn() & ball).sum()
+    assert drawn(alpha_threshold=0.99).sum() < drawn().sum()
 
 
 def test_a_descriptor_may_be_shown_the_rendered_masks_in_the_views_that_have_one(small, box):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ss_flow.tasks.split.agreement import View, agreement_of
+from ss_flow.tasks.artifacts import Tally
+from ss_flow.tasks.split.agreement import View, agreement_of, views_of
 
 
 def view(*masks: tuple[tuple[int, int, int], float], seen: tuple[int, int, int] = (100, 100, 100)) -> View:
@@ -28,3 +29,31 @@ def test_a_mask_is_a_pieces_own_from_an_iou_of_three_quarters_on(beside, expecte
 def test_a_view_that_sees_little_of_a_piece_counts_little(points, weight):
     shows, denies = view(((100, 100, 0), 0.9)), view(((100 - points, 0, 0), 0.9), seen=(100 - points, points, 0))
     assert agreement(shows, denies) == pytest.approx(1 / (1 + weight))
+
+
+@pytest.mark.parametrize(("held", "expected"), [(60, 0.75), (40, 2 / 3 * 0.25)])
+def test_a_mask_shows_two_pieces_the_better_the_more_it_holds_of_the_smaller(held, expected):
+    # 60 of 100 points are three quarters of the way from 30 to 70; the IoU of 160 / 200 is enough, that of 0.7 is not.
+    assert agreement(view(((100, held, 0), 0.9))) == pytest.approx(expected)
+
+
+def tally(label: list[int], seen: list[int], held: list[list[int]], quality: list[float]) -> Tally:
+    numbers = (np.array(of, np.int32) for of in (label, seen, held))
+    return Tally("a", *numbers, np.zeros((len(label), len(label)), np.int32), np.array(quality, np.float32))
+
+
+def test_a_view_sees_nothing_of_pieces_that_its_tally_lacks_nor_of_those_that_do_not_count():
+    (found,) = views_of(np.array([1, 2, 3], np.int32), [tally([1, 3], [5, 7], [[4, 6]], [0.9])])
+    assert found.seen.tolist() == [5, 0, 7] and found.held.tolist() == [[4, 0, 6]]
+    only = found.only(np.array([True, True, False]))
+    assert only.seen.tolist() == [5, 0, 0] and only.held.tolist() == [[4, 0, 0]]
+
+
+def test_a_view_with_the_same_points_and_masks_in_whatever_order_says_nothing_more():
+    def count(*changes) -> int:
+        return len(views_of(np.array([1, 2], np.int32), [tally([1, 2], *of) for of in (once, changes)]))
+
+    once = [9, 9], [[9, 0], [0, 9]], [0.9, 0.8]
+    assert count([9, 9], [[0, 9], [9, 0]], [0.8, 0.9]) == 1
+    assert count([9, 10], [[9, 0], [0, 9]], [0.9, 0.8]) == 2
+    assert count([9, 9], [[9, 0], [0, 9]], [0.9, 0.7]) == 2

@@ -156,6 +156,18 @@ def test_a_mask_over_both_halves_of_a_divided_sheet_becomes_two():
     assert sorted(mask.tolist() for mask in found.dense()) == sorted([lefts.tolist(), (~lefts).tolist()])
 
 
+def test_a_mask_of_one_half_alone_stays_as_it_is():
+    half = mask_set("0", left().reshape(1, SIDE, SIDE), np.ones(1, np.float32), "sam")
+    assert part_masks(view(), half, ONE, HALVES, contained=0.9) is half
+
+
+def test_pixels_of_a_divided_mask_on_a_thing_that_it_hardly_shows_go_to_the_nearest_other_one():
+    column = np.arange(SIDE * SIDE) % SIDE
+    thirds = labelled(np.where(column < 5, 10, np.where(column < 9, 11, 12)), num_labels=12)
+    mask = mask_set("0", (column < 10).reshape(1, SIDE, SIDE), np.ones(1, np.float32), "sam")  # a third of thing 12
+    assert part_masks(view(), mask, ONE, thirds, contained=0.9).areas().tolist() == [5 * SIDE, 5 * SIDE]
+
+
 def test_a_view_that_sees_no_point_keeps_its_masks():
     nothing = np.zeros(0, np.int32)
     blind = replace(view(), point_index=nothing, pixel=nothing, depth=np.zeros(0, np.float32))

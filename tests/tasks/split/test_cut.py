@@ -1,4 +1,7 @@
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -50,6 +53,13 @@ def test_parts_are_what_an_instance_is_made_of_the_largest_first():
 def test_labels_left_as_they_are_keep_their_parts():
     parts = PointParts(np.array([1, 0, 0, 0, 0, 2, 1, 0], np.int32))
     assert cut_parts(LABELS, parts, cut(LABELS, TREE, granularity=1.0)).part.tolist() == parts.part.tolist()
+
+
+def test_an_instance_of_most_labelled_points_is_warned_of_and_a_background_of_most_is_not(recwarn):
+    cut(replace(LABELS, label=np.array([0, 0, 0, 0, 0, 1, 2, 4], np.int32)), TREE, granularity=1.0)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match="Instance 1 holds 67% of the labelled points"):
+        cut(replace(LABELS, label=np.array([0, 0, 0, 0, 0, 1, 1, 4], np.int32)), TREE, granularity=1.0)
 
 
 @given(st.floats(0, 1), st.floats(0, 1))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,13 @@ def face(origin, along, up) -> np.ndarray:
     return np.array(origin) + i.reshape(-1, 1) * np.array(along) + j.reshape(-1, 1) * np.array(up)
 
 
+def cameras_at(*places) -> Cameras:
+    count = len(places)
+    poses = [looking(np.array(place, float), np.array([0.0, 1, 0]), np.array([0.0, 0, 1])) for place in places]
+    sizes, intrinsics = np.full((count, 2), 8, np.int32), np.tile([8.0, 8, 4, 4], (count, 1))
+    return Cameras(tuple("abc"[:count]), sizes, intrinsics, np.array(poses), True)
+
+
 def scene():
     """A box's top and front, and the ground before it, from above; nothing of them is hidden."""
     faces = [
@@ -29,15 +38,14 @@ def scene():
     places += np.random.default_rng(0).normal(scale=0.05, size=places.shape).astype(np.float32)
     label = np.repeat(np.array([TOP, FRONT, GROUND], np.int32), SIDE**2)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 1.0)
-    pose = looking(np.array([12.0, -60, 80]), np.array([0.0, 70, -75]), np.array([0.0, 0, 1]))
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
     every = np.arange(len(places), dtype=np.int32)
     view = Visibility("a", every, np.zeros_like(every), np.ones(len(every), np.float32), 8, 8)
-    return cloud, cameras, view, label
+    return cloud, cameras_at((12, -60, 80)), view, label
 
 
 def edges(cloud, cameras, view, label):
-    return convex_edges(cloud, cameras, [view], label, borders(label, cloud, TouchingParams()))
+    """When all cameras see what one view does."""
+    return convex_edges(cloud, cameras, [view] * len(cameras), label, borders(label, cloud, TouchingParams()))
 
 
 def test_faces_of_a_box_meet_in_a_convex_edge_and_the_ground_before_it_in_a_hollow():
@@ -46,10 +54,29 @@ def test_faces_of_a_box_meet_in_a_convex_edge_and_the_ground_before_it_in_a_holl
 
 def test_from_inside_of_a_box_its_faces_meet_in_a_hollow():
     cloud, _, view, label = scene()
-    inside = np.array([12.0, 12, 12])
-    pose = looking(inside, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
-    assert not edges(cloud, cameras, view, label)[TOP - 1, FRONT - 1]
+    assert not edges(cloud, cameras_at((12, 12, 12)), view, label)[TOP - 1, FRONT - 1]
+
+
+def test_most_cameras_tell_the_outside_of_a_surface_however_far_away_the_others_are():
+    cloud, _, view, label = scene()
+    above, far_below = (12, -60, 80), (12, 6000, -8000)
+    assert edges(cloud, cameras_at(above, above, far_below), view, label)[TOP - 1, FRONT - 1]
+    assert not edges(cloud, cameras_at(above, far_below, far_below), view, label)[TOP - 1, FRONT - 1]
+
+
+@pytest.mark.parametrize(("width", "meet"), [(9, False), (15, True)])
+def test_an_edge_is_convex_where_most_of_it_is(width, meet):
+    cloud, cameras, view, label = scene()
+    rises = (label == FRONT) & (cloud.points[:, 0] > width - 0.5)  # beside where it falls off from the top
+    places = np.where(rises[:, None], (0, 0, 2 * SIDE) + cloud.points * (1, 1, -1), cloud.points).astype(np.float32)
+    assert edges(replace(cloud, points=places), cameras, view, label)[TOP - 1, FRONT - 1] == meet
+
+
+def test_a_fence_along_the_edge_of_a_table_is_no_face_of_it():
+    # From in front the table is behind the fence's plane, but the fence does not fall off behind that of the table.
+    cloud, cameras, view, label = scene()
+    places = cloud.points + np.where((label == TOP)[:, None], (0, 0.5, -SIDE), 0)
+    assert not edges(replace(cloud, points=places.astype(np.float32)), cameras, view, label).any()
 
 
 def test_halves_of_one_face_meet_in_no_edge():

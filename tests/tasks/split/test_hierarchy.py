@@ -4,7 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels, Tally
+from ss_flow.tasks.split import hierarchy as module
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+from ss_flow.tasks.split.mounds import Mounds
 from ss_flow.tasks.split.stuff import StuffParams
 
 NO_BORDERS = np.zeros((9, 9), np.int32)
@@ -22,15 +24,15 @@ def tally(masks: list[tuple[set[int], float]], sees: set[int], points: int = SEE
     )
 
 
-def tree(tallies: list[Tally], labels: int, **changes) -> Hierarchy:
-    """Labels 1.., each a ball of points far from the others, so that none is flat."""
+def tree(tallies: list[Tally], labels: int, unused: int = 0, **changes) -> Hierarchy:
+    """Labels 1.., each a ball of points far from the others, so that none is flat; higher ones are unused."""
     rng = np.random.default_rng(0)
     places = rng.normal(size=(20 * labels, 3)).astype(np.float32)
     places[:, 0] += 9 * np.repeat(np.arange(labels), 20)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.1)
     label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), 20)
     nothing = np.zeros(0, np.int32)
-    given = PointLabels(label, np.ones(len(label), np.float32), labels, nothing, nothing, nothing)
+    given = PointLabels(label, np.ones(len(label), np.float32), labels + unused, nothing, nothing, nothing)
     sizes, intrinsics = np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]])
     cameras = Cameras(("a",), sizes, intrinsics, np.eye(4)[None], True)
     return hierarchy(cloud, cameras, [], given, tallies, params=HierarchyParams(**{"prior": 0.0, **changes}))
@@ -82,10 +84,37 @@ def test_the_best_union_comes_first_and_becomes_a_piece_of_the_next():
     assert found.parent.tolist() == [4, 4, 5, 5, 0]
 
 
-def test_a_crumb_that_a_view_hardly_sees_neither_speaks_for_nor_against():
-    tiny = Tally("a", np.array([1, 2], np.int32), np.array([SEES, 3], np.int32), np.array([[SEES, 0]], np.int32),
-                 NO_BORDERS[:2, :2], np.array([0.9], np.float32))  # fmt: skip
-    assert unions(tree([tally([({1, 2}, 0.9)], {1, 2}), tiny, tiny], 2)) == {frozenset({1, 2}): 1.0}
+def beside(points: int, held: int) -> Tally:
+    """A view of label 1, all under its one mask, and of some points of label 2, of which so many are under it too."""
+    seen, under = np.array([SEES, points], np.int32), np.array([[SEES, held]], np.int32)
+    return Tally("a", np.array([1, 2], np.int32), seen, under, NO_BORDERS[:2, :2], np.array([0.9], np.float32))
+
+
+@pytest.mark.parametrize(
+    ("most", "sees", "agreement"), [(100, 3, 1.0), (100, 19, 1.0), (100, 20, 0.5), (30, 9, 1.0), (30, 12, 0.5)]
+)
+def test_a_view_speaks_of_what_it_sees_ten_points_of_and_a_fifth_of_what_another_one_does(most, sees, agreement):
+    assert unions(tree([beside(most, most), beside(sees, 0)], 2)) == {frozenset({1, 2}): agreement}
+
+
+def test_of_sets_that_agree_equally_the_smaller_comes_first():
+    masks = [({1, 2, 3}, 0.9), ({2, 3}, 0.9)]
+    assert unions(tree([tally(masks, {1, 2, 3})], 3)) == {frozenset({2, 3}): 1.0, frozenset({1, 2, 3}): 1.0}
+
+
+def test_a_set_waits_for_a_better_one_that_it_shares_a_piece_with_though_that_one_waits_too():
+    masks = [({1, 2}, 0.9), ({2, 3}, 0.9), ({3, 4}, 0.9)]  # that three views show, two, and one
+    found = unions(tree([tally(masks[: 3 - k], {1, 2, 3, 4}, SEES - k) for k in range(3)], 4))
+    assert frozenset({1, 2}) in found and frozenset({3, 4}) not in found
+
+
+def test_what_no_view_shows_as_one_stays_apart_though_no_agreement_is_asked_for():
+    masks = [({1, 2}, 0.5), ({1}, 0.95), ({2}, 0.95)]
+    assert unions(tree([tally(masks, {1, 2})], 2, min_agreement=0.0)) == {}
+
+
+def test_nodes_are_numbered_after_all_labels_whether_points_carry_them_or_not():
+    assert tree([tally([({1, 2}, 0.9)], {1, 2})], 2, unused=5).node.tolist() == [1, 2, 8]
 
 
 def half_agree(views: int) -> list[tuple[list[tuple[set[int], float]], int]]:
@@ -164,3 +193,68 @@ def test_what_touches_nothing_else_is_one_thing_rather():
     assert agreement_beside(1.0, alone=0.0) == pytest.approx(0.5)
     assert 0.6 < agreement_beside(1.0) < 0.65
     assert agreement_beside(0.0) == pytest.approx(0.5)
+
+
+def known(monkeypatch, *, stuff=(), touching=(), convex=(), on_top=()) -> None:
+    """What their places tell of three labels: which are stuff, which touch at 50 points of each or meet in a convex
+    edge, and whether 3 stands on the other two, which surround it."""
+
+    def pairs(of, value):
+        table = np.zeros((3, 3), np.float32)
+        for a, b in of:
+            table[a - 1, b - 1] = table[b - 1, a - 1] = value
+        return table
+
+    share = np.array([[0, 0, 0], [0, 0, 0], [0.5, 0.5, 0]])
+    mounds = Mounds(share, np.array([100, 100, 40], np.int32), np.isin([1, 2, 3], on_top), 0.8)
+    told = {
+        "find_stuff": np.isin([1, 2, 3], stuff),
+        "find_contact": pairs(touching, 50),
+        "convex_edges": pairs(convex, 1) > 0,
+        "find_mounds": mounds,
+    }
+    for name, value in told.items():
+        monkeypatch.setattr(module, name, lambda *_, value=value, **__: value)
+
+
+def test_a_thing_and_stuff_are_never_united_and_a_union_of_stuff_is_stuff(monkeypatch):
+    known(monkeypatch, stuff=[1, 2])
+    found = tree([tally([({1, 2}, 0.9), ({1, 2, 3}, 0.9)], {1, 2, 3})], 3)
+    assert unions(found) == {frozenset({1, 2}): 1.0}
+    assert found.stuff.tolist() == [True, True, False, True]
+
+
+@pytest.mark.parametrize(("stuff", "agreement"), [([3], 0.6), ([], 0.5), ([1, 2, 3], 0.5)])
+def test_things_that_touch_a_floor_besides_stand_alone_and_walls_do_not(monkeypatch, stuff, agreement):
+    # 50 of 60 points, 10 of them presumed, are of the pair: two thirds of the way from a half to all of them.
+    known(monkeypatch, stuff=stuff, touching=[(1, 2), (1, 3)])
+    views = [tally([({1, 2}, 0.9)], {1, 2, 3}), tally([({1}, 0.9), ({2}, 0.9)], {1, 2, 3})]
+    assert unions(tree(views, 3)) == {frozenset({1, 2}): agreement}
+
+
+def test_where_pieces_of_a_union_touch_each_other_tells_nothing_about_what_it_is_united_with(monkeypatch):
+    known(monkeypatch, touching=[(1, 2)])
+    views = [tally([({1, 2}, 0.9), ({1, 2, 3}, 0.9)], {1, 2, 3}), tally([({1, 2}, 0.9)], {1, 2, 3})]
+    assert unions(tree(views, 3)) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.5}
+
+
+@pytest.mark.parametrize(("stuff", "are_faces"), [([], True), ([1], False), ([2], False), ([1, 2], False)])
+def test_walls_that_meet_in_a_convex_edge_are_no_faces_of_a_thing(monkeypatch, stuff, are_faces):
+    known(monkeypatch, stuff=stuff, convex=[(1, 2)])
+    view = tally([({1, 2, 3}, 0.5), ({1}, 0.9), ({2}, 0.9), ({3}, 0.9)], {1, 2, 3})
+    assert unions(tree([view], 3)) == ({frozenset({1, 2}): 0.46} if are_faces else {})
+
+
+def test_a_mask_of_a_seat_and_the_bag_on_it_shows_the_seat_and_a_group(monkeypatch):
+    view = tally([({1, 2, 3}, 0.9)], {1, 2, 3})
+    known(monkeypatch, on_top=[3])
+    # The mask's IoU with the seat alone is 2/3, five ninths of the way from 0.5 to 0.8.
+    assert unions(tree([view], 3)) == {frozenset({1, 2}): 5 / 9, frozenset({1, 2, 3}): 0.5}
+    known(monkeypatch)
+    assert unions(tree([view], 3)) == {frozenset({1, 2, 3}): 1.0}
+
+
+def test_a_union_stands_on_something_only_where_all_its_pieces_do(monkeypatch):
+    known(monkeypatch, on_top=[3])
+    views = [tally([({2, 3}, 0.9), ({1, 2, 3}, 0.9)], {1, 2, 3}), tally([({2, 3}, 0.9)], {1, 2, 3})]
+    assert unions(tree(views, 3)) == {frozenset({2, 3}): 1.0, frozenset({1, 2, 3}): 0.5}

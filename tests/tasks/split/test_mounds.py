@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,23 @@ SEAT = grid(1.2, 0.8)
 HOLE = (np.abs(SEAT[:, :2]) < 0.15).all(axis=1)
 
 
-def on_seat(height: float, color: tuple[int, int, int], asked: float = 0.09) -> Mounds:
+def mounds(places: np.ndarray, label: np.ndarray, color: tuple[int, int, int], asked: float, spacing=STEP) -> Mounds:
+    """Of a beige label 1 and label 2 in a colour, which meet each other alone, seen from above."""
+    nothing = np.zeros(0, np.int32)
+    labels = PointLabels(label, np.ones(len(label)), 2, nothing, nothing, nothing)
+    pose = np.diag([1.0, -1, -1, 1])
+    pose[:3, 3] = (0, 0, 2)
+    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
+    both = np.array([1, 2], np.int32)
+    beside = np.array([[0, 40], [40, 0]], np.int32)
+    seen = Tally("a", both, np.bincount(label)[1:].astype(np.int32), np.zeros((0, 2), np.int32), beside, np.zeros(0))
+    cloud = PointCloud(places.astype(np.float32), np.array([BEIGE, color], np.uint8)[label - 1], 1.0, STEP)
+    ends = borders(labels.label, cloud, TouchingParams())
+    cloud = replace(cloud, spacing=spacing)
+    return find_mounds(cloud, cameras, labels, [seen], ends, around=0.8, height=asked)
+
+
+def on_seat(height: float, color: tuple[int, int, int], asked: float = 0.09, spacing: float = STEP) -> Mounds:
     """A beige seat (label 1), seen from above, with something of this height and colour in the middle (label 2).
 
     asked: share of its extent from which it stands there.
@@ -29,18 +47,7 @@ def on_seat(height: float, color: tuple[int, int, int], asked: float = 0.09) -> 
     sides = np.concatenate([np.zeros((0, 3)), *(rim * (1, 1, 0) + (0, 0, z) for z in steps)])
     places = np.concatenate([SEAT[~HOLE], top, sides]).astype(np.float32)
     label = np.repeat(np.array([1, 2], np.int32), [(~HOLE).sum(), len(top) + len(sides)])
-    nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), 2, nothing, nothing, nothing)
-    pose = np.diag([1.0, -1, -1, 1])
-    pose[:3, 3] = (0, 0, 2)
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
-    both = np.array([1, 2], np.int32)
-    beside = np.array([[0, 40], [40, 0]], np.int32)
-    seen = Tally("a", both, np.bincount(label)[1:].astype(np.int32), np.zeros((0, 2), np.int32), beside, np.zeros(0))
-    colors = np.array([BEIGE, color], np.uint8)[label - 1]
-    cloud = PointCloud(places, colors, 1.0, STEP)
-    ends = borders(labels.label, cloud, TouchingParams())
-    return find_mounds(cloud, cameras, labels, [seen], ends, around=0.8, height=asked)
+    return mounds(places, label, color, asked, spacing)
 
 
 @pytest.mark.parametrize(
@@ -54,6 +61,18 @@ def test_a_bag_on_a_seat_stands_on_it_and_a_patch_sewn_on_or_a_fold_of_it_does_n
 @pytest.mark.parametrize(("height", "stands"), [(0.1, False), (0.14, True)])
 def test_what_has_other_colours_still_rises_by_two_thirds_of_what_is_asked(height, stands):
     assert on_seat(height, RED, asked=0.3).standing([0, 1]).tolist() == [False, stands]
+
+
+@pytest.mark.parametrize(("spacing", "rises"), [(0.03, True), (0.07, False)])
+def test_what_rises_by_less_than_two_spacings_may_be_noise(spacing, rises):
+    assert on_seat(0.12, RED, asked=0.0, spacing=spacing).bulges.tolist() == [False, rises]
+
+
+def test_a_hump_that_rises_without_an_edge_does_not_stand_on_what_is_round_it():
+    away = np.linalg.norm(SEAT[:, :2], axis=1)
+    hump = SEAT + np.where(away < 0.2, 0.1 * np.cos(np.pi * away / 0.4) ** 2, 0)[:, None] * (0, 0, 1)
+    found = mounds(hump, np.where(away < 0.2, 2, 1).astype(np.int32), RED, 0.09)
+    assert not found.bulges.any() and found.share.tolist() == [[0, 1], [1, 0]]
 
 
 def test_nothing_stands_on_something_smaller_or_on_what_does_not_surround_it():
@@ -72,6 +91,16 @@ def test_labels_touch_where_their_points_lie_side_by_side():
     assert contact.tolist() == contact.T.tolist()
     assert contact[0, 1] >= 2 * 50  # a row of points on either side
     assert not contact[[0, 1, 2, 0, 1], [0, 1, 2, 2, 2]].any()
+
+
+def test_where_labels_touch_the_points_of_both_sides_count():
+    strip = grid(0.2, 1.0)
+    coarse = strip[np.rint(strip[:, 1] / STEP).astype(int) % 2 == 0] + np.array([0.2, 0, 0])  # every second row
+    label = np.repeat(np.array([1, 2], np.int32), [len(strip), len(coarse)])
+    places = np.concatenate([strip, coarse]).astype(np.float32)
+    cloud = PointCloud(places, np.zeros((len(label), 3), np.uint8), 1.0, STEP)
+    contact = find_contact(borders(label, cloud, TouchingParams()), label)
+    assert contact[0, 1] == contact[1, 0] > 0
 
 
 def test_of_no_labels_none_touch():

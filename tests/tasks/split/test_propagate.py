@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from ss_flow.tasks.artifacts import BORDER, INSIDE, Observation, PointCloud
+from ss_flow.tasks.artifacts import BORDER, INSIDE, Observation, PointCloud, Visibility
 from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -129,9 +129,9 @@ def test_ids_move_up_over_those_that_were_dropped_only_where_the_highest_would_n
 def test_a_mask_that_hardly_touches_a_label_is_a_new_object():
     visible, masks = views_of([[0, 1]], [[1, 2, 3, 4, 5, 6]])
     joined = run(points(8), visible, masks, BARE)
-    apart = run(points(8), visible, masks, in_turn(min_overlap_share=0.5))
     assert joined.label[6] == joined.label[0] == 1
-    assert apart.label[6] == 2
+    for least in ({"min_overlap_share": 0.5}, {"min_overlap": 2}):
+        assert run(points(8), visible, masks, in_turn(**least)).label[6] == 2
 
 
 def test_a_second_pass_matches_early_views_against_late_labels():
@@ -156,6 +156,79 @@ def test_views_at_once_outvote_one_mask_that_holds_two_objects():
     assert left[0] != right[0]
     sequential = run(points(8), visible, masks, BARE)
     assert len(set(sequential.label)) == 1
+
+
+AT_ONCE = replace(BARE, views="at_once", at_once=MaskClusteringParams(min_points=1))
+
+
+def test_a_point_that_no_view_sees_takes_no_label_from_its_neighbours():
+    visible, masks = views_of(*[[[0, 1, 2], [4, 5, 6, 7]]] * 2)
+    assert run(points(8), visible, masks, replace(AT_ONCE, smoothing=3)).label[3] == 0
+
+
+@pytest.mark.parametrize(("background_vote", "label"), [(0.2, 2), (0.3, 0)])
+def test_a_point_that_many_views_see_under_no_mask_gets_no_label(background_vote, label):
+    # One view has a mask over points 1 to 3; four see them under none: a vote of 1 against 0.8 and 1.2.
+    visible, masks = views_of([[1, 2, 3], [4, 5, 6]], *[[[4, 5, 6]]] * 4)
+    seen = visible[0], *[row_of_points([1, 2, 3, 4, 5, 6])[0]] * 4
+    voting = MaskClusteringParams(min_points=1, background_vote=background_vote)
+    found = run(points(8), seen, masks, replace(AT_ONCE, at_once=voting, min_label_views=1))
+    assert found.label[1:7].tolist() == [label] * 3 + [1] * 3
+
+
+def test_a_second_copy_of_a_view_confirms_no_label():
+    twice = [[1, 2, 3], [4, 5, 6]]
+    visible, masks = views_of(twice, twice, *[[[4, 5, 6]]] * 3)
+    others = (row_of_points([1, 2, 3, 4, 5, 6, *more])[0] for more in ([], [0], [7]))
+    voting = MaskClusteringParams(min_points=1, background_vote=0.0)
+    found = run(points(8), (*visible[:2], *others), masks, replace(AT_ONCE, at_once=voting))
+    assert found.label[4:7].all() and not found.label[1:4].any()
+
+
+def test_the_background_is_no_label_that_views_fail_to_confirm(recwarn):
+    _, masks = views_of(*[[[4, 5, 6]]] * 2)
+    seen = tuple(row_of_points([*more, 1, 2, 3, 4, 5, 6])[0] for more in ([], [0]))
+    assert run(points(8), seen, masks, AT_ONCE).label.tolist() == [0] * 4 + [1] * 3 + [0]
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(("touching_merge", "labels"), [(True, 1), (False, 2)])
+def test_halves_of_a_sheet_that_masks_part_are_united_only_where_asked(touching_merge, labels):
+    v, u = np.divmod(np.arange(400), 20)
+    places = np.stack([u, v, 0 * u], axis=1).astype(np.float32)
+    cloud = PointCloud(places, np.full((400, 3), 128, np.uint8), 1.0, 1.0)
+    every = np.arange(400, dtype=np.int32)
+    view = Visibility("0", every, every, np.ones(400, np.float32), 20, 20)
+    left = (u < 10).reshape(20, 20)
+    found = run(cloud, (view,), (mask_set(np.stack([left, ~left])),), PropagateParams(touching_merge=touching_merge))
+    assert len(np.unique(found.label[found.label > 0])) == labels
+
+
+def test_a_mask_that_overlaps_no_label_is_a_new_object_however_little_is_asked_for():
+    visible, masks = views_of([[0, 1]], [[2, 3]])
+    assert run(points(8), visible, masks, in_turn(min_overlap=0)).match_label.tolist() == [1, 2]
+
+
+def lying(*masks) -> Observation:
+    """A view of points 0, 1, ..., all of them under each of its masks, and how they lie there."""
+    every = np.arange(len(masks[0]), dtype=np.int32)
+    first = (len(every) * np.arange(len(masks) + 1)).astype(np.int32)
+    standing = np.concatenate(masks).astype(np.uint8)
+    return Observation("0", every, np.arange(len(masks), dtype=np.int32), first, np.tile(every, len(masks)), standing)
+
+
+@pytest.mark.parametrize(("standing", "label"), [([INSIDE] * 4, 1), ([BORDER, BORDER, INSIDE, INSIDE], 2)])
+def test_points_at_the_border_of_a_mask_are_no_overlap(standing, label):
+    view, _ = row_of_points([0, 1, 2, 3])
+    both = lying([INSIDE, INSIDE, BORDER, BORDER]), lying(standing)
+    assert propagate(points(8), (view, view), both, params=BARE).match_label.tolist() == [1, label]
+
+
+def test_points_that_a_pass_left_contested_are_painted_with_no_label_in_the_next():
+    # Points 6 and 7 are of one mask in the last view; two labels share the votes on 6.
+    visible, masks = views_of([[0, 1], [2, 3, 6], [4, 5]], [[0, 1], [2, 3], [4, 5, 6]], [[6, 7]])
+    found = run(points(8), visible, masks, in_turn(passes=2, lambda_init=0.001))
+    assert found.match_view.tolist()[-1] == 2 and found.match_label.tolist()[-1] == 4
 
 
 @pytest.fixture(scope="module")
@@ -336,34 +409,50 @@ def test_a_label_that_one_view_shows_goes_to_the_background_where_many_others_lo
         assert run(points(8), views, masks, kept).label[1:7].all()
 
 
+SEAT = [INSIDE] * 100
+SEAT_AND_LEG = replace(
+    points(104),
+    points=np.array([*np.ndindex(10, 10, 1), (40, 0, 0), (41, 0, 0), (42, 0, 0), (43, 0, 0)], np.float32),
+)
+"""A seat of 100 points and, well apart, a leg of 4."""
+
+
 @pytest.mark.parametrize(
     ("inside_in", "tau_piece", "stays"),
     [(2, 0.55, True), (1, 0.55, True), (0, 0.55, False), (1, 0.75, False), (2, 1, False)],
 )
 def test_a_small_piece_of_a_label_stays_where_views_see_it_inside_of_masks(inside_in, tau_piece, stays):
-    # A seat of 100 points and, well apart, a leg of 4, under one mask of both views.
-    seat = np.stack([*np.indices((10, 10)).reshape(2, -1), np.zeros(100)], axis=1)
-    leg = np.array([[40.0, 0, 0], [41, 0, 0], [42, 0, 0], [43, 0, 0]])
-    cloud = PointCloud(np.concatenate([seat, leg]).astype(np.float32), np.zeros((104, 3), np.uint8), 1.0, 1.0)
-    everything = np.arange(104, dtype=np.int32)
-    observations = []
-    for view in range(2):
-        standing = np.where(everything < 100, INSIDE, INSIDE if view < inside_in else BORDER).astype(np.uint8)
-        first = np.array([0, 104], np.int32)
-        observations.append(Observation(f"{view}", everything, np.zeros(1, np.int32), first, everything, standing))
-    found = propagate(cloud, (), tuple(observations), params=PropagateParams(tau_piece=tau_piece))
+    views = [lying(SEAT + [INSIDE if view < inside_in else BORDER] * 4) for view in range(2)]
+    found = propagate(SEAT_AND_LEG, (), views, params=PropagateParams(tau_piece=tau_piece))
     assert found.label[:100].all()
     assert found.label[100:].all() == found.label[100:].any() == stays
 
 
-@pytest.mark.parametrize(("apart", "floor"), [(True, 2), (False, 1)])
-def test_masks_show_the_piece_of_a_parted_label_that_they_hold_most_of(apart, floor):
-    table, below = [0, 1, 2, 3], [6, 7]
+@pytest.mark.parametrize("legs", [([INSIDE] * 4, [BORDER] * 4), ([BORDER] * 4, [INSIDE] * 4)])
+def test_a_small_piece_under_two_masks_of_its_label_is_where_the_better_one_says(legs):
+    view = lying(*(SEAT + leg for leg in legs))
+    assert propagate(SEAT_AND_LEG, (), [view], params=PropagateParams()).label.all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "keep_share", "floor"),
+    [({}, 0.05, 2), ({"apart": False}, 0.05, 1), ({"min_label_points": 3}, 0.05, 1), ({}, 0.5, 1)],
+)
+def test_masks_show_the_piece_of_a_parted_label_that_they_hold_most_of(changes, keep_share, floor):
+    table, below = [0, 1, 2, 3], [6, 7]  # two points, a third of all
     visible, masks = views_of([table + below], [table, below], [table, below])
-    kept = ClusterParams(eps=1.5, min_samples=1, keep_share=0.05)
-    found = run(points(8), visible, masks, replace(BARE, apart=apart, label_clusters=kept))
+    kept = ClusterParams(eps=1.5, min_samples=1, keep_share=keep_share)
+    found = run(points(8), visible, masks, replace(BARE, label_clusters=kept, **changes))
     assert set(found.label[table].tolist()) == {1}
     assert set(found.label[below].tolist()) == {floor}
     assert found.num_labels == floor
     shown = np.stack([found.match_view, found.match_mask, found.match_label], axis=1).tolist()
     assert sorted(shown) == [[0, 0, 1], [1, 0, 1], [1, 1, floor], [2, 0, 1], [2, 1, floor]]
+
+
+def test_a_label_that_is_parted_takes_no_number_of_one_that_was_dropped():
+    table, below, dropped = [0, 1, 2, 3], [6, 7], [5]
+    visible, masks = views_of([table + below, dropped], [table, below], [table, below])
+    kept = ClusterParams(eps=1.5, min_samples=1, keep_share=0.05)
+    found = run(points(8), visible, masks, replace(BARE, label_clusters=kept, min_label_points=2))
+    assert found.label.tolist() == [1, 1, 1, 1, 0, 0, 3, 3] and found.num_labels == 3

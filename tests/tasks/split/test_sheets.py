@@ -81,6 +81,34 @@ def test_what_has_an_edge_all_round_is_no_sheet(thickness, stands):
     assert on_table(page=thickness).standing([(PAGE,), (MUG,)]).any() == stands
 
 
+def test_a_cushion_that_bulges_out_of_the_table_is_no_sheet():
+    cloud, labels = scene()
+    bulge = 0.1 * (np.cos(np.pi * cloud.points[:, :2].clip(-0.12, 0.12) / 0.24) ** 2).prod(axis=1)
+    round_ = replace(cloud, points=(cloud.points + bulge[:, None] * np.array([0, 0, 1])).astype(np.float32))
+    assert sheets_of(round_, labels)._outwards([(PAGE,), (MUG,)])[0] > 0.6
+    assert not sheets_of(round_, labels).standing([(PAGE,), (MUG,)]).any()
+
+
+@pytest.mark.parametrize(
+    ("smooth", "border", "sizes", "pieces", "expected"),
+    [
+        ([[0, 30, 70], [30, 0, 0], [70, 0, 0]], [100, 30, 70], [10, 20, 30], [(0,), (1,)], (70 - 30) / 120),
+        ([[0, 10, 40], [10, 0, 40], [40, 40, 0]], [50, 50, 80], [10, 10, 30], [(0, 1)], 80 / 100),
+        ([[0, 40, 40], [40, 0, 0], [40, 0, 0]], [40, 40, 40], [10, 20, 30], [(0,)], 40 / 60),
+        ([[0, 40, 40], [40, 0, 0], [40, 0, 0]], [40, 40, 40], [10, 20, 30], [(0,), (1,), (2,)], -40 / 60),
+    ],
+    ids=["into the set", "within the piece", "into two labels at once", "into two pieces at once"],
+)
+def test_of_the_border_of_a_piece_each_point_counts_once_outwards_or_into_the_set(
+    smooth, border, sizes, pieces, expected
+):
+    # 20 points more are presumed, which go nowhere.
+    cloud, _ = scene()
+    goes_on, rows = np.array(smooth, float), [np.arange(size) for size in sizes]
+    sheets = Sheets(goes_on, goes_on, np.array(border, float), rows, cloud, 0.6, 0.09)
+    assert sheets._outwards(pieces)[0] == pytest.approx(expected)
+
+
 def test_what_lies_in_the_page_does_not_stand_on_it():
     assert not on_table(mug=0.01).standing([(PAGE,), (MUG,)]).any()
 

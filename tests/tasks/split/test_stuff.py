@@ -63,3 +63,10 @@ def test_two_sides_of_a_cabinet_with_the_room_behind_it_are_a_thing():
 
 def test_a_wall_and_a_thing_before_it_in_one_piece_are_no_stuff():
     assert kinds(FLOOR, np.concatenate([WALL, plane((1, -1, 0), (1.01, 1, 1.5), 1500)])) == [True, False]
+
+
+def test_a_few_points_are_no_wall_however_far_apart():
+    share = np.linspace(0, 1, 9)
+    few = np.stack([4 * share - 2, np.full(9, 2.0), 2.5 * (4 * share % 1)], axis=1)
+    assert kinds(FLOOR, few) == [True, False]
+    assert kinds(FLOOR, np.concatenate([few, [[0, 2, 1]]])) == [True, True]

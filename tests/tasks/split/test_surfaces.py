@@ -86,6 +86,23 @@ def test_a_shadow_on_a_wall_tells_nothing_about_a_table():
     assert surfaces(*wall, *table()) == [1, 2, 3, 4]
 
 
+def test_a_shadow_on_a_table_tells_nothing_about_a_wall():
+    wall = [(places[:, [0, 2, 1]], color) for places, color in (patch(BROWN, 0, 2), patch(SHADE * BROWN, 0.5, 2))]
+    assert surfaces(*floor(), *table(), *wall) == [1, 1, 3, 3, 5, 6]
+
+
+def test_a_step_that_differs_along_its_border_is_no_shadow():
+    lit, (places, color) = floor()
+    uneven = color * SHADE ** np.where(places[:, 1:2] < 2.25, -0.6, 0.6)  # the shadow's step in the middle
+    assert surfaces(lit, (places, uneven), *table()) == [1, 2, 3, 4]
+
+
+def test_a_border_that_goes_into_a_shadow_here_and_out_of_it_there_is_not_that_of_a_shadow():
+    places, color = patch(BROWN, 0.5, 0)
+    both = color * SHADE ** np.where(places[:, 1:2] < 0.25, 1, -1)
+    assert surfaces(*floor(), *table(y=4), patch(BROWN, 0, 0), (places, both)) == [1, 1, 3, 3, 5, 6]
+
+
 @pytest.mark.parametrize("color", [WHITE, RED, GREY])
 def test_another_colour_stays_apart_beside_a_shadow(color):
     assert surfaces(*floor(), *table(), patch(color, 0, 0.5, 0.7)) == [1, 1, 3, 3, 5]
@@ -121,6 +138,24 @@ def test_where_the_colour_does_not_change_nothing_ends():
     assert surfaces(patch(BROWN, 0, 0), patch(BROWN, 0.5, 0)) == [1, 1]
     assert surfaces(patch(BROWN, 0, 0), patch(BROWN, 0.6, 0)) == [1, 2]
     assert surfaces(patch(BROWN, 0, 0), patch(BROWN, 0.5, 0, 0.1)) == [1, 2]
+
+
+def test_surfaces_touch_at_enough_points_and_along_enough_of_the_border_of_one_of_them():
+    row = patch(WHITE, -0.5, 0), patch(BROWN, 0, 0), patch(BROWN, 0.5, 0), patch(WHITE, 1, 0)
+    assert surfaces(*row) == [1, 2, 2, 4]
+    assert surfaces(*row, contact=0.7) == surfaces(*row, min_points=2000) == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(("width", "height"), [(0.5, 0.01), (4, 0.025)])
+def test_surfaces_are_as_thick_as_points_are_apart_and_the_larger_they_are_the_thicker(width, height):
+    assert surfaces(patch(BROWN, 0, 0, width=width), patch(BROWN, width, 0, height, width=width)) == [1, 1]
+
+
+@pytest.mark.parametrize(("height", "surface"), [(0.1, 1), (0.3, 2)])
+def test_what_lies_off_the_plane_of_the_others_for_the_most_part_is_no_piece_of_their_surface(height, surface):
+    (flat, color), (wall, same) = patch(BROWN, 0, 0), patch(BROWN, -height, 0, width=2 * height)
+    bent = np.concatenate([flat, wall[:, [2, 1, 0]]]), np.concatenate([color, same])
+    assert surfaces(bent, patch(BROWN, 0.5, 0)) == [1, surface]
 
 
 def test_a_sheet_of_paper_does_not_take_the_colour_of_what_fills_the_gap_beside_it():
@@ -174,6 +209,8 @@ def test_the_tree_unites_what_light_alone_parts():
     assert found.node.tolist() == [1, 2, 3, 4, 5, 6]
     assert found.parent.tolist() == [5, 5, 6, 6, 0, 0]
     assert found.agreement.tolist() == pytest.approx([1, 1, 1, 1, 0.6, 0.6])
+    # Halves of the floor are stuff though each alone would be too small.
+    assert found.stuff.tolist() == [True, True, False, False, True, False]
 
 
 def test_shadows_need_not_be_looked_for():

@@ -30,8 +30,8 @@ def test_a_view_without_masks_still_says_what_it_sees():
 
 
 def test_borders_are_counted_where_areas_meet():
-    # Points one a pixel: labels 1 1 2 / 1 2 2; three pairs of neighbours differ.
-    pixels = np.arange(6, dtype=np.int32)
-    view = Visibility("a", pixels, pixels, np.ones(6, np.float32), 2, 3)
-    masks = mask_set("a", np.zeros((0, 2, 3), bool), np.zeros(0, np.float32), "test")
-    assert tally(view, masks, labelled([1, 1, 2, 1, 2, 2])).beside.tolist() == [[0, 3], [3, 0]]
+    # Points one a pixel: labels 1 1 2 / 1 2 2 / 2 2 2; two pairs of neighbours in a row differ, and two in a column.
+    pixels = np.arange(9, dtype=np.int32)
+    view = Visibility("a", pixels, pixels, np.ones(9, np.float32), 3, 3)
+    masks = mask_set("a", np.zeros((0, 3, 3), bool), np.zeros(0, np.float32), "test")
+    assert tally(view, masks, labelled([1, 1, 2, 1, 2, 2, 2, 2, 2])).beside.tolist() == [[0, 4], [4, 0]]

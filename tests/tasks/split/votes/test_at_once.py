@@ -1,8 +1,10 @@
 """Correlation clustering of masks, against loops over points and pairs."""
 
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.sparse import csr_array
 
 from ss_flow.tasks.artifacts import BORDER, INSIDE, STRAY, Observation
 from ss_flow.tasks.split.votes.at_once import (
@@ -67,7 +69,9 @@ def test_the_largest_object_comes_first():
 
 def test_views_without_masks_and_small_masks_show_nothing():
     assert clusters([view(), view()]) == [[], []]
-    assert clusters([view(range(4), range(4, 20))], MaskClusteringParams(min_points=5)) == [[0, 1]]
+    some = view(range(4), range(4, 20))
+    assert clusters([some], MaskClusteringParams(min_points=5)) == [[0, 1]]
+    assert clusters([some] * 4, MaskClusteringParams(min_points=5, max_views=2)) == [[0, 1]] * 4
 
 
 @st.composite
@@ -95,6 +99,20 @@ def test_the_evidence_is_the_chance_of_two_points_to_lie_under_one_mask(views):
             pairs = [(p, q) for p in first for q in second]
             same = sum(p in points and q in points for p, q in pairs for _, points in masks)
             np.testing.assert_allclose(together[a, b], same / len(pairs), rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(("least", "beside"), [(0.0, 0.1), (0.2, 0.0)])
+def test_a_share_below_the_least_counts_as_nothing(least, beside):
+    members = membership([np.arange(10), np.arange(9, 19)], 20)  # of which one point is in both
+    _, said = evidence(members, np.array([0, 1]), np.ones(2, int), least)
+    np.testing.assert_allclose(said, [[1, beside], [beside, 1]])
+
+
+def test_the_weight_of_a_union_is_a_mean_over_the_pairs_of_masks():
+    # The last mask stands for nine; each says less for a union with the first (0.2) than the second one does (0.5).
+    together = csr_array([[1, 0.5, 0.2], [0.5, 1, 0.1], [0.2, 0.1, 1]])
+    said = np.array([[0.0], [1.0], [1.0]])
+    assert correlation_clusters(together, said, np.array([1, 1, 9]), 1.0).tolist() == [0, 0, 1]
 
 
 @given(scenes(), st.integers(0, 100))

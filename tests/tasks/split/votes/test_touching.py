@@ -118,6 +118,29 @@ def test_unions_go_on_until_nothing_is_left_to_unite():
     assert left(*scene(*row, labels=(4, 2, 9, 7, 3))) == [2]
 
 
+def test_labels_that_touch_along_the_larger_share_of_a_border_are_united_first():
+    # A row of three greys on unlabelled ground; the last one is shifted, so that it touches half as much of the second.
+    # Each is like the next, but not like two that became one.
+    ground, _ = patch((-10, -10, 0), X, Y, 80, BEIGE)
+    x, y = np.rint(ground[:, :2].T)
+    labels = np.zeros(len(ground), np.int32)
+    for number, shift in ((1, 0), (2, 0), (3, 10)):
+        labels[(x >= 20 * (number - 1)) & (x < 20 * number) & (y >= shift) & (y < shift + 20)] = number
+    grey = np.repeat(np.uint8([0, 104, 120, 136])[labels][:, None], 3, axis=1)
+    cloud = PointCloud(ground.astype(np.float32), grey, 1.0, 1.0)
+    assert left(cloud, labels, similarity=0.85, contact=0.1) == [0, 1, 3]
+
+
+def test_the_colours_of_a_union_are_those_of_all_its_pieces():
+    def grey(start, width, level):
+        places, color = patch((start, 0, 0), X, Y, 20, (level,) * 3, seed=start)
+        kept = places[:, 0] < start + width - 0.5
+        return places[kept], color[kept]
+
+    assert left(*scene(grey(0, 6, 124), grey(6, 20, 144)), similarity=0.9) == [1, 2]
+    assert left(*scene(grey(0, 6, 124), grey(6, 20, 134), grey(26, 20, 144)), similarity=0.9) == [1]
+
+
 def test_unlabelled_points_stay_so():
     cloud, labels = scene(*two_halves(), labels=(0, 3))
     assert merged(cloud, labels).tolist() == labels.tolist()
