@@ -172,8 +172,9 @@ def _masks_of_views(
         return each(
             capture.frames,
             capture.depths,
+            capture.by_view,
             names=capture.names,
-            build=lambda frame, depth: segment_rgbd(frame, depth, capture.cameras, params=params.rgbd),
+            build=lambda frame, depth, camera: segment_rgbd(frame, depth, camera, params=params.rgbd),
         )
     return each(
         capture.frames,

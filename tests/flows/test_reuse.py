@@ -177,6 +177,9 @@ def test_a_changed_photo_is_segmented_again_and_no_other(tmp_path):
     told = ss_flow("why", "segment_rgbd", "--cache", store).out
     assert told.startswith("split.segment_rgbd[0002]: input frame changed")
     assert "capture.ingest: parameter photos.2" in told
+    for file in scene.rglob("0004.*"):
+        file.unlink()
+    assert "split.segment_rgbd" not in run_tiny(scene, store, "--until", "segment").computed()
 
 
 def repainted(photo: Path) -> None:
