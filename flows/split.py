@@ -97,7 +97,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         seen,
         masks,
         names=capture.names,
-        build=lambda visible, pool: observe(points, visible, pool, params=params.observe),
+        build=lambda visible, pool: observe(points, visible, pool, params=params.observe.in_use()),
     )
     propagating, granularity = params.propagate, params.granularity
     if capture.clicks is not None:  # what was clicked as two objects stays two, and what was clicked as one, one
@@ -180,7 +180,7 @@ def _masks_of_views(
         capture.frames,
         embeddings,
         names=capture.names,
-        build=lambda frame, embedding: segment(frame, embedding, params=params.segment, model=segmenter),
+        build=lambda frame, embedding: segment(frame, embedding, params=params.segment.in_use(), model=segmenter),
     )
 
 
