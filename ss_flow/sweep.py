@@ -64,6 +64,11 @@ def recorded_as(scene: str, values: Mapping[str, Any]) -> dict[str, Any]:
     return {"scene": f"{scene} [{in_words(texts)}]", "sweep": texts}
 
 
+def scene_of(header: Mapping[str, Any]) -> str:
+    """The scene that a run is of, by its header: that of a variant names its values, too."""
+    return str(header["scene"]).removesuffix(f" [{in_words(header.get('sweep', {}))}]")
+
+
 def in_words(values: Mapping[str, Any]) -> str:
     """Values by name as words: "factor=1.0, limit=5"."""
     return ", ".join(f"{name}={value}" for name, value in values.items())

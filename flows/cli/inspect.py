@@ -100,50 +100,6 @@ def _state(ended: dict[str, Any] | None, events: list[dict[str, Any]]) -> str:
     return f"done, {failed} failed" if failed else "done"
 
 
-@dataclass(frozen=True)
-class Why:
-    """Tell why a step ran in the latest run that got to it: what of its key had changed, back to the first cause."""
-
-    step: Annotated[str, tyro.conf.Positional]
-    """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
-    scene: PositionalPath = None
-    """The scene; the one that ran last, when left out."""
-    store: Options = StoreOptions()
-    """Where results are kept."""
-
-    def run(self) -> int:
-        runs = runs_to_ask(self.store.existing_store(), self.scene)
-        for run in runs:
-            nodes = _tried(run)
-            if asked := named(run, nodes, self.step):
-                break
-        else:
-            known = ", ".join(sorted({n["step"] for n in _tried(runs[0])}))
-            raise InputError(f"the latest run of {runs[0].scene} has no step {self.step!r}; it has {known}.")
-        out = console(json=False)
-        if run is not runs[0]:
-            started = time.strftime("%F %T", time.localtime(run.header["started"]))
-            out.print(escape(f"the latest run has no such step; in that of {run.scene}, started {started}:"))
-        computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
-        if not computed:
-            out.print(f"{asked[0]['step']}: reused; nothing that it depends on changed")
-            return 0
-        reasons = list(dict.fromkeys(n["why"] for n in computed))
-        for reason in reasons[:5]:
-            these = [n for n in computed if n["why"] == reason]
-            what = these[0]["label"] if len(these) == 1 else these[0]["step"]
-            count = f" ({len(these)} of them)" if len(these) > 1 else ""
-            out.print(escape(f"{what}: {reason}{count}"))
-            for cause in _causes(these[0], nodes):
-                out.print(escape(f"  because {cause}"))
-        return 0
-
-
-def _tried(run: Run) -> list[dict[str, Any]]:
-    """What was begun or found, failures too."""
-    return [event for event in run.events() if event["event"] in ("hit", "finished", "failed", "started")]
-
-
 def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     """The nodes of a run that a user may mean: propagate, split.propagate, segment[0003], or a result, as masks.
 
@@ -181,21 +137,6 @@ def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
         about = f" of {scene}" if scene else ""
         raise InputError(f"the store {store.location} knows no run{about}; `ss-flow run SCENE` makes one.")
     return sorted(runs, key=lambda run: run.scene != runs[0].scene)
-
-
-def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:
-    """From a changed input back, step by step, to the change that began it; of a step's nodes that of the same item."""
-    found: list[str] = []
-    seen = {node["step"]}
-    while (why := node.get("why", "")).startswith("input "):
-        producer = node.get("inputs", {}).get(why.split()[1])
-        changed = [n for n in nodes if n["step"] == producer and "why" in n and n["event"] == "finished"]
-        if not changed or producer in seen:
-            break
-        node = next((n for n in changed if n["item"] == node["item"]), changed[0])
-        seen.add(node["step"])
-        found.append(f"{node['step']}: {node['why']}")
-    return found
 
 
 @dataclass(frozen=True)
