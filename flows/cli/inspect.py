@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import time
 from collections import defaultdict
 from dataclasses import dataclass
@@ -110,7 +111,8 @@ def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, An
         return steps
     result, bracket, item = name.partition("[")
     digests = set(run.results().get(result, ()))
-    return [n for n in nodes if n["label"].endswith(bracket + item) and not digests.isdisjoint(n.get("outputs", ()))]
+    found = [n for n in nodes if n["label"].endswith(bracket + item) and not digests.isdisjoint(n.get("outputs", ()))]
+    return found[::-1]  # a step that gave what it was given came later, and is what the result is of
 
 
 def run_with(store: Store, scene: Path | None, name: str) -> tuple[Run | None, list[dict[str, Any]]]:
@@ -211,32 +213,33 @@ class CacheShow:
         store = self.store.existing_store()
         if self.png:
             check_named(self.png, "--png")
-        run, digests = results_named(store, self.scene, self.what)
+        run, digests, asked = results_named(store, self.scene, self.what)
         values = [store.get(digest) for digest in digests]
         if self.png:
             from ss_flow.flows.cli.drawing import draw_results
 
             draw_results(store, run or latest_run(store, self.scene), values, self.view, self.png)
         out = console(json=False)
-        for line in told(values, digests, store, run):
+        for line in told(values, digests, store, run, asked):
             out.print(escape(line))
         if self.png:
             out.print(escape(f"drawn to {self.png}"))
         return 0
 
 
-def results_named(store: Store, scene: Path | None, what: str) -> tuple[Run | None, list[str]]:
-    """The digests of a step or result of the latest run that has it, and that run; or of what a digest begins.
+def results_named(store: Store, scene: Path | None, what: str) -> tuple[Run | None, list[str], list[dict[str, Any]]]:
+    """The latest run that has a step or result, its digests, and the nodes that gave them; or of what a digest begins.
 
     Raises InputError when there is nothing of this name, or several things.
     """
     run, nodes = run_with(store, scene, what)
     if run:
+        nodes.sort(key=lambda node: [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", node["item"])])
         outputs = [digest for node in nodes for digest in node["outputs"]]
-        return run, run.results().get(what) or outputs
+        return run, run.results().get(what) or outputs, nodes
     found = store.find(what)
     if len(found) == 1:
-        return None, found
+        return None, found, []
     problem = f"stands for {len(found)} results" if found else "is neither a step of the latest runs nor a digest"
     raise InputError(f"{what!r} {problem}; `ss-flow cache ls` lists what there is.")
 

@@ -174,6 +174,15 @@ def test_cache_show_describes_the_items_of_a_list(tiny):
     shown = ss_flow("cache", "show", "ingest", "--cache", tiny.store).out
     assert shown.count("Frame\n") == 5
     assert all(f"name: {k:04d}" in shown for k in range(5))
+    shown = ss_flow("cache", "show", "visibility", "--cache", tiny.store).out
+    assert re.findall(r"name: (\d+)", shown) == [f"{k:04d}" for k in range(5)]
+
+
+def test_what_gave_what_it_was_given_is_told_of_as_itself(tiny):
+    results = tiny.called.results()
+    assert results["cut"] == results["propagate"]
+    assert "made by split.cut (" in ss_flow("cache", "show", "cut", "--cache", tiny.store).out
+    assert "made by split.propagate (" in ss_flow("cache", "show", "propagate", "--cache", tiny.store).out
 
 
 @pytest.mark.parametrize(
