@@ -12,6 +12,7 @@ import numpy as np
 
 from ss_flow.cache.store import Action, Store
 from ss_flow.runs import Run, latest_runs
+from ss_flow.tasks.deliver.statistics import statistics
 
 _LONGEST = 200
 """Characters of a plain value that are shown."""
@@ -49,26 +50,6 @@ def facts(value: Any) -> list[FieldFacts]:
             shown = text if len(text) < _LONGEST else f"{text[: _LONGEST - 3]}..."
             found.append(FieldFacts(item.name, shown, 0, ""))
     return found
-
-
-def statistics(array: np.ndarray) -> str:
-    """Least and greatest value, mean, and shares of zeros and NaN, where there are some; of booleans the share of true.
-
-    Means and extremes are those of the finite values.
-    """
-    if not array.size or array.dtype.kind not in "biuf":
-        return ""
-    if array.dtype.kind == "b":
-        return f"{array.mean():.3g} true"
-    finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
-    told = []
-    if finite.size:
-        told = [f"{finite.min():.6g} .. {finite.max():.6g}", f"mean {finite.mean(dtype=np.float64):.4g}"]
-    shares = {"zero": array == 0}
-    if array.dtype.kind == "f":
-        shares |= {"NaN": np.isnan(array), "infinite": np.isinf(array)}
-    told += [f"{100 * share.mean():.3g}% {word}" for word, share in shares.items() if share.any()]
-    return ", ".join(told)
 
 
 def size_in_words(count: float) -> str:

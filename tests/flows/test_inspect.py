@@ -174,8 +174,8 @@ def test_cache_show_describes_the_items_of_a_list(tiny):
     shown = ss_flow("cache", "show", "ingest", "--cache", tiny.store).out
     assert shown.count("Frame\n") == 5
     assert all(f"name: {k:04d}" in shown for k in range(5))
-    shown = ss_flow("cache", "show", "visibility", "--cache", tiny.store).out
-    assert re.findall(r"name: (\d+)", shown) == [f"{k:04d}" for k in range(5)]
+    shown = ss_flow("cache", "show", "retrain", "--cache", tiny.store).out
+    assert re.findall(r"made by splat.retrain\[(\d)\]", shown) == [*"012345"]
 
 
 def test_what_gave_what_it_was_given_is_told_of_as_itself(tiny):
