@@ -103,6 +103,7 @@ def test_a_changed_threshold_of_propagation_computes_it_and_nothing_before_it(wa
         ("merge.global_mask_weight=0.5", {"splat.global_pass"}),
         ("propagate.in_turn.passes=2", set()),  # the votes are counted at once
         ("propagate.at_once.rate=0.5", {"split.propagate"}),
+        ("registration.tau_clear=0.3", set()),  # it would not warn
         ("reconstruct.retrain_share=0.3", {"splat.retrain"}),
         ("reconstruct.warm_start=false", {"splat.retrain"}),
         ("refine.margin=0.5", set()),  # there is no segmenter that would be asked
