@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -82,8 +82,11 @@ class SegmentParams:
         """With what is not read as by default, so that it does not enter the key: also values beyond the grids."""
         unread = ["mask_nms" if self.suppression == "boxes" else "box_nms"]
         unread += ["duplicate_iou"] if self.merge == "union" else ["duplicate_overlap", "union_overlap"]
+        unread += [] if self.adaptive else ["settled_by"]
         default, count = SegmentParams(), len(self.grids)
-        lists = {n: (*v[:count], *(getattr(default, n) or ())[count:]) for n, v in self._lists().items()}
+        lists: dict[str, Any] = {
+            name: values[:count] + (getattr(default, name) or ())[count:] for name, values in self._lists().items()
+        }
         return replace(by_default(self, *unread), **lists)
 
     def _lists(self) -> dict[str, tuple[float, ...]]:

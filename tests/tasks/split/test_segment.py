@@ -189,6 +189,7 @@ def test_settings_that_do_not_cover_every_grid_are_refused():
     [
         ({}, {"box_nms": (0.1,) * 4, "duplicate_overlap": 0.5, "union_overlap": 0.9}),
         ({"suppression": "boxes", "merge": "union"}, {"mask_nms": 0.1, "duplicate_iou": 0.1}),
+        ({"adaptive": False}, {"settled_by": 9}),
         ({"grids": (1, 4)}, {"stability_offset": (0.85, 0.85, 9.0), "mask_threshold": (0.5, 0.5, 9.0)}),
         ({"grids": (1, 4), "stability": (0.5, 0.6)}, {"stability": (0.5, 0.6, 1.0)}),
     ],
