@@ -107,7 +107,8 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     placing = None
     if sensed is not None:
         advise = params.calibrate == "none"
-        placing = registration(frames, cameras, sensed, advise=advise, params=params.registration)
+        compared = params.registration.in_use(advise=advise)
+        placing = registration(frames, cameras, sensed, advise=advise, params=compared)
         fitting = fitting_depth(frames, cameras, sensed, placing, params)
         depths = presumed = completed_depth(frames, cameras, fitting, names, params)
     elif params.calibrate == "depth":

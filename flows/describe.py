@@ -12,6 +12,7 @@ import numpy as np
 
 from ss_flow.cache.store import Action, Store
 from ss_flow.runs import Run, latest_runs
+from ss_flow.tasks.deliver.statistics import statistics
 
 _LONGEST = 200
 """Characters of a plain value that are shown."""
@@ -51,26 +52,6 @@ def facts(value: Any) -> list[FieldFacts]:
     return found
 
 
-def statistics(array: np.ndarray) -> str:
-    """Least and greatest value, mean, and shares of zeros and NaN, where there are some; of booleans the share of true.
-
-    Means and extremes are those of the finite values.
-    """
-    if not array.size or array.dtype.kind not in "biuf":
-        return ""
-    if array.dtype.kind == "b":
-        return f"{array.mean():.3g} true"
-    finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
-    told = []
-    if finite.size:
-        told = [f"{finite.min():.6g} .. {finite.max():.6g}", f"mean {finite.mean(dtype=np.float64):.4g}"]
-    shares = {"zero": array == 0}
-    if array.dtype.kind == "f":
-        shares |= {"NaN": np.isnan(array), "infinite": np.isinf(array)}
-    told += [f"{100 * share.mean():.3g}% {word}" for word, share in shares.items() if share.any()]
-    return ", ".join(told)
-
-
 def size_in_words(count: float) -> str:
     """A number of bytes as a person says it."""
     for unit in ("B", "kB", "MB"):
@@ -104,33 +85,44 @@ class Provenance:
         return told + [f"warning: {text}" for text in node.get("warnings", ())]
 
 
-def maker(store: Store, object_digest: str, run: Run | None = None) -> tuple[Run, Mapping[str, Any]] | None:
+def maker(
+    store: Store, object_digest: str, run: Run | None = None, asked: Sequence[Mapping[str, Any]] = ()
+) -> tuple[Run, Mapping[str, Any]] | None:
     """The run that has an object, and its record of the step that gave it; None where none is known.
 
-    run: the one to look into; otherwise the latest that has it.
+    run: the one to look into; otherwise the latest that has it. asked: records of that run that are looked at first: a
+    step may give what it was given, and then several gave the same.
     """
     for one in latest_runs(store.runs) if run is None else (run,):
-        for node in one.nodes():
+        for node in (*asked, *one.nodes()):
             if object_digest in node["outputs"]:
                 return one, node
     return None
 
 
-def provenance(store: Store, object_digest: str, run: Run | None = None) -> Provenance | None:
+def provenance(
+    store: Store, object_digest: str, run: Run | None = None, asked: Sequence[Mapping[str, Any]] = ()
+) -> Provenance | None:
     """What made an object, as `maker` finds it."""
-    found = maker(store, object_digest, run)
+    found = maker(store, object_digest, run, asked)
     return None if found is None else Provenance(found[1], store.action(found[1]["key"], whole=False))
 
 
-def told(values: Sequence[Any], digests: Sequence[str], store: Store, run: Run | None = None) -> list[str]:
-    """One artifact, or those of a list, in lines of plain text. run: where to look first for what made them."""
+def told(
+    values: Sequence[Any],
+    digests: Sequence[str],
+    store: Store,
+    run: Run | None = None,
+    asked: Sequence[Mapping[str, Any]] = (),
+) -> list[str]:
+    """One artifact, or those of a list, in lines of plain text. run, asked: where to look for what made them."""
     lines = []
     shown = len(values) if len(values) <= _MOST_SHOWN else 1
     for value, object_digest in list(zip(values, digests, strict=True))[:shown]:
         lines.append(type(value).__name__)
         lines += [f"  {fact.name}: {fact}" for fact in facts(value)]
         lines.append(f"  stored as {object_digest[:12]} in {size_in_words(store.size(object_digest))}")
-        if made := provenance(store, object_digest, run):
+        if made := provenance(store, object_digest, run, asked):
             lines += [f"  {line}" for line in made.lines()]
     if shown < len(values):
         total = size_in_words(sum(map(store.size, digests)))

@@ -22,5 +22,6 @@ def described_parts(
 
     nodes: the results of a run by name.
     """
+    params = params.in_use(encoder)
     parts = part_masks(nodes["cameras"], nodes["scene"], nodes["masks"])
     return parts, each(parts, build=lambda part: describe_part(nodes["ingest"], part, encoder=encoder, params=params))

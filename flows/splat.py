@@ -43,7 +43,7 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
             found,
             row,
             lambda seen: reconstruct(
-                some(views, seen), found.instances[row], params=settings.reconstruct, visibility=visibility
+                some(views, seen), found.instances[row], params=settings.reconstruct.of_first(), visibility=visibility
             ),
         )
 
@@ -58,7 +58,7 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
                 reconstructed(row),
                 pick(found.embeddings, seen) if networks.segmenter is not None else (),
                 model=networks.segmenter,
-                params=settings.refine,
+                params=settings.refine.in_use(networks.segmenter),
                 visibility=visibility,
             ),
         )
@@ -110,6 +110,8 @@ def described(
 ) -> tuple[Descriptors, ...]:
     """The descriptors of all instances; masks, gaussians: the nodes of an instance's own, by its row."""
 
+    describing = params.semantics.describe.in_use(networks.encoder)
+
     def build(row: int, seen: list[int]) -> Descriptors:
         pictured = masks(row)
         if params.semantics.masks == "rendered":
@@ -117,11 +119,11 @@ def described(
                 some(capture.views, seen),
                 pictured,
                 gaussians(row),
-                params=params.splat.refine,
+                params=params.splat.refine.in_use(None),
                 visibility=params.split.visibility,
             )
         frames = pick(capture.frames, seen)
-        return describe(frames, pictured, encoder=networks.encoder, params=params.semantics.describe)
+        return describe(frames, pictured, encoder=networks.encoder, params=describing)
 
     return each(
         found.instances,
@@ -176,5 +178,5 @@ def merge_rounds(
         return merge_rounds(views, gather([*merged, *rest]), masks, shown, params, number + 1)
 
     with labelled(str(number)):
-        planned = plan(groups, shown, params=params.splat.plan, round=number)
+        planned = plan(groups, shown, params=params.splat.plan.in_use(), round=number)
     return expand(planned, build)

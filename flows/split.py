@@ -97,7 +97,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         seen,
         masks,
         names=capture.names,
-        build=lambda visible, pool: observe(points, visible, pool, params=params.observe),
+        build=lambda visible, pool: observe(points, visible, pool, params=params.observe.in_use()),
     )
     propagating, granularity = params.propagate, params.granularity
     if capture.clicks is not None:  # what was clicked as two objects stays two, and what was clicked as one, one
@@ -172,14 +172,15 @@ def _masks_of_views(
         return each(
             capture.frames,
             capture.depths,
+            capture.by_view,
             names=capture.names,
-            build=lambda frame, depth: segment_rgbd(frame, depth, capture.cameras, params=params.rgbd),
+            build=lambda frame, depth, camera: segment_rgbd(frame, depth, camera, params=params.rgbd),
         )
     return each(
         capture.frames,
         embeddings,
         names=capture.names,
-        build=lambda frame, embedding: segment(frame, embedding, params=params.segment, model=segmenter),
+        build=lambda frame, embedding: segment(frame, embedding, params=params.segment.in_use(), model=segmenter),
     )
 
 

@@ -153,8 +153,10 @@ class PreviousKeys:
     survives an interrupted run. Read when first asked: most runs find everything.
     """
 
-    def __init__(self, runs: Path, scene: str) -> None:
-        self._latest = list(itertools.islice(latest_runs(runs, scene), RUNS_BACK))
+    def __init__(self, runs: Path, scene: str, before: float = float("inf")) -> None:
+        """before: only runs that started earlier, seconds since 1970."""
+        earlier = (run for run in latest_runs(runs, scene) if run.header["started"] < before)
+        self._latest = list(itertools.islice(earlier, RUNS_BACK))
 
     def __call__(self, label: str) -> Sequence[str]:
         return self._keys.get(label, ())

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from ss_flow.cache.canonical import digest
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
@@ -54,14 +55,23 @@ def sweep(
     scene, until and options are those of `run_flow`. A variant is recorded as a run of its own, named after the scene
     and its values, and compared with the latest run of the scene itself.
     """
-    requests = [Request(functools.partial(build, **v), scene, recorded_as(scene, v), until) for v in variants]
+    asked = digest([in_words(v) for v in variants])
+    requests = [Request(functools.partial(build, **v), scene, recorded_as(scene, v, asked), until) for v in variants]
     return rows_of(variants, run_flows(requests, store, **options))
 
 
-def recorded_as(scene: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The header of a variant's run: a scene name of its own leaves `why` and `status` of the plain scene alone."""
+def recorded_as(scene: str, values: Mapping[str, Any], asked: str = "") -> dict[str, Any]:
+    """The header of a variant's run: a scene name of its own leaves `why` and `status` of the plain scene alone.
+
+    asked: the same for all variants of a sweep.
+    """
     texts = {name: str(value) for name, value in values.items()}
-    return {"scene": f"{scene} [{in_words(texts)}]", "sweep": texts}
+    return {"scene": f"{scene} [{in_words(texts)}]", "sweep": texts, "asked": asked}
+
+
+def scene_of(header: Mapping[str, Any]) -> str:
+    """The scene that a run is of, by its header: that of a variant names its values, too."""
+    return str(header["scene"]).removesuffix(f" [{in_words(header.get('sweep', {}))}]")
 
 
 def in_words(values: Mapping[str, Any]) -> str:

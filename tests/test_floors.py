@@ -13,7 +13,7 @@ FLOORS = {"cache": "ss_flow.cache", "ss_flow": "ss_flow", "tasks": "ss_flow.task
 ORDER = list(FLOORS)
 ROOMS = (
     {"packed"},
-    {"artifacts", "ranges", "words", "processor", "device"},
+    {"artifacts", "ranges", "unread", "words", "processor", "device"},
     {"geometry"},
     {"models", "gaussians", "masks"},
     {"capture"},

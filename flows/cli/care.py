@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Literal, TypeVar
@@ -27,6 +27,7 @@ from ss_flow.flows.cli.pins import tell_pins
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.runs import Run, latest_runs
+from ss_flow.sweep import scene_of
 from ss_flow.units import parse_bytes, parse_seconds
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -41,7 +42,8 @@ class CacheCollect:
     """Delete results that neither a pin nor a run needs; with limits, also those that were not used for long."""
 
     keep_runs: OptionalCount = None
-    """Keep only the latest so many runs of each scene, and delete the records of older ones; all, when left out."""
+    """Keep only the latest so many runs, and sweeps, of each scene, and delete the records of older ones; all, when
+    left out."""
     max_size: OptionalText = None
     """Delete results until they take no more room than this (500MB, 20GB, 1.5TiB), least recently used first; what is
     pinned or belongs to a living run stays."""
@@ -110,15 +112,21 @@ class Wanted:
             roots.held.update(pinned.keys)
             roots.objects.update(pinned.objects)
         later: Counter[str] = Counter()
+        sweeps: dict[str, set[str]] = defaultdict(set)
         unknown = {name for name in living if name.startswith(RUN_CLAIM)}
         for run in latest_runs(self._store.runs):
             claim = RUN_CLAIM + run.folder.name
             later[run.scene] += 1
+            rank = later[run.scene]
+            if "sweep" in run.header:  # of a scene, a sweep counts as one
+                others = sweeps[scene_of(run.header)]
+                others.add(run.header.get("asked", ""))
+                rank = max(rank, len(others))
             if claim in living:
                 unknown.discard(claim)
                 roots.held.update(node["key"] for node in run.nodes())
                 roots.objects.update(run.taken())
-            elif self._keep is not None and later[run.scene] > self._keep and self._is_quiet(run):
+            elif self._keep is not None and rank > self._keep and self._is_quiet(run):
                 self.outdated.append(run)
             else:
                 roots.kept.update(node["key"] for node in run.nodes())

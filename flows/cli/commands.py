@@ -53,7 +53,7 @@ lo:hi:nlog the same evenly in the logarithm. What variants share is computed onc
     ),
     "status": Entry("inspect:Status", "Tell what the latest run did, step by step; also while it runs."),
     "why": Entry(
-        "inspect:Why",
+        "why:Why",
         "Tell why a step ran in the latest run that got to it: what of its key had changed, back to the first cause.",
     ),
     "graph": Entry("inspect:Graph", "Draw what feeds what in the latest run, a box a step, in Mermaid's notation."),

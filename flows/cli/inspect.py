@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import time
 from collections import defaultdict
 from dataclasses import dataclass
@@ -100,50 +101,6 @@ def _state(ended: dict[str, Any] | None, events: list[dict[str, Any]]) -> str:
     return f"done, {failed} failed" if failed else "done"
 
 
-@dataclass(frozen=True)
-class Why:
-    """Tell why a step ran in the latest run that got to it: what of its key had changed, back to the first cause."""
-
-    step: Annotated[str, tyro.conf.Positional]
-    """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
-    scene: PositionalPath = None
-    """The scene; the one that ran last, when left out."""
-    store: Options = StoreOptions()
-    """Where results are kept."""
-
-    def run(self) -> int:
-        runs = runs_to_ask(self.store.existing_store(), self.scene)
-        for run in runs:
-            nodes = _tried(run)
-            if asked := named(run, nodes, self.step):
-                break
-        else:
-            known = ", ".join(sorted({n["step"] for n in _tried(runs[0])}))
-            raise InputError(f"the latest run of {runs[0].scene} has no step {self.step!r}; it has {known}.")
-        out = console(json=False)
-        if run is not runs[0]:
-            started = time.strftime("%F %T", time.localtime(run.header["started"]))
-            out.print(escape(f"the latest run has no such step; in that of {run.scene}, started {started}:"))
-        computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
-        if not computed:
-            out.print(f"{asked[0]['step']}: reused; nothing that it depends on changed")
-            return 0
-        reasons = list(dict.fromkeys(n["why"] for n in computed))
-        for reason in reasons[:5]:
-            these = [n for n in computed if n["why"] == reason]
-            what = these[0]["label"] if len(these) == 1 else these[0]["step"]
-            count = f" ({len(these)} of them)" if len(these) > 1 else ""
-            out.print(escape(f"{what}: {reason}{count}"))
-            for cause in _causes(these[0], nodes):
-                out.print(escape(f"  because {cause}"))
-        return 0
-
-
-def _tried(run: Run) -> list[dict[str, Any]]:
-    """What was begun or found, failures too."""
-    return [event for event in run.events() if event["event"] in ("hit", "finished", "failed", "started")]
-
-
 def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     """The nodes of a run that a user may mean: propagate, split.propagate, segment[0003], or a result, as masks.
 
@@ -154,7 +111,8 @@ def named(run: Run, nodes: list[dict[str, Any]], name: str) -> list[dict[str, An
         return steps
     result, bracket, item = name.partition("[")
     digests = set(run.results().get(result, ()))
-    return [n for n in nodes if n["label"].endswith(bracket + item) and not digests.isdisjoint(n.get("outputs", ()))]
+    found = [n for n in nodes if n["label"].endswith(bracket + item) and not digests.isdisjoint(n.get("outputs", ()))]
+    return found[::-1]  # a step that gave what it was given came later, and is what the result is of
 
 
 def run_with(store: Store, scene: Path | None, name: str) -> tuple[Run | None, list[dict[str, Any]]]:
@@ -181,21 +139,6 @@ def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
         about = f" of {scene}" if scene else ""
         raise InputError(f"the store {store.location} knows no run{about}; `ss-flow run SCENE` makes one.")
     return sorted(runs, key=lambda run: run.scene != runs[0].scene)
-
-
-def _causes(node: dict[str, Any], nodes: list[dict[str, Any]]) -> list[str]:
-    """From a changed input back, step by step, to the change that began it; of a step's nodes that of the same item."""
-    found: list[str] = []
-    seen = {node["step"]}
-    while (why := node.get("why", "")).startswith("input "):
-        producer = node.get("inputs", {}).get(why.split()[1])
-        changed = [n for n in nodes if n["step"] == producer and "why" in n and n["event"] == "finished"]
-        if not changed or producer in seen:
-            break
-        node = next((n for n in changed if n["item"] == node["item"]), changed[0])
-        seen.add(node["step"])
-        found.append(f"{node['step']}: {node['why']}")
-    return found
 
 
 @dataclass(frozen=True)
@@ -270,32 +213,33 @@ class CacheShow:
         store = self.store.existing_store()
         if self.png:
             check_named(self.png, "--png")
-        run, digests = results_named(store, self.scene, self.what)
+        run, digests, asked = results_named(store, self.scene, self.what)
         values = [store.get(digest) for digest in digests]
         if self.png:
             from ss_flow.flows.cli.drawing import draw_results
 
             draw_results(store, run or latest_run(store, self.scene), values, self.view, self.png)
         out = console(json=False)
-        for line in told(values, digests, store, run):
+        for line in told(values, digests, store, run, asked):
             out.print(escape(line))
         if self.png:
             out.print(escape(f"drawn to {self.png}"))
         return 0
 
 
-def results_named(store: Store, scene: Path | None, what: str) -> tuple[Run | None, list[str]]:
-    """The digests of a step or result of the latest run that has it, and that run; or of what a digest begins.
+def results_named(store: Store, scene: Path | None, what: str) -> tuple[Run | None, list[str], list[dict[str, Any]]]:
+    """The latest run that has a step or result, its digests, and the nodes that gave them; or of what a digest begins.
 
     Raises InputError when there is nothing of this name, or several things.
     """
     run, nodes = run_with(store, scene, what)
     if run:
+        nodes.sort(key=lambda node: [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", node["item"])])
         outputs = [digest for node in nodes for digest in node["outputs"]]
-        return run, run.results().get(what) or outputs
+        return run, run.results().get(what) or outputs, nodes
     found = store.find(what)
     if len(found) == 1:
-        return None, found
+        return None, found, []
     problem = f"stands for {len(found)} results" if found else "is neither a step of the latest runs nor a digest"
     raise InputError(f"{what!r} {problem}; `ss-flow cache ls` lists what there is.")
 

@@ -121,7 +121,7 @@ class Sweep:
                     Request(
                         variant.prepared.build,
                         variant.prepared.name,
-                        header(variant.prepared, options) | recorded_as(variant.prepared.name, variant.values),
+                        header(variant.prepared, options) | recorded_as(variant.prepared.name, variant.values, asked),
                         options.target,
                         Prefixed(screen, variant.label(scene=len(scenes) > 1), leading=position == 0),
                         partial(done, position),
@@ -185,11 +185,12 @@ class Sweep:
             raise InputError("there is nothing to sweep; give a parameter several values: --set tau_label=0.6,0.8.")
         if not self.zipped and (count := math.prod(map(len, swept.values()))) > MOST_ROWS:
             raise InputError(f"these values have {count:,} combinations; a sweep may have at most {MOST_ROWS:,}.")
-        found = []
+        found: dict[str, tuple[Params, dict[str, Any]]] = {}  # a value that is named twice, 0.6 and 0.60, counts once
         for values in zipped(swept) if self.zipped else grid(swept):
             variant = settings.apply(params, [*fixed, *(f"{name}={text}" for name, text in values.items())])
-            found.append((variant, {name: settings.flat(variant)[name] for name in values}))
-        return found
+            flat = settings.flat(variant)
+            found.setdefault(digest(flat), (variant, {name: flat[name] for name in values}))
+        return list(found.values())
 
     def _check(self) -> None:
         if not self.scenes:

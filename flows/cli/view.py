@@ -94,15 +94,15 @@ class View:
         from ss_flow.tasks.artifacts import Gaussians
 
         out, store = console(json=False), self.store.existing_store()
-        run, digests = results_named(store, None, self.what)
+        run, digests, asked = results_named(store, None, self.what)
         values = [store.get(digest) for digest in digests]
-        made = maker(store, digests[0], run)
+        made = maker(store, digests[0], run, asked)
         around = around_of(store, made[0]) if made else Around()
         if self.draw_at_most:
             count = sum(len(value) for value in values if isinstance(value, Gaussians))
             around = replace(around, share=min(1.0, self.draw_at_most / max(count, 1)))
         if self.html:
-            write_artifact_page(self.html, self.what, digests, store, around, run)
+            write_artifact_page(self.html, self.what, digests, store, around, run, asked)
             out.print(escape(str(self.html)))
         elif placed(values, around) and find_spec("viser"):
             from ss_flow.flows.view.server import start
@@ -114,7 +114,7 @@ class View:
                 _wait()
             server.stop()
         else:
-            for line in told(values, digests, store, run):
+            for line in told(values, digests, store, run, asked):
                 out.print(escape(line))
         return 0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,16 +65,22 @@ def show(server: viser.ViserServer, values: Sequence[Any], around: Around) -> No
 
 
 def write_artifact_page(
-    file: Path, title: str, digests: Sequence[str], store: Store, around: Around, run: Run | None
+    file: Path,
+    title: str,
+    digests: Sequence[str],
+    store: Store,
+    around: Around,
+    run: Run | None,
+    asked: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     """Write one HTML file about some artifacts, whole or not at all: a picture, the fields and the history of each.
 
-    run: where to look first for what made them.
+    run, asked: where to look for what made them.
     """
     parts = []
     for object_digest in digests[:_MOST_ON_A_PAGE]:
         value = store.get(object_digest)
-        made = provenance(store, object_digest, run)
+        made = provenance(store, object_digest, run, asked)
         parts.append(f"<section>{as_html(value, artifact_picture(value, around), made)}</section>")
     if len(digests) > len(parts):
         parts.append(f"<p>... and {len(digests) - len(parts)} more</p>")

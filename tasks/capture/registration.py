@@ -19,6 +19,7 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame, 
 from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.ranges import Count, Fraction
+from ss_flow.tasks.unread import by_default
 
 _SIDE = 320
 """Longer side of the images that are compared, at most; all lengths below are pixels of these."""
@@ -51,6 +52,10 @@ class RegistrationParams:
     of the agreement between edges of depth and of photo that is lost without them."""
     tau_clear: Fraction = 0.2
     """Gain from which they are clear: calibrate=auto then applies them, and calibrate=none warns."""
+
+    def in_use(self, *, advise: bool) -> RegistrationParams:
+        """For `registration`: tau_clear, where it does not warn, as by default, so that it does not enter the key."""
+        return self if advise else by_default(self, "tau_clear")
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, decompressed
 from ss_flow.tasks.deliver.contact_sheet import FAINT, INK, as_picture, blank, caption, contact_sheet, table_picture
 from ss_flow.tasks.deliver.palette import depth_colors, instance_colors, paint_ids, turbo
 from ss_flow.tasks.deliver.point_view import draw_points, orbit_camera
+from ss_flow.tasks.deliver.statistics import statistics
 from ss_flow.tasks.geometry.cameras import Camera, camera_of, centers_of, level_axes, up_of
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.models.colour_words import TERMS, ColourWords
@@ -96,10 +97,12 @@ def _draw(value: object, context: Context) -> UInt8:
 
 
 def _said(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype} [{', '.join(map(str, value.shape))}]"
     text = f"{value:.6g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= 70 else text[:69] + "…"
+    if isinstance(value, np.ndarray):
+        short = 0 < value.size <= 8 and value.dtype.kind in "iuf"
+        words = ", ".join(f"{number:.4g}" for number in value.flat) if short else statistics(value)
+        text = f"{value.dtype} [{', '.join(map(str, value.shape))}]{': ' if words else ''}{words}"
+    return text if len(text) <= 90 else text[:89] + "…"
 
 
 @_draw.register(tuple)

@@ -19,6 +19,7 @@ from ss_flow.tasks.packed import bounds
 from ss_flow.tasks.ranges import Count, Fraction, Natural, Positive
 from ss_flow.tasks.semantics.encoders import encoder_of
 from ss_flow.tasks.semantics.sides import mean_direction
+from ss_flow.tasks.unread import by_default
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,12 @@ class DescribeParams:
     """Whether views weigh in by their visible area; False takes the plain mean, as in the paper."""
     erosion: ErosionParams = ErosionParams()
     """How much of the mask's border is left out."""
+
+    def in_use(self, encoder: Model | None) -> DescribeParams:
+        """With what is not read as by default, so that it does not enter the key: colour words (None) see masks."""
+        if encoder is None:
+            return by_default(self, "background", "blur_radius", "margin_px", "box_scale", "crop_side")
+        return self if self.background == "blur" else by_default(self, "blur_radius")
 
 
 @task(resources=Resources(cores=1, memory_mb=1200, gpus=0.1), environment=network_identity)

@@ -31,6 +31,7 @@ from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative
 from ss_flow.tasks.splat.collisions import SOLID_OPACITY, TRIMMED, group_box
 from ss_flow.tasks.splat.guard import guarded
+from ss_flow.tasks.unread import by_default
 
 _OF_PAIRS = (
     "iterations_per_view",
@@ -135,15 +136,11 @@ class MergeParams:
 
     def of_pairs(self) -> MergeParams:
         """For `merge_pair`: what only the last pass reads is as by default, so that it does not enter the key."""
-        return self._by_default(_OF_LAST_PASS)
+        return by_default(self, *_OF_LAST_PASS)
 
     def of_last_pass(self) -> MergeParams:
         """For `global_pass`: what only pairs read is as by default, so that it does not enter the key."""
-        return replace(self._by_default(_OF_PAIRS), crop=CropParams(max_side=self.crop.max_side))
-
-    def _by_default(self, names: Sequence[str]) -> MergeParams:
-        default = MergeParams()
-        return replace(self, **{name: getattr(default, name) for name in names})
+        return replace(by_default(self, *_OF_PAIRS), crop=CropParams(max_side=self.crop.max_side))
 
 
 @task(

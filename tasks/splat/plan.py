@@ -20,6 +20,7 @@ from ss_flow.tasks.splat.collisions import (
     match_pairs,
     voxel_collisions,
 )
+from ss_flow.tasks.unread import by_default
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,12 @@ class PlanParams:
     """Pairs that overlap by no more than this are left apart."""
     mask_weights: tuple[NonNegative, ...] = (0.05, 0.15, 0.25)
     """w_mask of each round; the last one holds for all further rounds."""
+
+    def in_use(self) -> PlanParams:
+        """With what is not read as by default, so that it does not enter the key."""
+        if not self.max_rounds:
+            return PlanParams(max_rounds=0)
+        return by_default(self, "voxel" if self.overlap == "box" else "bbox_quantile")
 
 
 @task()

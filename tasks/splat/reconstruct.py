@@ -33,6 +33,7 @@ from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.dilation import dilated
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive, Range
 from ss_flow.tasks.splat.consensus import agreed, completed
+from ss_flow.tasks.unread import by_default
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,10 @@ class ReconstructParams:
     """The part of each view that is rendered."""
     seed: Natural = 0
     """Another one trains on the views in another order, and before other random backgrounds."""
+
+    def of_first(self) -> ReconstructParams:
+        """For `reconstruct`: what only `retrain` reads is as by default, so that it does not enter the key."""
+        return by_default(self, "retrain_share", "warm_start")
 
     def iterations(self, instance: InstanceMasks) -> int:
         """Training steps for an instance, by the number of its views (spec row 22)."""

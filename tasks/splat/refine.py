@@ -29,7 +29,21 @@ from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, Sam
 from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative
+from ss_flow.tasks.unread import by_default
 
+_OF_PROMPTS = (
+    "prompts",
+    "prompt_alpha",
+    "drop_hull",
+    "tau_iou",
+    "pred_iou",
+    "margin",
+    "tie",
+    "max_change",
+    "speckle",
+    "dilation",
+)
+"""What is not read where no segmenter is asked."""
 Prompt = Callable[[Float32], tuple[Bool, float]]
 """Points [n, 2] in pixels of a photo -> the segmenter's mask and its score."""
 
@@ -77,6 +91,10 @@ class RefineParams:
     """Without a segmenter: share of the rendered mask that the view's depth must confirm for it to be added."""
     min_views: Count = 2
     """An instance with masks in fewer views stays weak."""
+
+    def in_use(self, model: Model | None) -> RefineParams:
+        """With what is not read as by default, so that it does not enter the key. model: the segmenter, if any."""
+        return by_default(self, "min_support") if model else by_default(self, *_OF_PROMPTS)
 
 
 @dataclass(frozen=True)

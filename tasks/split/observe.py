@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -40,6 +40,10 @@ class ClusterParams:
     """Where there are more clusters than this, all points are kept; 0 = no such rule. For labels, 3 in the code of the
     paper's authors."""
 
+    def in_use(self) -> ClusterParams:
+        """As by default where all points are kept, so that what is not read does not enter the key."""
+        return self if self.eps else ClusterParams(eps=0.0)
+
     def kept(self, points: Float32 | Float64, spacing: float) -> Bool:
         """[N] which of the points [N, 3] belong together; spacing: of the cloud that they are from."""
         if not self.eps:
@@ -57,6 +61,10 @@ class ObserveParams:
     """How far a mask's border is taken off."""
     clusters: ClusterParams = field(default_factory=ClusterParams)
     """Which points inside a mask are kept."""
+
+    def in_use(self) -> ObserveParams:
+        """With what is not read as by default, so that it does not enter the key."""
+        return replace(self, clusters=self.clusters.in_use())
 
 
 @task(resources=Resources(cores=1, memory_mb=400))

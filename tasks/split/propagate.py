@@ -80,9 +80,10 @@ class PropagateParams:
     def in_use(self) -> PropagateParams:
         """With the groups that are not read as by default, so that they do not enter the key."""
         touching = self.touching if self.touching_merge else TouchingParams()
+        read = replace(self, touching=touching, label_clusters=self.label_clusters.in_use())
         if self.views == "at_once":
-            return replace(self, touching=touching, in_turn=SequentialParams())
-        return replace(self, touching=touching, at_once=MaskClusteringParams(rate=self.at_once.rate))
+            return replace(read, in_turn=SequentialParams())
+        return replace(read, at_once=MaskClusteringParams(rate=self.at_once.rate))
 
 
 @task()

@@ -4,8 +4,8 @@ Sec. 3.1; spec S1)."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Annotated, Literal
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import Embedding, PromptedImage, Sam
 from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Range
+from ss_flow.tasks.unread import by_default
 
 
 @dataclass(frozen=True)
@@ -70,13 +71,28 @@ class SegmentParams:
     """With "union": share of the smaller mask above which a finer one is united with a coarser one (row 9)."""
 
     def __post_init__(self) -> None:
-        for name in ("stability", "stability_offset", "mask_threshold", "box_nms"):
-            values = getattr(self, name)
-            if values is not None and len(values) < len(self.grids):
+        for name, values in self._lists().items():
+            if len(values) < len(self.grids):
                 raise InputError(
                     f"segment.{name} has {len(values)} values but segment.grids has {len(self.grids)}; "
                     "it should have one for each grid."
                 )
+
+    def in_use(self) -> SegmentParams:
+        """With what is not read as by default, so that it does not enter the key: also values beyond the grids."""
+        unread = ["mask_nms" if self.suppression == "boxes" else "box_nms"]
+        unread += ["duplicate_iou"] if self.merge == "union" else ["duplicate_overlap", "union_overlap"]
+        unread += [] if self.adaptive else ["settled_by"]
+        default, count = SegmentParams(), len(self.grids)
+        lists: dict[str, Any] = {
+            name: values[:count] + (getattr(default, name) or ())[count:] for name, values in self._lists().items()
+        }
+        return replace(by_default(self, *unread), **lists)
+
+    def _lists(self) -> dict[str, tuple[float, ...]]:
+        """What is read of each grid, by name."""
+        names = ["stability", "stability_offset", "mask_threshold"] + ["box_nms"] * (self.suppression == "boxes")
+        return {name: values for name in names if (values := getattr(self, name)) is not None}
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ss_flow.errors import InputError
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, Int32, MaskSet
-from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.artifacts import Bool, DepthMap, Frame, Int32, MaskSet
+from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size, pixels_under
 from ss_flow.tasks.masks.overlap import drop_duplicates
@@ -64,20 +63,17 @@ class SegmentRgbdParams:
     name="split.segment_rgbd",
     resources=Resources(cores=1, memory_mb=500),
 )
-def segment_rgbd(frame: Frame, depth: DepthMap, cameras: Cameras, *, params: SegmentRgbdParams) -> MaskSet:
+def segment_rgbd(frame: Frame, depth: DepthMap, camera: Camera, *, params: SegmentRgbdParams) -> MaskSet:
     """The masks of one view from its colours and its depth alone (the place of Split&Splat's M_k; spec S1).
 
     Gives the same tree as a segmenter: the finest level holds objects, coarser ones groups, and large planes (walls,
     floor, table tops) have masks of their own. `predicted_iou` is how strong a mask's boundary is, `stability` the IoU
     of the mask at a level a tenth lower and a tenth higher.
-    Raises InputError when the cameras do not have the frame.
     """
-    if frame.name not in cameras.names:
-        raise InputError(f"frame {frame.name} has no camera; RGB-D segmentation needs one for each frame.")
     rgb, valid = decode_rgb(frame), decode_valid(frame)
     scale = min(1.0, params.side / max(frame.width, frame.height))
     width, height = max(8, round(frame.width * scale)), max(8, round(frame.height * scale))
-    camera = camera_of(cameras, cameras.names.index(frame.name)).scaled(width, height)
+    camera = camera.scaled(width, height)
 
     import cv2
 

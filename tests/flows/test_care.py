@@ -21,6 +21,7 @@ from ss_flow.engine import run_flow
 from ss_flow.flows.cli.care import Wanted, size_text
 from ss_flow.graph import stored
 from ss_flow.runs import latest_runs
+from ss_flow.sweep import grid, sweep
 
 
 def gc(store, *options):
@@ -77,6 +78,17 @@ def test_only_the_latest_runs_of_a_scene_are_kept_on_request(warm):
     assert keys == keys_of(latest) and objects == named_by(warm.store, keys)
     assert again(warm, "--set", "propagate.at_once.min_points=6").computed() == {}
     assert again(warm).computed() == {"split.propagate": 1}
+
+
+def test_of_the_sweeps_of_a_scene_the_latest_are_kept_as_of_its_runs(tmp_path):
+    store = Store(tmp_path / "store")
+    run_flow(toy.flow, store, scene="one")
+    for limits in ((1.0, 2.0), (3.0, 4.0)):
+        sweep(toy.flow, grid({"limit": limits}), store, scene="one")
+    age_all(store.root)
+    assert removed(gc(store.root, "--keep-runs", "2", "--dry-run")) == {}
+    assert removed(gc(store.root, "--keep-runs", "1"))["records of runs"] == 2
+    assert sorted(run.scene for run in latest_runs(store.runs)) == ["one", "one [limit=3.0]", "one [limit=4.0]"]
 
 
 def test_nothing_young_goes_and_a_dry_run_changes_nothing(warm):

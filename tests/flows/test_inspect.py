@@ -94,6 +94,31 @@ def test_why_goes_back_by_the_nodes_of_the_same_item(tmp_path):
     ]
 
 
+def test_why_says_what_changed_of_results_that_an_earlier_run_had(tmp_path):
+    store = Store(tmp_path / "store")
+
+    def run(limit, last=toy.half):
+        run_flow(
+            lambda: {"end": last(toy.square(toy.clip(toy.source(values=(5.0,))[0], limit=limit)))}, store, scene="/t"
+        )
+
+    def told(step):
+        return ss_flow("why", step, "--cache", store.root).out.splitlines()
+
+    because = ["  because ss_flow_toy.clip: parameter limit 3.0 -> 2.0"]
+    run(2.0, last=toy.uncertain)
+    run(3.0)
+    run(2.0)
+    assert told("square") == [
+        "ss_flow_toy.square: reused from an earlier run; since the last one, input x changed",
+        *because,
+    ]
+    changed = ["  because ss_flow_toy.square: input x changed", *because]
+    assert told("half") == ["ss_flow_toy.half: input x changed", *changed]
+    run(2.0)
+    assert told("square") == ["ss_flow_toy.square: reused; nothing that it depends on changed"]
+
+
 def test_the_graph_is_mermaid_with_a_box_a_step_and_what_feeds_it(tiny):
     lines = ss_flow("graph", "--cache", tiny.store).out.splitlines()
     assert lines[0] == "flowchart TD"
@@ -149,6 +174,15 @@ def test_cache_show_describes_the_items_of_a_list(tiny):
     shown = ss_flow("cache", "show", "ingest", "--cache", tiny.store).out
     assert shown.count("Frame\n") == 5
     assert all(f"name: {k:04d}" in shown for k in range(5))
+    shown = ss_flow("cache", "show", "retrain", "--cache", tiny.store).out
+    assert re.findall(r"made by splat.retrain\[(\d)\]", shown) == [*"012345"]
+
+
+def test_what_gave_what_it_was_given_is_told_of_as_itself(tiny):
+    results = tiny.called.results()
+    assert results["cut"] == results["propagate"]
+    assert "made by split.cut (" in ss_flow("cache", "show", "cut", "--cache", tiny.store).out
+    assert "made by split.propagate (" in ss_flow("cache", "show", "propagate", "--cache", tiny.store).out
 
 
 @pytest.mark.parametrize(

@@ -219,6 +219,12 @@ def test_a_scene_that_is_named_twice_is_swept_once(tiny):
     assert [row["scene"] for row in rows] == [str(tiny.scene)] * 2
 
 
+def test_a_value_that_is_named_twice_is_swept_once(tiny):
+    options = ["--cache", tiny.store, "--preset", "fast", "--dry-run", "--json", "--set", "tau_label=0.7,0.70,0.8"]
+    rows = ss_flow("sweep", tiny.scene, *options).document()
+    assert [row["params"] for row in rows] == [{"split.propagate.tau_label": value} for value in (0.7, 0.8)]
+
+
 def test_no_sweep_takes_the_place_of_another(warm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = ["--cache", warm.store, "--preset", "fast", *SHORT, "--until", "propagate", "--json"]

@@ -196,3 +196,9 @@ def test_a_long_list_is_cut_and_an_empty_one_says_so():
 def test_what_is_empty_or_unknown_has_a_picture_too(value):
     picture = draw(value)
     assert picture.ndim == 3 and picture.dtype == np.uint8 and picture.size > 0
+
+
+@pytest.mark.parametrize("size", [3, 20])
+def test_a_table_tells_what_is_in_an_array_and_not_its_shape_alone(size):
+    ones, more = (draw(np.full(size, value, np.int32)) for value in (1, 7))
+    assert ones.shape == more.shape and (ones != more).any()

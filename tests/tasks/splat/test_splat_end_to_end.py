@@ -111,12 +111,20 @@ def test_training_twice_gives_the_same_bytes_and_the_order_of_a_pair_does_not_ma
 def test_no_training_reads_a_parameter_that_is_kept_out_of_its_key(built):
     read: set[str] = set()
 
-    class Noted(MergeParams):
-        def __getattribute__(self, name):
+    def noted(kind, **values):
+        def get(self, name):
             read.add(name)
-            return super().__getattribute__(name)
+            return super(kind, self).__getattribute__(name)
 
-    params = Noted(min_iterations=2, max_iterations=2, global_iterations=4, relabel_after=2, reset_opacity=True)
+        return type("Noted", (kind,), {"__getattribute__": get})(**values)
+
+    reconstruct(
+        built.views, built.scene.instance(2), params=noted(ReconstructParams, min_iterations=2, max_iterations=2)
+    )
+    assert "max_iterations" in read and not read & {"retrain_share", "warm_start"}
+    params = noted(
+        MergeParams, min_iterations=2, max_iterations=2, global_iterations=4, relabel_after=2, reset_opacity=True
+    )
     merge_pair(built.views, built.box, built.ball, built.scene.maps, params=params, w_mask=0.05)
     assert set(module._OF_PAIRS) <= read and not read & set(module._OF_LAST_PASS)
     read.clear()

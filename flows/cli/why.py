@@ -1,0 +1,114 @@
+"""Why a step ran in the latest run, or has another result than before though it was found: back to the first cause."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+from rich.markup import escape
+
+from ss_flow.cache.store import Store
+from ss_flow.errors import InputError
+from ss_flow.explain import first_difference, nearest
+from ss_flow.flows.cli.context import PositionalPath, StoreOptions, console
+from ss_flow.flows.cli.inspect import named, runs_to_ask
+from ss_flow.keys import Components
+from ss_flow.runs import DONE, PreviousKeys, Run
+from ss_flow.sweep import scene_of
+
+Options = tyro.conf.OmitArgPrefixes[StoreOptions]
+_COMPARED = 10
+"""How many of the calls of one label a found result is compared with."""
+
+
+@dataclass(frozen=True)
+class Why:
+    """Tell why a step ran in the latest run that got to it: what of its key had changed, back to the first cause."""
+
+    step: Annotated[str, tyro.conf.Positional]
+    """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
+    scene: PositionalPath = None
+    """The scene; the one that ran last, when left out."""
+    store: Options = StoreOptions()
+    """Where results are kept."""
+
+    def run(self) -> int:
+        store = self.store.existing_store()
+        runs = runs_to_ask(store, self.scene)
+        for run in runs:
+            nodes = _tried(run)
+            if asked := named(run, nodes, self.step):
+                break
+        else:
+            known = ", ".join(sorted({n["step"] for n in _tried(runs[0])}))
+            raise InputError(f"the latest run of {runs[0].scene} has no step {self.step!r}; it has {known}.")
+        out = console(json=False)
+        if run is not runs[0]:
+            started = time.strftime("%F %T", time.localtime(run.header["started"]))
+            out.print(escape(f"the latest run has no such step; in that of {run.scene}, started {started}:"))
+        reason_of = Reasons(store, run)
+        computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
+        reasons: dict[str, list[dict[str, Any]]] = {}
+        for node in computed or asked:
+            reasons.setdefault(reason_of(node), []).append(node)
+        if reasons.keys() == {""}:
+            out.print(f"{asked[0]['step']}: reused; nothing that it depends on changed")
+        for reason, these in [one for one in reasons.items() if one[0]][:5]:
+            what = these[0]["label"] if len(these) == 1 else these[0]["step"]
+            found = "" if computed else "reused from an earlier run; since the last one, "
+            count = f" ({len(these)} of them)" if len(these) > 1 else ""
+            out.print(escape(f"{what}: {found}{reason}{count}"))
+            for cause in _causes(these[0], nodes, reason_of):
+                out.print(escape(f"  because {cause}"))
+        return 0
+
+
+def _tried(run: Run) -> list[dict[str, Any]]:
+    """What was begun or found, failures too."""
+    return [event for event in run.events() if event["event"] in ("hit", "finished", "failed", "started")]
+
+
+class Reasons:
+    """Why a node has another key than in the run before: as recorded where it was computed; where it was found, by
+    comparing keys. "" where nothing changed, or there was no run before."""
+
+    def __init__(self, store: Store, run: Run) -> None:
+        self._store = store
+        self._known = PreviousKeys(store.runs, scene_of(run.header), before=run.header["started"])
+
+    def __call__(self, node: dict[str, Any]) -> str:
+        if "why" in node or node["event"] not in DONE:
+            return str(node.get("why", ""))
+        known = self._known(node["label"])
+        if not known or node["key"] in known:
+            return ""
+        among = [record for key in known[:_COMPARED] if (record := self._parts(key)) is not None]
+        now = self._parts(node["key"])
+        if not among or now is None:
+            return "what changed is not known: a record is no longer in the store"
+        before = nearest(among, now)
+        codes = [{}, {}] if before["code"] == now["code"] else [self._store.part(one["code"]) for one in (before, now)]
+        return first_difference({**before, "code": None if None in codes else codes[0]}, {**now, "code": codes[1]})
+
+    def _parts(self, key: str) -> Components | None:
+        record = self._store.action(key, whole=False)
+        return None if record is None else record.components
+
+
+def _causes(node: dict[str, Any], nodes: list[dict[str, Any]], reason_of: Reasons) -> list[str]:
+    """From a changed input back, step by step, to the change that began it; of a step's nodes that of the same item."""
+    found: list[str] = []
+    seen = {node["step"]}
+    while (why := reason_of(node)).startswith("input "):
+        producer = node.get("inputs", {}).get(why.split()[1])
+        made = [n for n in nodes if n["step"] == producer and n["event"] in DONE]
+        made.sort(key=lambda n: n["item"] != node["item"])
+        cause = next((n for n in made if reason_of(n)), None)
+        if cause is None or producer in seen:
+            break
+        node = cause
+        seen.add(node["step"])
+        found.append(f"{node['step']}: {reason_of(node)}")
+    return found
