@@ -124,9 +124,14 @@ def _written_out(stream: TextIO) -> None:
 
 def entry() -> None:
     """The console script."""
+    if os.name == "nt":
+        raise SystemExit("ss-flow runs on Linux and macOS; on Windows use it inside WSL.")
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by who called; a file opened later must not get its place
+        stream = getattr(sys, name)
+        if stream is None:  # closed by who called; a file opened later must not get its place
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - it stays open
+        elif stream.errors == "strict":  # a sign that the terminal lacks is no reason to end
+            stream.reconfigure(errors="backslashreplace")
     # A cluster's queue stops a job with SIGTERM: the run then keeps what it has, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # Hardly anything here is in a cycle: search for cycles less often than after every 700 objects more.

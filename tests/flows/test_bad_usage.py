@@ -498,6 +498,23 @@ def test_a_stream_that_is_closed_is_no_failure(closed, tiny):
         assert (called.returncode, called.stderr) == (0, "")
 
 
+def test_a_terminal_that_lacks_a_sign_gets_its_number(tmp_path):
+    (tmp_path / "a‐b").mkdir()
+    for arguments in (["--help"], ["run", tmp_path / "a‐b"]):
+        words = [sys.executable, "-c", ENTRY, *map(str, arguments)]
+        environment = {**os.environ, "PYTHONIOENCODING": "latin-1:strict"}
+        called = subprocess.run(words, capture_output=True, text=True, env=environment)
+        assert "UnicodeEncodeError" not in called.stderr
+        assert "\\u20" in called.stdout + called.stderr
+        assert called.returncode == (0 if arguments == ["--help"] else 2)
+
+
+def test_windows_is_told_what_to_do():
+    called = run_entry(["doctor"], "import os, ss_flow.flows.cli.main; os.name = 'nt'\n")
+    assert (called.returncode, called.stdout) == (1, "")
+    assert called.stderr == "ss-flow runs on Linux and macOS; on Windows use it inside WSL.\n"
+
+
 def test_an_interrupt_before_the_command_is_known_ends_as_any_other():
     before = (
         "import sys\n"
