@@ -13,6 +13,9 @@ from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
+if os.name == "nt":
+    raise SystemExit("ss-flow runs on Linux and macOS; on Windows use it inside WSL.")
+
 NATIVE = Path("tasks/gaussians/native")
 SOURCES, HEADERS = sorted(NATIVE.glob("*.cpp")), sorted(NATIVE.glob("*.h"))
 COMMON = [

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from blake3 import blake3
 
+from ss_flow.cache.errors import StoreFailure
+
 AT_WORK_SECONDS = 3600.0
 """For so long after its last change an unfinished file counts as being written."""
 _NAME_BYTES = 200
@@ -111,5 +113,10 @@ def folder_bytes(folder: Path) -> int:
 
 
 def user_cache() -> Path:
-    """The folder of ss-flow in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME", "") or "~/.cache").expanduser() / "ss-flow"
+    """The folder of ss-flow in the user's cache folder. Raises StoreFailure for a user without a home."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME", "") or "~/.cache").expanduser() / "ss-flow"
+    except RuntimeError:
+        raise StoreFailure(
+            "this user has no home folder; set XDG_CACHE_HOME to a folder that can be written."
+        ) from None

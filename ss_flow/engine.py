@@ -14,6 +14,7 @@ import psutil
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure, writing
 from ss_flow.cache.store import Store
+from ss_flow.control_groups import within_limit, within_quota
 from ss_flow.errors import InputError
 from ss_flow.events import Log, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
@@ -81,8 +82,8 @@ class Report:
 
 
 def usable_cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores this process may use: those it may run on, or what its container's share of time keeps busy."""
+    return within_quota(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def run_flow(
@@ -149,7 +150,7 @@ def _this_machine(gpus: int | None) -> Resources:
     """What there is to use here. gpus: None = one where the driver shows any."""
     return Resources(
         cores=usable_cores(),
-        memory_mb=psutil.virtual_memory().available >> 20,
+        memory_mb=within_limit(psutil.virtual_memory().available) >> 20,
         gpus=min(len(glob.glob("/dev/nvidia[0-9]*")), 1) if gpus is None else gpus,  # tasks use the first one
     )
 

@@ -31,17 +31,17 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 def main(arguments: list[str]) -> int:
     """Run one command; return the exit code."""
-    if not arguments:
-        from ss_flow.flows.cli.start import next_steps
-
-        print(next_steps(Path.cwd()))
-        return BAD_INPUT
     if arguments == ["--version"]:
         from importlib.metadata import version
 
         print(f"ss-flow {version('ss-flow')}")
         return 0
     try:
+        if not arguments:
+            from ss_flow.flows.cli.start import next_steps
+
+            print(next_steps(Path.cwd()))
+            return BAD_INPUT
         return int(_read(arguments).run())
     except InputError as error:
         _complain(str(error))
@@ -147,7 +147,10 @@ def _open_streams() -> None:
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115 - it stays open
-        elif stat.S_ISCHR(os.fstat(number).st_mode):  # one that was closed just now says that it is none
+            continue
+        if stream.errors == "strict":  # a sign that the terminal lacks is no reason to end
+            stream.reconfigure(errors="backslashreplace")
+        if stat.S_ISCHR(os.fstat(number).st_mode):  # one that was closed just now says that it is none
             screen = io.BufferedWriter(_Screen(number, "w", closefd=False))
             setattr(sys, name, io.TextIOWrapper(screen, stream.encoding, stream.errors, line_buffering=True))
 
@@ -160,6 +163,8 @@ def _hung_up(*_: object) -> None:
 
 def entry() -> None:
     """The console script."""
+    if os.name == "nt":
+        raise SystemExit("ss-flow runs on Linux and macOS; on Windows use it inside WSL.")
     _open_streams()
     # A cluster's queue stops a job with SIGTERM: the run then keeps what it has, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)

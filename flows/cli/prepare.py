@@ -20,7 +20,7 @@ from ss_flow.events import Reporter
 from ss_flow.flows import settings
 from ss_flow.flows.capture import Capture, capture
 from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model, choose_patches, references
-from ss_flow.flows.deliver import deliver, run_document, weight_free
+from ss_flow.flows.deliver import deliver, remarks, run_document
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
 from ss_flow.flows.split_splat import LEADS_TO, LEADS_TO_CAMERAS, split_splat
@@ -179,9 +179,8 @@ def prepare(
 
 def tell_remarks(scenes: Iterable[Prepared], out: Console) -> None:
     """Print what is to be said of runs before they begin, once."""
-    for remark in {weight_free(one.scene, one.params, one.networks): None for one in scenes}:
-        if remark is not None:
-            out.print(f"[yellow]warning[/] {escape(remark)}")
+    for remark in dict.fromkeys(text for one in scenes for text in remarks(one.scene, one.params, one.networks)):
+        out.print(f"[yellow]warning[/] {escape(remark)}")
 
 
 def _until(step: str, results: Mapping[str, Any]) -> Any:

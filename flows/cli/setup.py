@@ -6,6 +6,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import json
+import platform
 import shutil
 import sys
 from collections.abc import Callable
@@ -140,7 +141,12 @@ class Doctor:
             _Check("store", lambda: (_store(self.store), ""), "name a folder that can be written, with --cache"),
             _Check("rasterizer", lambda: (_rasterizer(), ""), "install ss-flow again, with a C++17 compiler at hand"),
             _Check("CUDA", _cuda),
-            _Check("Open3D", lambda: (_open3d(), ""), f"{again} open3d-cpu libusb-package"),
+            _Check(
+                "Open3D",
+                lambda: (_open3d(), ""),
+                f"{again} {'open3d-cpu' if _x86_linux() else 'open3d'} libusb-package",
+            ),
+            _Check("pycolmap", lambda: (_pycolmap(), ""), f"{again} pycolmap"),
             _Check("onnxruntime", lambda: (_onnxruntime(), ""), f"{again} onnxruntime"),
             *(
                 _Check(name, lambda n=name, m=module: (_library(n, m), ""), f"{again} {name}")  # type: ignore[misc]
@@ -183,15 +189,12 @@ def _store(options: StoreOptions) -> str:
 
 _LIBRARIES = (
     ("torch", "torch"),
-    ("pycolmap", "pycolmap"),
     ("opencv-contrib-python-headless", "cv2"),
     ("zarr", "zarr"),
 )
 
 
 def _library(distribution: str, module: str) -> str:
-    import zlib  # noqa: F401 - must be loaded before pycolmap brings its own
-
     importlib.import_module(module)
     return importlib.metadata.version(distribution)
 
@@ -200,6 +203,19 @@ def _open3d() -> str:
     from ss_flow.tasks.geometry.open3d import load_open3d
 
     return str(load_open3d().__version__)
+
+
+def _pycolmap() -> str:
+    from ss_flow.tasks.capture.colmap import has_pycolmap, load_pycolmap
+
+    if platform.system() == "Linux" and not _x86_linux() and not has_pycolmap():
+        return "none, as it is not built for this processor; captures need poses, which are taken as they are"
+    return str(load_pycolmap().__version__)
+
+
+def _x86_linux() -> bool:
+    """Whether this is the one system that open3d-cpu is built for."""
+    return (platform.system(), platform.machine()) == ("Linux", "x86_64")
 
 
 def _onnxruntime() -> str:

@@ -4,19 +4,33 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib.util
 import signal
 from collections.abc import Iterator
 from types import ModuleType
 
+from ss_flow.errors import InputError
+
+
+def has_pycolmap() -> bool:
+    """Whether the library is installed; it is not loaded."""
+    return importlib.util.find_spec("pycolmap") is not None
+
 
 @functools.cache
 def load_pycolmap() -> ModuleType:
-    """The library, quiet but for its errors."""
+    """The library, quiet but for its errors. Raises InputError when it cannot be loaded."""
     import zlib  # noqa: F401 - pycolmap brings a zlib of its own, which breaks Python's when loaded before it
 
     # Its logging takes SIGTERM for itself, and would end a run that a cluster's queue stops with a native stack trace.
-    with _action_kept(signal.SIGTERM):
-        import pycolmap
+    try:
+        with _action_kept(signal.SIGTERM):
+            import pycolmap
+    except ImportError as error:
+        raise InputError(
+            f"pycolmap cannot be loaded ({error}): `pip install pycolmap`, or, on a machine that it is not built for "
+            "(Linux on ARM), take a capture with poses and leave --refine-poses out."
+        ) from error
 
     pycolmap.logging.minloglevel = 2
     return pycolmap

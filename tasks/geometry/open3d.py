@@ -22,25 +22,31 @@ def load_open3d() -> ModuleType:
     `libusb_package` carries is loaded first, so that the linker finds it by name. Its pictures in notebooks bring Dash,
     Plotly and IPython, half of what loading it takes: they are loaded when one is drawn.
 
-    Raises InputError when a system library is missing all the same.
+    Raises InputError when it, or a system library, is missing all the same.
     """
-    if sys.platform == "linux":
-        try:
-            ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
-        except OSError:
-            import libusb_package
-
-            ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
     late = ModuleType("open3d.visualization.draw_plotly")
     vars(late).update({name: functools.partial(_draw_late, late, name) for name in _DRAWN_BY_PLOTLY})
     sys.modules.setdefault(late.__name__, late)
     try:
+        if sys.platform == "linux":
+            _load_libusb()
         return importlib.import_module("open3d")
+    except ModuleNotFoundError as error:
+        raise InputError(f"open3d cannot be loaded ({error}): install ss-flow again.") from error
     except (ImportError, OSError) as error:
         raise InputError(
             f"open3d cannot be loaded ({error}); on Debian or Ubuntu install its libraries with "
             "`apt-get install libgl1 libegl1 libusb-1.0-0 libgomp1`."
         ) from error
+
+
+def _load_libusb() -> None:
+    try:
+        ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
+    except OSError:
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
 
 
 def _draw_late(late: ModuleType, name: str, *args: Any, **options: Any) -> Any:

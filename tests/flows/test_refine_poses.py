@@ -3,6 +3,7 @@ this is better, or where it is asked for, and the run says so."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 from tiny_runs import run_tiny
 
 from ss_flow.cache.store import Store
+from ss_flow.flows.deliver import UNCOMPARED
 from ss_flow.flows.generated import RoomParams, generate, write_scene
 from ss_flow.flows.params import Params
 from ss_flow.flows.settings import preset
+from ss_flow.tasks.capture.colmap import load_pycolmap
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +107,32 @@ def test_where_photos_have_nothing_in_common_the_given_poses_stay(scenes, tmp_pa
     called = run_tiny(capture, store, *UNTIL)
     assert called.code == 0
     assert called.results() == run_tiny(capture, store, *UNTIL, *NEVER).results()
+
+
+@pytest.fixture
+def without_pycolmap(monkeypatch):
+    load_pycolmap.cache_clear()
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+
+
+def test_without_pycolmap_given_poses_are_taken_as_they_are_and_the_run_says_so(scenes, tmp_path, without_pycolmap):
+    store = tmp_path / "store"
+    called = run_tiny(scenes[1], store, *UNTIL)
+    assert called.code == 0 and f"warning {UNCOMPARED}\n" in called.err
+    assert {"label": "run", "text": UNCOMPARED} in called.document()["warnings"]
+    chosen = run_tiny(scenes[1], store, *UNTIL, *NEVER)
+    assert chosen.results() == called.results() and UNCOMPARED not in chosen.err
+
+
+def test_what_takes_pycolmap_says_what_to_do_where_it_is_lacking(scenes, tmp_path, without_pycolmap):
+    photos = tmp_path / "photos"
+    photos.symlink_to(scenes[0] / "color")
+    for called in (
+        run_tiny(photos, tmp_path / "store", *UNTIL),
+        run_tiny(scenes[1], tmp_path / "store", *UNTIL, "--refine-poses"),
+    ):
+        assert called.code == 2
+        assert "pip install pycolmap" in called.err and "a capture with poses" in called.err
 
 
 def test_photos_without_poses_have_none_to_refine(scenes, tmp_path):

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from generated_views import around, views
+from native_builds import skip_without
 from patchmatch_reference import Reference
 
 from ss_flow.tasks.artifacts import DepthMap
@@ -12,7 +13,6 @@ from ss_flow.tasks.capture.stereo import StereoParams, carried, stereo
 from ss_flow.tasks.gaussians import library
 from ss_flow.tasks.geometry.cameras import camera_of, cameras_by_view
 from ss_flow.tasks.geometry.images import encode_png
-from ss_flow.tasks.processor import INSTRUCTION_SETS, features
 
 EYES = [(0, 0, 0), (0.35, 0, 0), (-0.35, 0.1, 0), (0, 0.35, 0), (0.1, -0.35, 0.1)]
 
@@ -64,8 +64,7 @@ def small():
 @pytest.fixture(params=library.BUILDS)
 def build(request, monkeypatch):
     """Each instruction set of this machine, one after the other."""
-    if not INSTRUCTION_SETS[request.param] <= features():
-        pytest.skip(f"this processor has no {request.param}")
+    skip_without(request.param)
     monkeypatch.setattr("ss_flow.tasks.capture.patchmatch.library", lambda: library.library(request.param))
 
 

@@ -34,6 +34,15 @@ def test_without_a_compiler_the_installation_ends_with_one_sentence(tmp_path):
     assert not list(tmp_path.rglob("*.so"))
 
 
+def test_on_windows_the_installation_ends_before_a_compiler_is_asked_for():
+    root = Path(__file__).parents[3]
+    loaded = "import os, runpy; from setuptools.command import bdist_wheel, build_ext\n"
+    program = loaded + "os.name = 'nt'; runpy.run_path('setup.py')"
+    done = subprocess.run([sys.executable, "-P", "-c", program], cwd=root, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert done.stderr == "ss-flow runs on Linux and macOS; on Windows use it inside WSL.\n"
+
+
 @pytest.fixture
 def copied(tmp_path, monkeypatch):
     """The library and its sources in another folder, where they may be changed."""

@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from native_builds import skip_without
 
 from ss_flow.tasks.gaussians import library, native_pass
 from ss_flow.tasks.gaussians.library import BUILDS, Workspace
@@ -18,7 +19,6 @@ from ss_flow.tasks.gaussians.library import library as native_library
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, backend_identity, device_here, rasterize
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.processor import INSTRUCTION_SETS, features
 
 DEVICES = [
     "cpu",
@@ -125,8 +125,7 @@ def on_build(monkeypatch):
     """Renders with the library of an instruction set from here on, given its name."""
 
     def use(name: str) -> None:
-        if not INSTRUCTION_SETS[name] <= features():
-            pytest.skip(f"this processor has no {name}")
+        skip_without(name)
         monkeypatch.setattr(native_pass, "library", lambda: native_library(name))
         monkeypatch.setattr(library, "library", lambda: native_library(name))
 
