@@ -8,7 +8,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
@@ -115,6 +115,14 @@ class SceneFiles:
     def place(self) -> Path:
         """What its runs are recorded under."""
         return self.opened or self.root
+
+    def files(self) -> Iterator[Path]:
+        """Where it lies, and all files of it that a run may read; some more than once."""
+        for value in vars(self).values():
+            for one in value if isinstance(value, tuple) else (value,):
+                place = one.path if isinstance(one, Hints) else one
+                if isinstance(place, Path):
+                    yield place
 
     @property
     def has_masks(self) -> bool:
