@@ -198,7 +198,7 @@ def test_a_video_is_known_by_its_name_alone(tmp_path):
     (tmp_path / "walk.MP4").write_bytes(b"")
     assert open_scene(tmp_path / "walk.MP4").kind == "video"
     assert open_scene(tmp_path).recording == tmp_path / "walk.MP4"
-    for name in ("walk.mpg", "walk.mpeg"):
+    for name in ("walk.mpg", "walk.mpeg", "walk.MTS", "walk.m2ts", "walk.ts", "walk.3gp"):
         (tmp_path / name).write_bytes(b"")
         assert open_scene(tmp_path / name).kind == "video"
 
