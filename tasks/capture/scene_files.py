@@ -234,7 +234,7 @@ def read_text(path: Path) -> str:
     Raises InputError when it is absent or no text.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # editors on Windows put a mark in front
     except FileNotFoundError as error:
         raise InputError(f"{path} is missing; the capture needs it.") from error
     except (UnicodeDecodeError, OSError) as error:
