@@ -284,15 +284,10 @@ def listed_photos_missing(root):
     return root
 
 
-@case("0000", "the first is looked for at ")
-def listed_photos_of_no_ending_missing(root):
+@case("images/0000, also with .png, .jpg or .jpeg at its end", "none of them exists; the first is looked for at ")
+def listed_photos_without_an_ending_missing(root):
     edit_json(made.nerfstudio(root), lambda d: [f.update(file_path="images\\0000") for f in d["frames"]])
     return root
-
-
-@case("images/0000, also with .png, .jpg or .jpeg at its end", "none of them exists")
-def listed_photos_are_looked_for_with_endings(root):
-    return listed_photos_of_no_ending_missing(root)
 
 
 @case("10.png", "does not exist; put it there or drop the view.")
