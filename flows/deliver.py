@@ -23,7 +23,8 @@ from ss_flow.tasks.artifacts import Cameras, Frame
 from ss_flow.tasks.capture.colmap import has_pycolmap
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import SceneFiles
-from ss_flow.tasks.deliver.output import RUN_FILE, replacing, write_masks, write_scene
+from ss_flow.tasks.deliver.output import RUN_FILE, write_masks, write_scene
+from ss_flow.tasks.deliver.places import RESULT, replacing_own, sizes
 from ss_flow.tasks.deliver.ply import write_cloud
 
 if TYPE_CHECKING:
@@ -137,10 +138,9 @@ def deliver(folder: Path, store: Store, document: dict[str, Any], scene: SceneFi
         document |= known
         write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
         return
-    with replacing(folder) as filling:
+    with replacing_own(folder, RESULT) as filling:
         write_all(filling, store, document, scene, undistorted=undistorted)
-        files = sorted(path for path in filling.rglob("*") if path.is_file())
-        document["files"] = {path.relative_to(filling).as_posix(): path.stat().st_size for path in files}
+        document["files"] = sizes(filling)
         document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
 

@@ -23,8 +23,10 @@ from ss_flow.resolution import Failure
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import UInt8
 from ss_flow.tasks.deliver.output import replacing
+from ss_flow.tasks.deliver.places import Written, replacing_own, sizes
 
 RECIPE = "recipe.json"
+SCENE = Written(RECIPE, "the room", listing="names")
 
 Masks = Literal["auto", "truth", "degraded"]
 
@@ -70,7 +72,7 @@ def demo_scene(
     """Have a room's capture in a folder; where the same one lies there already, no file is touched.
 
     reporter: hears of the photographing. engine: options of `run_flows`; in a dry run nothing is written.
-    Returns whether the capture is there. Raises InputError when the folder holds something else.
+    Returns whether the capture is there. Raises InputError when the folder holds something else, or more.
     """
     return _placed(folder, room, masks, "", store, reporter, engine)
 
@@ -113,12 +115,14 @@ def _placed(
             return
         digests = report.succeeded()["files"]
         recipe = {"room": asdict(room), "files": list(digests)}
-        there = known == recipe
+        there = isinstance(known, dict) and all(known.get(part) == value for part, value in recipe.items())
         if there or engine["dry"]:
             return
-        with replacing(folder) as filling:
+        listed = isinstance(known, dict) and SCENE.listing in known
+        with replacing_own(folder, SCENE) if listed else replacing(folder) as filling:
             for digest in digests:
                 _write(store.get(digest), filling)
+            recipe[SCENE.listing] = list(sizes(filling))
             (filling / RECIPE).write_text(json.dumps(recipe, indent=1), encoding="utf-8")
         there = True
 

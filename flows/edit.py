@@ -22,7 +22,8 @@ from ss_flow.graph import labelled
 from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
 from ss_flow.tasks.artifacts import EditedScene
-from ss_flow.tasks.deliver.output import RUN_FILE, check_place, replacing, write_scene
+from ss_flow.tasks.deliver.output import RUN_FILE, write_scene
+from ss_flow.tasks.deliver.places import RESULT, check_replaceable, replacing_own, sizes
 from ss_flow.tasks.edit.fill import fill
 from ss_flow.tasks.edit.holes import Holes, Measured, holes
 from ss_flow.tasks.edit.operations import begin
@@ -89,9 +90,10 @@ def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None =
 
     Raises InputError when `out` cannot be written, and what a task raised when one failed.
     """
-    check_place(out)
     if out.resolve() == edit.source.folder.resolve():
         raise InputError(f"--out {out} is the run that is edited; name another folder.")
+    read = [Path(operation["run"]) for operation in edit.script["operations"] if "run" in operation]
+    check_replaceable(out, RESULT, store.location, [edit.source.folder, *read])
     documents: list[dict[str, Any]] = []
 
     def done(report: Report) -> None:
@@ -134,10 +136,11 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
     }
     code = kept_closure(_deliver, store.closures).definitions
     document["content"] = digest({"results": report.values, "instances": instances, "code": code})
-    with replacing(out) as filling:
+    with replacing_own(out, RESULT) as filling:
         write_scene(filling, scene, instances)
         html = report_html(document, pictures=made.all("report_pictures"), instances=instances)
         (filling / "report.html").write_text(html, encoding="utf-8")
+        document["files"] = sizes(filling)
         document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
     return document

@@ -45,7 +45,8 @@ from ss_flow.flows.params import Params
 from ss_flow.sweep import rows_of
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import capture_name, named_after
-from ss_flow.tasks.deliver.output import check_place, check_writable
+from ss_flow.tasks.deliver.output import check_writable
+from ss_flow.tasks.deliver.places import RESULT, check_outside, check_replaceable
 
 BATCH_FILE = "batch.json"
 COLOURS = {"ok": "green", "degraded": "yellow", "failed": "red"}
@@ -76,6 +77,7 @@ class Batch:
         params = settings.apply(settings.preset(Params(), options.preset), options.texts)
         folders = folder_names(_found(self.scenes, self.list_file))
         check_writable(self.out)
+        check_outside(self.out, options.store.location)
         ended = _ended(self.out / BATCH_FILE, folders) if self.retry_failed else {}
         tell = console(json=options.json)
         store = options.store.open_store()
@@ -85,7 +87,7 @@ class Batch:
         with digests:
             for path in (path for path in folders if str(path) not in ended):
                 try:
-                    scenes[path] = self._opened(path, self.out / folders[path], params, digests)
+                    scenes[path] = self._opened(path, self.out / folders[path], params, digests, folders)
                 except Exception as error:  # a fault in one scene must not stop the others
                     errors[path] = _in_words(error)
             if errors and not scenes and not ended:
@@ -125,12 +127,13 @@ class Batch:
             tell.print(escape(f"{options.stops_early}: only {self.out / BATCH_FILE} is written"))
         return STATUS_EXIT["ok" if all(row["status"] == "ok" for row in book.rows) else "degraded"]
 
-    def _opened(self, path: Path, out: Path, params: Params, digests: FileDigests) -> Prepared:
-        """Raises InputError, among others, when the scene cannot be run."""
-        prepared = prepare(open_scene(path), params, self.execution, digests)
+    def _opened(self, path: Path, out: Path, params: Params, digests: FileDigests, every: Iterable[Path]) -> Prepared:
+        """every: all scenes of the batch. Raises InputError, among others, when the scene cannot be run."""
+        scene = open_scene(path)
+        prepared = prepare(scene, params, self.execution, digests)
         prepared.steps()
         if self.execution.delivers:
-            check_place(out)
+            check_replaceable(out, RESULT, self.execution.store.location, [*scene.files(), *every])
         return prepared
 
     def _plan(

@@ -22,11 +22,13 @@ from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.export.coco import coco
-from ss_flow.tasks.deliver.output import check_named, check_place, replacing
+from ss_flow.tasks.deliver.output import check_named
+from ss_flow.tasks.deliver.places import Written, check_outside, check_replaceable, note_beside, replacing_own
 from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorted
 from ss_flow.tasks.geometry.images import suffix_of
 
 MANIFEST = "export.json"
+EXPORT = Written(MANIFEST, "an earlier export")
 _ADDED = {"labelled-ply": "-labelled", "gltf-flat": "-flat", "mesh-glb": "-mesh"}
 """What the default names of formats have before a suffix that is another's too."""
 _MOST_IN_A_NAME = 3
@@ -69,7 +71,7 @@ class Export:
         ids = run.ids(self.instance) if self.instance else run.all_ids() if by_instance else None
         folder = several or workspace
         out = self.out or Path("ss-flow-export") / f"{run.name}{self._ending(ids or (), folder=folder)}"
-        _check_place(out, folder=folder)
+        _check_place(out, run.store.location, folder=folder)
         self._check_suffix(out, folder=folder)
         if workspace:
             return self._write_workspace(out, run)
@@ -126,7 +128,7 @@ class Export:
         """Write the photos and cameras that the run worked with."""
         frames = [run.store.get(value) for value in run.document["results"]["ingest"]]
         cameras = run.results.one("cameras")
-        with replacing(out) as filling:
+        with replacing_own(out, EXPORT) as filling:
             if self.format == "colmap":
                 maps = [run.store.get(value) for value in run.document["results"]["masks"]]
                 write_undistorted(filling, frames, cameras, maps)
@@ -151,7 +153,7 @@ class Export:
             write_atomically(out, content)
             return [{"file": out.name, "instances": None if ids is None else list(ids), "bytes": len(content)}]
         files = []
-        with replacing(out) as filling:
+        with replacing_own(out, EXPORT) as filling:
             for name, value in good.items():
                 content = run.store.get(value).content.tobytes()
                 file = f"{int(name):04d}{formats.suffix_of(self.format)}"
@@ -163,6 +165,7 @@ class Export:
         return files
 
     def _tell(self, out: Path, report: Report | None, files: list[dict[str, Any]]) -> int:
+        note_beside(out)
         failed = report.failures if report else []
         status = "degraded" if failed else "ok"
         failures = [{"label": f.label, "error": f"{type(f.error).__name__}: {f.error}"} for f in failed]
@@ -212,9 +215,10 @@ def _check_there(scene: Gaussians, ids: tuple[int, ...] | None, folder: Path) ->
         raise InputError(f"{what} has no Gaussians, so there is nothing to export.")
 
 
-def _check_place(out: Path, *, folder: bool) -> None:
+def _check_place(out: Path, store: str, *, folder: bool) -> None:
     """Raises InputError unless the export can be written here: a new place, or that of an earlier export."""
     if folder:
-        check_place(out, MANIFEST, "an earlier export")
+        check_replaceable(out, EXPORT, store)
     else:
+        check_outside(out, store)
         check_named(out, "--out")

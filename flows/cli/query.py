@@ -29,12 +29,13 @@ from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.query import NEEDED, described_parts
 from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
-from ss_flow.tasks.deliver.output import check_place, replacing
+from ss_flow.tasks.deliver.places import Written, check_replaceable, note_beside, replacing_own, sizes
 from ss_flow.tasks.models.colour_words import ColourWords, words_ignored
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
 
 ANSWER_FILE = "answer.json"
+ANSWER = Written(ANSWER_FILE, "an earlier answer", frozenset({"answer.ply"}))
 ROWS = 10
 """So many instances are named at least; all that match are."""
 
@@ -79,7 +80,7 @@ class Query:
         run = open_run(self.result, self.store, ("describe", *(NEEDED if self.parts else ())))
         params = self._params(document)
         if self.out is not None:
-            check_place(self.out, ANSWER_FILE)
+            check_replaceable(self.out, ANSWER, run.store.location)
         with file_digests(run.store) as digests:
             encoder = choose_model("text-image", encoder_name(run.store, document["results"]["describe"]), digests)
 
@@ -183,7 +184,8 @@ def write_answer(
 ) -> None:
     """Write the folder of an answer: answer.json, answer.ply, and a mask of 0 and 255 for every photo.
 
-    document: what --json prints. parts: where the frames show the parts, when parts were searched.
+    document: what --json prints; answer.json lists the other files, too. parts: where the frames show the parts, when
+    parts were searched.
     """
     import numpy as np
 
@@ -205,12 +207,14 @@ def write_answer(
     else:
         shown = [part for part in parts if (part.instance_id, part.part_id) in wanted]
         masks = _on_photos(run, shown, [photo.stem for photo in photos])
-    with replacing(folder) as filling:
+    with replacing_own(folder, ANSWER) as filling:
         write_gaussians(filling / "answer.ply", select(scene, np.array(rows, bool)), labelled=True)
         (filling / "masks").mkdir()
         for photo, mask in zip(photos, masks, strict=True):
             (filling / "masks" / photo.name).write_bytes(encode_png(np.uint8(255) * mask).tobytes())
-        (filling / ANSWER_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
+        listed = document | {"files": sizes(filling)}
+        (filling / ANSWER_FILE).write_text(json.dumps(listed, indent=1), encoding="utf-8")
+    note_beside(folder)
 
 
 def _on_photos(run: FinishedRun, parts: Sequence[PartMasks], names: Sequence[str]) -> Iterator[Bool]:

@@ -20,12 +20,14 @@ from ss_flow.flows.render import CameraPath, Shot, shoot
 from ss_flow.flows.results import FinishedRun
 from ss_flow.graph import stored
 from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
-from ss_flow.tasks.deliver.output import check_named, check_place, replacing
+from ss_flow.tasks.deliver.output import check_named
 from ss_flow.tasks.deliver.pictures import What
+from ss_flow.tasks.deliver.places import Written, check_outside, check_replaceable, note_beside, replacing_own
 
 CAMERAS_FILE = "transforms.json"
 MANIFEST = "render.json"
 """Tells earlier pictures, which may be replaced, from a capture, which has a transforms.json too."""
+PICTURES = Written(MANIFEST, "earlier pictures", frozenset({CAMERAS_FILE}))
 _LEAST, _MOST = 8, 8192
 
 
@@ -68,7 +70,7 @@ class Render:
         run = open_run(self.result, self.store, ("scene", "cameras", "dense"))
         out = self.out or Path("ss-flow-render") / f"{run.name}.mp4"
         is_film = out.suffix.lower() == ".mp4"
-        _check_place(out, is_film=is_film)
+        _check_place(out, run.store.location, is_film=is_film)
         ids = run.ids(self.instance) if self.instance else None
         unit = float(run.results.one("dense").unit) / 1000
         earlier = _scene_before(run) if self.before else None
@@ -93,6 +95,7 @@ class Render:
         with display(console(json=self.json)) as screen:
             request = Request(build, run.document["scene"], reporter=screen, done=done)
             run_flows([request], run.store, jobs=self.jobs, recorded=False)
+        note_beside(out)
         if self.json:
             print(json.dumps({"status": "ok", "what": self.what, "out": str(out), "frames": written}))
         else:
@@ -151,7 +154,7 @@ def _write_pictures(
     made = report.succeeded()
     paths, pictures = made["cameras"], made["pictures"]
     sizes = []
-    with replacing(out) as filling:
+    with replacing_own(out, PICTURES) as filling:
         files = [f"{number:05d}.png" for number in range(len(pictures))]
         for file, value in zip(files, pictures, strict=True):
             content = run.store.get(value).content.tobytes()
@@ -167,11 +170,12 @@ def _write_pictures(
     return len(files)
 
 
-def _check_place(out: Path, *, is_film: bool) -> None:
+def _check_place(out: Path, store: str, *, is_film: bool) -> None:
     """Raises InputError unless the pictures can be written here: a new place, or that of earlier ones."""
     if is_film:
+        check_outside(out, store)
         check_named(out, "--out")
     elif out.is_file():
         raise InputError(f"{out} is a file that does not end in .mp4; --out must name a film or a folder.")
     else:
-        check_place(out, MANIFEST, "earlier pictures")
+        check_replaceable(out, PICTURES, store)

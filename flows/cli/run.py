@@ -22,7 +22,7 @@ from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles, capture_name
-from ss_flow.tasks.deliver.output import check_place
+from ss_flow.tasks.deliver.places import RESULT, check_outside, check_replaceable
 from ss_flow.tasks.gaussians.read_ply import read_columns
 
 _MOST_LABELS = 3
@@ -107,7 +107,8 @@ class Demo:
         engine = options.engine()
         if self.seed < 0:
             raise InputError(f"--seed {self.seed} is out of range; it must be 0 or more.")
-        check_place(self.out / "result")
+        check_outside(scene, options.store.location)
+        check_replaceable(self.out / "result", RESULT, options.store.location)
         room = RoomParams(objects=self.objects, views=self.views, seed=self.seed)
         out = console(json=options.json)
         with display(out) as screen:
@@ -127,7 +128,7 @@ def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions,
     params = settings.apply(params, options.texts)
     engine = options.engine()
     if options.until is None:
-        check_place(out)
+        check_replaceable(out, RESULT, options.store.location, scene.files())
     store = options.store.open_store()
     digests = file_digests(store, verify=options.verify)
     prepared = prepare(scene, params, options, digests)

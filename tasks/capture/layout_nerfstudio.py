@@ -25,6 +25,8 @@ from ss_flow.tasks.capture.scene_files import (
 from ss_flow.tasks.geometry.cameras import Camera
 
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+"""Those that a photo's name may leave out, as in NeRF's synthetic scenes."""
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 
 
@@ -41,15 +43,16 @@ def open_nerfstudio(path: Path) -> SceneFiles:
     root = path.parent
     document = _document(path)
     listed = sorted(document["frames"], key=lambda f: (natural_key(f["file_path"]), f["file_path"]))
-    places = [(frame, _photo(root, frame["file_path"])) for frame in listed]
+    places = [(frame, _photo(_place(root, frame["file_path"]))) for frame in listed]
     found = [(frame, photo) for frame, photo in places if photo is not None]
     if not found:
-        first = root / listed[0]["file_path"]
+        first = _place(root, listed[0]["file_path"])
         raise InputError(
-            f"{path} lists {len(listed)} photos, and none of them exists; the first is looked for at {first}."
+            f"{path} lists {len(listed)} photos, and none of them exists; the first is looked for at {first}"
+            f"{'' if first.suffix else ', also with .png, .jpg or .jpeg at its end'}."
         )
     frames, photos = [frame for frame, _ in found], tuple(photo for _, photo in found)
-    missing = [root / frame["file_path"] for frame, photo in places if photo is None]
+    missing = [_place(root, frame["file_path"]) for frame, photo in places if photo is None]
     called = view_names(photos, missing)
     with_depth = [f for f in frames if f.get("depth_file_path")]
     if with_depth and len(with_depth) < len(frames):
@@ -63,13 +66,13 @@ def open_nerfstudio(path: Path) -> SceneFiles:
         names=tuple(called[p] for p in photos),
         photos=photos,
         valid=tuple(_listed(root, f.get("mask_path"), path) for f in frames),
-        depths=tuple(root / f["depth_file_path"] for f in frames) if with_depth else None,
+        depths=tuple(_place(root, f["depth_file_path"]) for f in frames) if with_depth else None,
         depth_scale=_depth_scale(document, path),
         lenses=tuple(_lens({**document, **f}, p, path) for f, p in zip(frames, photos, strict=True)),
         poses=poses,
         metric=bool(with_depth),
         skipped=tuple(called[p] for p in missing),
-        all_names=tuple(called[photo or root / frame["file_path"]] for frame, photo in places),
+        all_names=tuple(called[photo or _place(root, frame["file_path"])] for frame, photo in places),
     )
 
 
@@ -124,24 +127,33 @@ def _document(path: Path) -> dict[str, Any]:
         )
     if not frames:
         raise InputError(f"{path} lists no frame; at least one photo is needed.")
+    for number, frame in enumerate(frames):
+        for key in ("file_path", "depth_file_path", "mask_path"):
+            value = frame.get(key)
+            if not (isinstance(value, str) and value) and (key == "file_path" or value not in (None, "")):
+                raise InputError(f"{path} has `{key}` {value!r} in frame {number}; the name of a file is expected.")
     return document
 
 
-def _photo(root: Path, name: str) -> Path | None:
-    photo = root / name
-    if photo.is_file():
-        return photo
-    if not photo.suffix and photo.with_suffix(".png").is_file():
-        return photo.with_suffix(".png")
-    return None
+def _place(root: Path, name: str) -> Path:
+    """Where a listed file lies; Windows writes folders with backslashes."""
+    place = root / name
+    return place if place.exists() else root / name.replace("\\", "/")
+
+
+def _photo(photo: Path) -> Path | None:
+    """The photo itself, or with the ending that the list leaves out."""
+    endings = ("",) if photo.suffix else ("", *_ENDINGS)
+    return next((file for end in endings if (file := photo.with_name(photo.name + end)).is_file()), None)
 
 
 def _listed(root: Path, name: str | None, path: Path) -> Path | None:
-    if name is None:
+    if not name:
         return None
-    if not (root / name).is_file():
-        raise InputError(f"{root / name}, which {path.name} lists, does not exist; put it there or drop the entry.")
-    return root / name
+    file = _place(root, name)
+    if not file.is_file():
+        raise InputError(f"{file}, which {path.name} lists, does not exist; put it there or drop the entry.")
+    return file
 
 
 def _lens(values: dict[str, Any], photo: Path, path: Path) -> Lens:

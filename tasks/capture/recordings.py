@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,7 +81,8 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
     floor = params.min_sharpness * float(np.median([s for s, _, _ in best]))
     kept = [frame for sharpness, _, frame in best if sharpness >= floor]
     warn_of_skipped(
-        tuple(frame.name for sharpness, _, frame in best if sharpness < floor), "blurred beside the other frames"
+        tuple(frame.name for sharpness, _, frame in best if sharpness < floor),
+        "blurred or without detail beside the other frames",
     )
     return tuple(kept)
 
@@ -90,7 +92,9 @@ def _count_frames(video: Path) -> int:
 
     reader = cv2.VideoCapture(str(video))
     if not reader.isOpened():
-        raise InputError(f"{video} cannot be opened as a video; an MP4, MOV, AVI, MKV, WebM or MPEG file is expected.")
+        raise InputError(
+            f"{video} cannot be opened as a video: it is cut short or damaged, or holds no pictures; copy it again."
+        )
     # The container's own count is often wrong, too low mostly: only one that is far too high tells of a damage.
     announced = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     total = 0
@@ -98,7 +102,10 @@ def _count_frames(video: Path) -> int:
         total += 1
     reader.release()
     if total == 0:
-        raise InputError(f"{video} holds no frame that can be decoded; a video with at least one is needed.")
+        raise InputError(
+            f"{video} holds no frame that can be decoded: it is damaged, or of a codec that is not read, such as AV1; "
+            f"convert it to H.264 (ffmpeg -i {shlex.quote(video.name)} -c:v libx264 converted.mp4)."
+        )
     if total < _WHOLE * announced:
         warn(f"{video.name} announces {announced} frames, but only {total} can be decoded; it may be cut or damaged.")
     return total

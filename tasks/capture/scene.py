@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +30,8 @@ ACCEPTED = (
     "a folder of photos, a video, a COLMAP workspace (sparse/ and images/), a nerfstudio transforms.json, a ScanNet "
     "export (color/ depth/ pose/ intrinsic/) or .sens file, or a TUM RGB-D sequence (rgb.txt)"
 )
+_OTHER_TRANSFORMS = "transforms_*.json"
+"""As NeRF's synthetic scenes have them, one for the views to train on and others to test with."""
 _MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff"})
 
 
@@ -113,7 +116,10 @@ def _open_layout(path: Path) -> SceneFiles:
             return open_sens(path)
         if path.name == "transforms.json":
             return open_nerfstudio(path)
-        raise InputError(f"{path} is no scene; give {ACCEPTED}.")
+        if path.match(_OTHER_TRANSFORMS):
+            raise InputError(f"{path} is not read under this name; copy it to {path.with_name('transforms.json')}.")
+        suffixes = " ".join(sorted(VIDEO_SUFFIXES))
+        raise InputError(f"{path} is no scene; give {ACCEPTED}; videos end in {suffixes}.")
     if (path / "transforms.json").is_file():
         return open_nerfstudio(path / "transforms.json")
     if is_scannet(path):
@@ -126,7 +132,18 @@ def _open_layout(path: Path) -> SceneFiles:
 
 
 def _open_loose(path: Path) -> SceneFiles:
-    photos = _one_of_each(files_in(path) or files_in(path / "images"))
+    if others := sorted(path.glob(_OTHER_TRANSFORMS), key=lambda file: ("train" not in file.name, file.name)):
+        raise InputError(
+            f"{path} holds {others[0].name}, and poses are read from transforms.json only; copy it to that name, or "
+            "move it away to have poses found."
+        )
+    photos, more = _one_of_each(files_in(path)), _one_of_each(files_in(path / "images"))
+    if photos and more:
+        raise InputError(
+            f"{path} holds photos ({len(photos)}), and so does its folder images/ ({len(more)}); give {path / 'images'}"
+            " to use the latter, or move that folder away."
+        )
+    photos = photos or more
     recordings = files_in(path, VIDEO_SUFFIXES | {".sens"})
     if photos:
         folder, stems = photos[0].parent, {photo.stem for photo in photos}
@@ -150,7 +167,13 @@ def _open_loose(path: Path) -> SceneFiles:
 
 
 def _what_to_give(path: Path) -> str:
-    """What to give in the place of a folder without a photo: its only folder that has some, or any capture."""
+    """What to give in the place of a folder without a photo: its only folder that is a capture, or has some photos, or
+    any capture."""
+    captures = [
+        folder for folder in sorted(path.glob("*/")) if is_colmap(folder) or (folder / "transforms.json").is_file()
+    ]
+    if len(captures) == 1:
+        return f"its folder {captures[0].name}/ is a capture with poses, so give that"
     within = [(folder, photos) for folder in sorted(path.glob("*/")) if (photos := files_in(folder))]
     if len(within) == 1:
         folder, photos = within[0]
@@ -186,7 +209,20 @@ def _check_exist(files: Sequence[Path]) -> None:
             raise InputError(
                 f"{file} links to {file.readlink()}, which is no file; put it there or take the link away."
             )
-        raise InputError(f"{file}, which the scene lists, does not exist; put it there or drop the view.")
+        alike = _alike(file, listings[file.parent])
+        there = f"; {alike} lies there, which is spelt differently: rename it" if alike else ""
+        raise InputError(f"{file}, which the scene lists, does not exist{there or '; put it there or drop the view'}.")
+
+
+def _alike(file: Path, names: Iterable[str]) -> str | None:
+    """A name that differs from a file's in capitals, in how accents are stored, or else in the ending only."""
+
+    def plain(name: str) -> str:
+        return unicodedata.normalize("NFC", name).casefold()
+
+    known = [name for name in sorted(names) if Path(name).suffix.lower() in PHOTO_SUFFIXES]
+    same = [name for name in known if plain(name) == plain(file.name)]
+    return next(iter([*same, *(name for name in known if plain(Path(name).stem) == plain(file.stem))]), None)
 
 
 def _names_of_files(folder: Path) -> set[str]:

@@ -8,7 +8,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
@@ -24,7 +24,9 @@ PNM_SUFFIXES = frozenset({".pgm", ".ppm", ".pnm"})
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}) | HEIC_SUFFIXES | PNM_SUFFIXES
 UNREAD_SUFFIXES = frozenset({".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raw"})
 """Photos of cameras and phones that are not read."""
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
+VIDEO_SUFFIXES = frozenset(
+    {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts", ".3gp"}
+)
 
 Pose = tuple[float, ...]
 """World-to-camera, 16 numbers row by row (plain numbers, so that a step's key can hold it)."""
@@ -115,6 +117,14 @@ class SceneFiles:
     def place(self) -> Path:
         """What its runs are recorded under."""
         return self.opened or self.root
+
+    def files(self) -> Iterator[Path]:
+        """Where it lies, and all files of it that a run may read; some more than once."""
+        for value in vars(self).values():
+            for one in value if isinstance(value, tuple) else (value,):
+                place = one.path if isinstance(one, Hints) else one
+                if isinstance(place, Path):
+                    yield place
 
     @property
     def has_masks(self) -> bool:
@@ -224,7 +234,7 @@ def read_text(path: Path) -> str:
     Raises InputError when it is absent or no text.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # editors on Windows put a mark in front
     except FileNotFoundError as error:
         raise InputError(f"{path} is missing; the capture needs it.") from error
     except (UnicodeDecodeError, OSError) as error:

@@ -27,7 +27,7 @@ from ss_flow.tasks.geometry.images import encode_png
 RUN_FILE = "run.json"
 OWN_FILES = {RUN_FILE, "report.html", "instances.json", "descriptors.npz", "descriptors.png"}
 OWN_FILES |= {"scene.ply", "scene_labeled.ply", "cloud_labeled.ply"}
-OWN_FOLDERS = {"instances", "masks", "masks_split"}
+OWN_FOLDERS = {"instances", "masks", "masks_split", "undistorted"}
 """What a result consists of; other files beside these are the user's."""
 GRACE_SECONDS = 3600.0
 """For so long after its last change an unfinished folder counts as being filled, where no lock tells."""

@@ -85,6 +85,18 @@ def test_the_demo_leaves_a_scene_folder_of_something_else_alone(tmp_path):
     assert (tmp_path / "demo/scene/holiday.jpg").read_text() == "mine"
 
 
+def test_another_room_does_not_take_away_what_a_user_put_beside_the_photos(tmp_path):
+    room = ["--objects", "1", "--views", "3", "--until", "cameras", "--cache", tmp_path / "store"]
+    assert ss_flow("demo", "--out", tmp_path / "demo", *room).code == 0
+    hints = tmp_path / "demo/scene/my_hints.json"
+    hints.write_text("{}")
+    other = ss_flow("demo", "--out", tmp_path / "demo", *room, "--seed", "1")
+    assert other.code == 2 and "scene holds my_hints.json, which is no part of the room; move it away" in other.err
+    assert hints.is_file() and (tmp_path / "demo/scene/recipe.json").is_file()
+    hints.unlink()
+    assert ss_flow("demo", "--out", tmp_path / "demo", *room, "--seed", "1").code == 0
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [

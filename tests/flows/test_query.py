@@ -113,6 +113,8 @@ def test_the_folder_of_an_answer_shows_what_matches_in_every_photo_and_in_space(
     answer = ss_flow("query", tiny.out, "not purple", "--out", out, "--json", "--cache", tiny.store)
     assert answer.code == 0, answer.err
     document = json.loads((out / "answer.json").read_text())
+    written = document.pop("files")
+    assert written["answer.ply"] == (out / "answer.ply").stat().st_size
     assert document == answer.document()
     matched = [row["id"] for row in document["instances"] if row["matched"]]
     scene, own = (read_gaussians(f) for f in (tiny.out / "scene_labeled.ply", out / "answer.ply"))

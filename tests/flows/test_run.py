@@ -186,6 +186,9 @@ def test_views_kept_back_are_measured_and_the_photo_whose_colours_the_scene_has_
 
 def test_a_new_result_takes_the_place_of_the_old_one_whole(warm):
     (warm.out / "instances/0099.ply").write_text("of an older run")
+    document = json.loads((warm.out / "run.json").read_text())
+    document["files"]["instances/0099.ply"] = 15
+    (warm.out / "run.json").write_text(json.dumps(document))
     called = run_tiny(warm.scene, warm.store, "--set", "merge.global_iterations=5", out=warm.out)
     assert called.code == 0
     assert not (warm.out / "instances/0099.ply").exists()

@@ -1,9 +1,11 @@
 """Every kind of bad capture is refused with one sentence that names what is wrong."""
 
 import json
+import re
 import shutil
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import capture_folders as made
 import cv2
@@ -99,10 +101,40 @@ def folder_of_two_folders_of_photos(root):
     return root
 
 
-@case("notes.txt", "is no scene")
+@case("scene", "its folder dense/ is a capture with poses, so give that.")
+def folder_of_a_workspace_among_others(root):
+    made.colmap(root / "dense")
+    made.photos(root / "walk")
+    return root
+
+
+@case("scene", "holds photos (3), and so does its folder images/ (3); give ")
+def photos_here_and_there(root):
+    made.photos(root / "images")
+    return made.photos(root)
+
+
+@case("transforms_train.json", "poses are read from transforms.json only; copy it to that name, or move it away")
+def transforms_under_another_name(root):
+    (made.nerfstudio(root) / "transforms.json").rename(root / "transforms_train.json")
+    return root
+
+
+@case("transforms_train.json", "is not read under this name; copy it to ")
+def transforms_named_by_another_name(root):
+    return transforms_under_another_name(root) / "transforms_train.json"
+
+
+@case("notes.txt", "is no scene; give ")
 def file_of_another_kind(root):
     (root / "notes.txt").write_text("hello")
     return root / "notes.txt"
+
+
+@case("walk.wmv", "videos end in .3gp .avi .m2ts ")
+def video_of_another_ending(root):
+    (root / "walk.wmv").write_bytes(b"")
+    return root / "walk.wmv"
 
 
 @case("color", "holds no photo")
@@ -252,9 +284,37 @@ def listed_photos_missing(root):
     return root
 
 
-@case("10.png", "does not exist")
+@case("images/0000, also with .png, .jpg or .jpeg at its end", "none of them exists; the first is looked for at ")
+def listed_photos_without_an_ending_missing(root):
+    edit_json(made.nerfstudio(root), lambda d: [f.update(file_path="images\\0000") for f in d["frames"]])
+    return root
+
+
+@case("10.png", "does not exist; put it there or drop the view.")
 def listed_depth_missing(root):
     (made.nerfstudio(root) / "depth" / "10.png").unlink()
+    return root
+
+
+@case("10.png", "does not exist; 10.PNG lies there, which is spelt differently: rename it.")
+def listed_depth_in_capitals(root):
+    place = made.nerfstudio(root) / "depth"
+    (place / "10.png").rename(place / "10.PNG")
+    return root
+
+
+@case("10.png", "does not exist; 10.tif lies there, which is spelt differently: rename it.")
+def listed_depth_of_another_ending(root):
+    place = made.nerfstudio(root) / "depth"
+    (place / "10.png").rename(place / "10.tif")
+    return root
+
+
+@case("K\u00fcche.png", "does not exist; Ku\u0308che.png lies there, which is spelt differently: rename it.")
+def listed_depth_with_its_accent_apart(root):
+    place = made.nerfstudio(root) / "depth"
+    (place / "10.png").rename(place / "Ku\u0308che.png")
+    edit_json(root, lambda d: d["frames"][1].update(depth_file_path="depth/K\u00fcche.png"))
     return root
 
 
@@ -414,6 +474,12 @@ def video_that_is_none(root):
     return root / "walk.mp4"
 
 
+@case("walk.mp4", "it is cut short or damaged, or holds no pictures; copy it again.")
+def video_of_no_bytes(root):
+    (root / "walk.mp4").write_bytes(b"")
+    return root / "walk.mp4"
+
+
 @case("images.bin", "ends too early")
 def colmap_images_cut(root):
     cut(made.colmap(root) / "sparse" / "1" / "images.bin")
@@ -548,6 +614,28 @@ def test_the_captures_that_the_cases_spoil_are_sound(make, tmp_path):
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("file_path", value) for value in (3, None, "", ["a"])),
+        *((key, value) for key in ("depth_file_path", "mask_path") for value in (5, True, False, [])),
+    ],
+)
+def test_a_name_of_a_file_that_is_none_is_refused(key, value, tmp_path):
+    edit_json(made.nerfstudio(tmp_path), lambda d: d["frames"][1].update({key: value}))
+    says = re.escape(f"transforms.json has `{key}` {value!r} in frame 1; the name of a file is expected.")
+    with pytest.raises(InputError, match=says):
+        open_scene(tmp_path)
+
+
+def test_a_video_without_a_frame_is_said_to_be_of_a_codec_that_is_not_read(tmp_path, monkeypatch):
+    video = made.video(tmp_path / "my walk.avi", count=2)
+    whole = SimpleNamespace(isOpened=lambda: True, get=lambda what: 48, grab=lambda: False, release=lambda: None)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda file: whole)
+    with pytest.raises(InputError, match=r"such as AV1; convert it to H.264 \(ffmpeg -i 'my walk.avi' -c:v libx264"):
+        video_frames(video=ref(video))
+
+
 def test_an_infinite_pose_is_refused_without_a_warning_before(tmp_path):
     edit_json(made.nerfstudio(tmp_path), lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(3, np.inf))
     with pytest.raises(InputError, match=r"transforms\.json for images/10\.png holds NaN or infinite numbers"):

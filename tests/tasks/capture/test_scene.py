@@ -99,6 +99,33 @@ def test_nerfstudio_without_depth_is_not_metric_and_may_be_named_by_its_file(tmp
     assert scene.depths is None and not scene.metric
 
 
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".JPEG"])
+def test_nerfstudio_names_may_lack_their_ending_and_have_the_backslashes_of_windows(ending, tmp_path):
+    whole = open_scene(made.nerfstudio(tmp_path))
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in document["frames"]:
+        file = tmp_path / frame["file_path"]
+        file.rename(file.with_suffix(ending))
+        frame |= {"file_path": f".\\images\\{file.stem}", "depth_file_path": f"depth\\{file.name}", "mask_path": ""}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    scene = open_scene(tmp_path)
+    assert (scene.names, scene.depths, scene.poses) == (whole.names, whole.depths, whole.poses)
+    assert [photo.suffix for photo in scene.photos] == [ending] * 3
+    (tmp_path / "images/10").with_suffix(ending).unlink()
+    assert open_scene(tmp_path).skipped == ("10",)
+
+
+@pytest.mark.parametrize("layout", ["nerfstudio", "tum", "colmap"])
+def test_the_mark_that_windows_puts_in_front_of_a_text_is_no_part_of_it(layout, tmp_path):
+    more = {"binary": False} if layout == "colmap" else {}
+    scene = open_scene(getattr(made, layout)(tmp_path, **more))
+    texts = [file for ending in ("*.txt", "*.json") for file in tmp_path.rglob(ending)]
+    assert texts
+    for file in texts:
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert open_scene(tmp_path) == scene
+
+
 @pytest.mark.parametrize("binary", [True, False])
 def test_the_largest_colmap_model_is_taken(tmp_path, binary):
     scene = open_scene(made.colmap(tmp_path, binary))
@@ -198,7 +225,7 @@ def test_a_video_is_known_by_its_name_alone(tmp_path):
     (tmp_path / "walk.MP4").write_bytes(b"")
     assert open_scene(tmp_path / "walk.MP4").kind == "video"
     assert open_scene(tmp_path).recording == tmp_path / "walk.MP4"
-    for name in ("walk.mpg", "walk.mpeg"):
+    for name in ("walk.mpg", "walk.mpeg", "walk.MTS", "walk.m2ts", "walk.ts", "walk.3gp"):
         (tmp_path / name).write_bytes(b"")
         assert open_scene(tmp_path / name).kind == "video"
 
