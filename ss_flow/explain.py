@@ -10,6 +10,8 @@ from typing import Any
 from ss_flow.cache.canonical import digest
 from ss_flow.keys import Components
 
+COMPARED = 10
+"""With how many earlier calls of the same label a call is compared."""
 SHOWN_CHARACTERS = 60
 SHOWN_BEFORE = 10
 SHOWN_ITEMS = 3

@@ -52,6 +52,12 @@ class Run:
     def scene(self) -> str:
         return str(self.header["scene"])
 
+    @property
+    def place(self) -> tuple[int, float]:
+        """In the order of all runs, later ones greater. Clocks are wrong at times, and differ, so a number comes first;
+        a run of an older version has none."""
+        return int(self.header.get("number", 0)), float(self.header["started"])
+
     def events(self) -> Iterator[dict[str, Any]]:
         """What happened, in order; a line that is cut (the last one of a killed run) or damaged is left out."""
         try:
@@ -118,7 +124,7 @@ def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def start_run(runs: Path, header: dict[str, Any]) -> Run:
-    """Open a run: its folder, with what was asked. header: with "number", its place in the order (`next_number`)."""
+    """Open a run: its folder, with what was asked. header: with its "number" (`next_number`)."""
     name = "".join(c if c.isalnum() else "-" for c in Path(header["scene"]).name)
     name = name.encode()[:NAME_BYTES].decode(errors="ignore")  # never in the middle of a character
     folder = runs / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}-{uuid.uuid4().hex[:6]}"
@@ -129,21 +135,22 @@ def start_run(runs: Path, header: dict[str, Any]) -> Run:
 
 
 def next_number(runs: Path) -> int:
-    """The number of a run that starts now. Clocks are wrong at times, and differ: by it, later runs come later."""
-    return max((int(run.header.get("number", 0)) for run in latest_runs(runs)), default=0) + 1
+    """The number of a run that starts now: one more than the highest."""
+    latest = next(latest_runs(runs), None)
+    return latest.place[0] + 1 if latest else 1
 
 
 def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
     """Runs, the latest first; of one scene (a resolved path), or of all. A record that says no scene is passed over."""
-    found: list[tuple[int, float, Run]] = []
+    found = []
     for file in runs.glob("*/run.json"):
         try:
-            header = json.loads(file.read_text())
-            if header["scene"] == scene or scene is None:
-                found.append((int(header.get("number", 0)), float(header["started"]), Run(file.parent, header)))
+            run = Run(file.parent, json.loads(file.read_text()))
+            if scene in (None, run.header["scene"]):
+                found.append((run.place, run))
         except (*ABSENT, ValueError, KeyError, TypeError, OverflowError):  # collected just now, or damaged
             continue
-    yield from (run for *_, run in sorted(found, key=lambda one: one[:2], reverse=True))
+    yield from (run for _, run in sorted(found, key=lambda one: one[0], reverse=True))
 
 
 class PreviousKeys:
@@ -153,9 +160,9 @@ class PreviousKeys:
     survives an interrupted run. Read when first asked: most runs find everything.
     """
 
-    def __init__(self, runs: Path, scene: str, before: float = float("inf")) -> None:
-        """before: only runs that started earlier, seconds since 1970."""
-        earlier = (run for run in latest_runs(runs, scene) if run.header["started"] < before)
+    def __init__(self, runs: Path, scene: str, before: Run | None = None) -> None:
+        """before: only runs that started earlier."""
+        earlier = (run for run in latest_runs(runs, scene) if before is None or run.place < before.place)
         self._latest = list(itertools.islice(earlier, RUNS_BACK))
 
     def __call__(self, label: str) -> Sequence[str]:

@@ -24,7 +24,7 @@ from ss_flow.events import Reporter
 from ss_flow.execute import Invocation, reference_to
 from ss_flow.executors import Executor
 from ss_flow.executors.worker import WorkerDied
-from ss_flow.explain import changed_items, first_difference, nearest
+from ss_flow.explain import COMPARED, changed_items, first_difference, nearest
 from ss_flow.graph import Call, Flow, Node, Stored
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.kept_closures import kept_closure
@@ -33,8 +33,6 @@ from ss_flow.resolution import Failure, NotRun, Resolution
 from ss_flow.task import Resources
 
 POLL_SECONDS = 0.2
-COMPARED = 10
-"""For `why`: with how many earlier calls of the same label a call is compared."""
 OUT_OF_MEMORY = (WorkerDied, MemoryError)
 """A call that ends like this is tried once more, with nothing beside it: most likely memory ran out."""
 

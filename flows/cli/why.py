@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
-from ss_flow.explain import first_difference, nearest
+from ss_flow.explain import COMPARED, first_difference, nearest
 from ss_flow.flows.cli.context import PositionalPath, StoreOptions, console
 from ss_flow.flows.cli.inspect import named, runs_to_ask
 from ss_flow.keys import Components
@@ -19,8 +19,6 @@ from ss_flow.runs import DONE, PreviousKeys, Run
 from ss_flow.sweep import scene_of
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
-_COMPARED = 10
-"""How many of the calls of one label a found result is compared with."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class Reasons:
 
     def __init__(self, store: Store, run: Run) -> None:
         self._store = store
-        self._known = PreviousKeys(store.runs, scene_of(run.header), before=run.header["started"])
+        self._known = PreviousKeys(store.runs, scene_of(run.header), before=run)
 
     def __call__(self, node: dict[str, Any]) -> str:
         if "why" in node or node["event"] not in DONE:
@@ -84,7 +82,7 @@ class Reasons:
         known = self._known(node["label"])
         if not known or node["key"] in known:
             return ""
-        among = [record for key in known[:_COMPARED] if (record := self._parts(key)) is not None]
+        among = [record for key in known[:COMPARED] if (record := self._parts(key)) is not None]
         now = self._parts(node["key"])
         if not among or now is None:
             return "what changed is not known: a record is no longer in the store"
