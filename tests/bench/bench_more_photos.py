@@ -1,6 +1,6 @@
 """What two photos more cost: the share of Splat's nodes that are found again when a capture of fifty grows to 52.
 
-    python tests/bench/bench_more_photos.py
+    python tests/bench/bench_more_photos.py [--objects 20] [--views 52] [--width 192] [--left-out 20 21]
 
 A generated room is run without two of its photos, then with them, on one store, with true masks and trainings of a few
 steps: what is counted is which nodes run, not how long they take.
@@ -34,9 +34,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--objects", type=int, default=20)
     parser.add_argument("--views", type=int, default=52)
+    parser.add_argument("--width", type=int, default=192)
     parser.add_argument("--left-out", type=int, nargs="+", default=[20, 21], help="photos that come later")
     options = parser.parse_args()
-    room = generate(RoomParams(objects=options.objects, views=options.views, width=192, height=144, held_out=0))
+    size = {"width": options.width, "height": options.width * 3 // 4}
+    room = generate(RoomParams(objects=options.objects, views=options.views, **size, held_out=0))
     with tempfile.TemporaryDirectory() as temporary:
         few, all_ = Path(temporary, "few"), Path(temporary, "all")
         for folder in (few, all_):
