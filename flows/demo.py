@@ -23,7 +23,7 @@ from ss_flow.resolution import Failure
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import UInt8
 from ss_flow.tasks.deliver.output import replacing
-from ss_flow.tasks.deliver.places import Written, replacing_own, sizes
+from ss_flow.tasks.deliver.places import Written, others, sizes
 
 RECIPE = "recipe.json"
 SCENE = Written(RECIPE, "the room", listing="names")
@@ -118,8 +118,9 @@ def _placed(
         there = isinstance(known, dict) and all(known.get(part) == value for part, value in recipe.items())
         if there or engine["dry"]:
             return
-        listed = isinstance(known, dict) and SCENE.listing in known
-        with replacing_own(folder, SCENE) if listed else replacing(folder) as filling:
+        if isinstance(known, dict) and SCENE.listing in known and (beside := others(folder, SCENE)):
+            raise InputError(f"{folder} holds {beside[0]}, which is no part of the room; move it away.")
+        with replacing(folder) as filling:
             for digest in digests:
                 _write(store.get(digest), filling)
             recipe[SCENE.listing] = list(sizes(filling))

@@ -23,7 +23,7 @@ from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.deliver.export.coco import coco
 from ss_flow.tasks.deliver.output import check_named
-from ss_flow.tasks.deliver.places import Written, check_outside, check_replaceable, note_beside, replacing_own
+from ss_flow.tasks.deliver.places import Written, check_outside, check_replaceable, replacing_own
 from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorted
 from ss_flow.tasks.geometry.images import suffix_of
 
@@ -165,7 +165,6 @@ class Export:
         return files
 
     def _tell(self, out: Path, report: Report | None, files: list[dict[str, Any]]) -> int:
-        note_beside(out)
         failed = report.failures if report else []
         status = "degraded" if failed else "ok"
         failures = [{"label": f.label, "error": f"{type(f.error).__name__}: {f.error}"} for f in failed]

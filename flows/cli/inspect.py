@@ -23,7 +23,6 @@ from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.describe import told
 from ss_flow.runs import DONE, Run, latest_runs, settled
 from ss_flow.tasks.deliver.output import check_named
-from ss_flow.tasks.deliver.places import note_beside
 from ss_flow.telemetry import trace
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -47,7 +46,6 @@ class Status:
         if self.otlp:
             check_named(self.otlp, "--otlp")
             write_atomically(self.otlp, json.dumps(trace(run)) + "\n")
-            note_beside(self.otlp)
         events = list(run.events())
         steps = _steps(events)
         last = next((e for e in reversed(events) if e["event"] in ("run ended", "restarted")), None)
@@ -221,7 +219,6 @@ class CacheShow:
             from ss_flow.flows.cli.drawing import draw_results
 
             draw_results(store, run or latest_run(store, self.scene), values, self.view, self.png)
-            note_beside(self.png)
         out = console(json=False)
         for line in told(values, digests, store, run, asked):
             out.print(escape(line))

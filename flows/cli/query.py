@@ -29,7 +29,7 @@ from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.query import NEEDED, described_parts
 from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
-from ss_flow.tasks.deliver.places import Written, check_replaceable, note_beside, replacing_own, sizes
+from ss_flow.tasks.deliver.places import Written, check_replaceable, replacing_own, sizes
 from ss_flow.tasks.models.colour_words import ColourWords, words_ignored
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
@@ -214,7 +214,6 @@ def write_answer(
             (filling / "masks" / photo.name).write_bytes(encode_png(np.uint8(255) * mask).tobytes())
         listed = document | {"files": sizes(filling)}
         (filling / ANSWER_FILE).write_text(json.dumps(listed, indent=1), encoding="utf-8")
-    note_beside(folder)
 
 
 def _on_photos(run: FinishedRun, parts: Sequence[PartMasks], names: Sequence[str]) -> Iterator[Bool]:

@@ -22,7 +22,7 @@ from ss_flow.graph import stored
 from ss_flow.tasks.capture.layout_nerfstudio import transforms_document
 from ss_flow.tasks.deliver.output import check_named
 from ss_flow.tasks.deliver.pictures import What
-from ss_flow.tasks.deliver.places import Written, check_outside, check_replaceable, note_beside, replacing_own
+from ss_flow.tasks.deliver.places import Written, check_outside, check_replaceable, replacing_own
 
 CAMERAS_FILE = "transforms.json"
 MANIFEST = "render.json"
@@ -95,7 +95,6 @@ class Render:
         with display(console(json=self.json)) as screen:
             request = Request(build, run.document["scene"], reporter=screen, done=done)
             run_flows([request], run.store, jobs=self.jobs, recorded=False)
-        note_beside(out)
         if self.json:
             print(json.dumps({"status": "ok", "what": self.what, "out": str(out), "frames": written}))
         else:

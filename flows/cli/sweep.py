@@ -43,7 +43,7 @@ from ss_flow.sweep import MOST_ROWS, Row, grid, in_words, recorded_as, rows_of, 
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.output import check_writable
-from ss_flow.tasks.deliver.places import check_outside, note_beside
+from ss_flow.tasks.deliver.places import check_outside
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,6 @@ class Sweep:
         if options.target and not names_of([options.target]):
             tell.print(escape(f"--until {options.until} gives no figures; these steps do: {', '.join(NAMES)}"))
         written = write_files(out, documents, zipped=self.zipped)
-        for file in written:
-            note_beside(out / file)
         tell.print(escape(f"see {out}: {', '.join(written)}"))
         statuses = {document["status"] for document in documents}
         return STATUS_EXIT[statuses.pop()] if len(statuses) == 1 else STATUS_EXIT["degraded"]

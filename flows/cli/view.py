@@ -26,7 +26,6 @@ from ss_flow.flows.cli.context import (
 from ss_flow.flows.cli.query import encoder_name, query_params
 from ss_flow.flows.results import FinishedRun, read_run
 from ss_flow.tasks.deliver.output import check_named
-from ss_flow.tasks.deliver.places import note_beside
 
 if TYPE_CHECKING:
     from ss_flow.flows.view.search import Search
@@ -104,7 +103,6 @@ class View:
             around = replace(around, share=min(1.0, self.draw_at_most / max(count, 1)))
         if self.html:
             write_artifact_page(self.html, self.what, digests, store, around, run, asked)
-            note_beside(self.html)
             out.print(escape(str(self.html)))
         elif placed(values, around) and find_spec("viser"):
             from ss_flow.flows.view.server import start
@@ -127,13 +125,11 @@ class View:
             from ss_flow.flows.view import rerun_file
 
             rerun_file.write_recording(self.rerun, open_run(folder, self.store, rerun_file.SHOWN))
-            note_beside(self.rerun)
             out.print(escape(f"{self.rerun} ({self.rerun.stat().st_size / 1e6:.1f} MB)"))
         if self.html:
             from ss_flow.flows.view import page
 
             page.write_page(self.html, open_run(folder, self.store, page.SHOWN))
-            note_beside(self.html)
             out.print(escape(f"{self.html} ({self.html.stat().st_size / 1e6:.1f} MB)"))
         return 0
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ss_flow.cache.files import hidden
 from ss_flow.errors import InputError
 from ss_flow.flows.results import FinishedRun
 from ss_flow.flows.view.drawing import agreement_colors, label_colors, spacing_of
@@ -37,7 +38,7 @@ def write_recording(file: Path, run: FinishedRun) -> None:
         raise InputError("a recording needs a package that is not installed; run `pip install 'ss-flow[rerun]'`.")
     import rerun as rr
 
-    filling = file.with_name(f".{file.name}.part")
+    filling = file.with_name(f"{hidden(file.name)}.part")
     stream = rr.RecordingStream("ss-flow")
     try:
         stream.save(filling)

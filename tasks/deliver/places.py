@@ -1,11 +1,11 @@
-"""What a command may replace: what an earlier one wrote, and nothing that a user put there."""
+"""What a command may replace: what an earlier one wrote. What else lies there stays."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
+import shutil
 import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -13,13 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ss_flow.cache.files import write_atomically
 from ss_flow.cache.location import is_url
 from ss_flow.errors import InputError
 from ss_flow.tasks.deliver.output import OWN_FILES, OWN_FOLDERS, RUN_FILE, check_place, replacing
 
-BESIDE_FILE = "beside.json"
-"""Name -> bytes of what commands wrote into a result's folder after the run: pages, films, exports."""
 _LITTER = re.compile(r"\.DS_Store|Thumbs\.db|desktop\.ini|\._.*|\..+\.[0-9a-f]{32}")
 """What file managers leave in any folder, and what a command leaves that is killed while it writes a file."""
 
@@ -42,7 +39,7 @@ RESULT = Written(RUN_FILE, "an earlier result")
 
 
 def check_replaceable(folder: Path, kind: Written, store: str | Path, inputs: Iterable[Path] = ()) -> None:
-    """Raises InputError unless a folder of this kind can be written here, and nothing else is lost by that.
+    """Raises InputError unless a folder of this kind can be written here, and nothing that is in use is lost by that.
 
     store: its folder, or its URL. inputs: folders and files that the command reads.
     """
@@ -56,7 +53,6 @@ def check_replaceable(folder: Path, kind: Written, store: str | Path, inputs: It
     for read in inputs:
         if _lies_in(os.path.realpath(read), place):
             raise InputError(f"{folder} holds {read}, which is read here; name another folder with --out.")
-    _check_own(folder, kind)
 
 
 def check_outside(folder: Path, store: str | Path) -> None:
@@ -67,22 +63,23 @@ def check_outside(folder: Path, store: str | Path) -> None:
 
 @contextmanager
 def replacing_own(folder: Path, kind: Written) -> Iterator[Path]:
-    """As `replacing`, but raises InputError where the folder by then holds what no command wrote; all of it stays."""
+    """As `replacing`, but what no command wrote in the folder is there afterwards, too, as another name of the file.
+
+    Raises InputError where something of the same name was filled in; all of the folder stays as it was then.
+    """
     with replacing(folder) as filling:
         yield filling
-        _check_own(folder, kind)
-
-
-def note_beside(written: Path) -> None:
-    """Where a file or a folder lies in a result's, note that a command wrote it, so that a run may replace it."""
-    place = Path(os.path.realpath(written))
-    result = next((folder for folder in place.parents if (folder / RUN_FILE).is_file()), None)
-    if result is None:
-        return
-    files = [place / name for name in _files(place)] if place.is_dir() else [place]
-    noted = {file.relative_to(result).as_posix(): file.stat().st_size for file in files}
-    with contextlib.suppress(OSError):  # then it counts as the user's
-        write_atomically(result / BESIDE_FILE, json.dumps(_read(result / BESIDE_FILE) | noted, indent=1))
+        for name in others(folder, kind):
+            if os.path.lexists(filling / name):
+                raise InputError(
+                    f"{folder} holds {name}, which no command wrote and a new file would replace; move it away, or "
+                    "name another folder with --out."
+                )
+            (filling / name).parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(folder / name, filling / name, follow_symlinks=False)
+            except OSError:  # a disk that knows no second names
+                shutil.copy2(folder / name, filling / name, follow_symlinks=False)
 
 
 def sizes(folder: Path) -> dict[str, int]:
@@ -90,22 +87,16 @@ def sizes(folder: Path) -> dict[str, int]:
     return {name: (folder / name).stat().st_size for name in _files(folder)}
 
 
-def _check_own(folder: Path, kind: Written) -> None:
-    """Raises InputError where a folder holds what no command wrote."""
-    listed, noted = _read(folder / kind.mark).get(kind.listing), _read(folder / BESIDE_FILE)
-    own = {kind.mark, BESIDE_FILE, *kind.unlisted, *map(_name, listed or ())}
+def others(folder: Path, kind: Written) -> list[str]:
+    """The files in a folder that no command wrote as part of it, and links, by their names from there, with "/"."""
+    listed = _read(folder / kind.mark).get(kind.listing)
+    own = {kind.mark, *kind.unlisted, *map(_name, listed or ())}
     if listed is None:  # by an older version
         own |= {name for name in _files(folder) if name in OWN_FILES or name.partition("/")[0] in OWN_FOLDERS}
     own = set(map(_spelt, own))
-    for name in _files(folder):
-        known = _spelt(name) in own or _LITTER.fullmatch(name.rpartition("/")[2])
-        if not known and noted.get(name) != (folder / name).lstat().st_size:
-            top = f"{name.partition('/')[0]}/"
-            whole = top in name and not any(other.startswith(top) for other in own | noted.keys())
-            raise InputError(
-                f"{folder} holds {top if whole else name}, which is no part of {kind.what}; move it away, or name "
-                "another folder with --out."
-            )
+    return [
+        name for name in _files(folder) if _spelt(name) not in own and not _LITTER.fullmatch(name.rpartition("/")[2])
+    ]
 
 
 def _name(entry: Any) -> str:

@@ -1,4 +1,4 @@
-"""What a command may replace: an earlier one's files, and nothing that a user put beside them."""
+"""What a command may replace: an earlier one's files; what a user put beside them stays."""
 
 from __future__ import annotations
 
@@ -9,15 +9,7 @@ from pathlib import Path
 import pytest
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.deliver.places import (
-    BESIDE_FILE,
-    RESULT,
-    Written,
-    check_outside,
-    check_replaceable,
-    note_beside,
-    replacing_own,
-)
+from ss_flow.tasks.deliver.places import RESULT, Written, check_outside, check_replaceable, others, replacing_own
 
 STORE = "s3://bucket/store"
 """A store that lies in no folder."""
@@ -40,52 +32,58 @@ def put(file: Path) -> Path:
 
 
 @pytest.mark.parametrize("listed", [True, False])
-def test_an_earlier_result_and_what_file_managers_left_in_it_may_be_replaced(listed, tmp_path):
+def test_an_earlier_result_and_what_file_managers_left_in_it_are_nobodys(listed, tmp_path):
     own = ("scene.ply", "masks/0001.png", "masks_split/0001.png", "instances/0001.ply", "undistorted/sparse/0/x.bin")
     folder = result(tmp_path / "out", *own, listed=listed)
     for litter in (".DS_Store", "masks/Thumbs.db", "desktop.ini", "._scene.ply", f".run.json.{'0a' * 16}"):
         put(folder / litter)
     check_replaceable(folder, RESULT, STORE)
+    assert others(folder, RESULT) == []
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    "name",
     [
-        ("notes.txt", "notes.txt"),
-        ("photos/0001.jpg", "photos/"),
-        ("masks/mine.png", "masks/mine.png"),
-        ("descriptors.npz", "descriptors.npz"),
-        ("transforms.json", "transforms.json"),
-        (".hidden", ".hidden"),
+        "notes.txt",
+        "photos/0001.jpg",
+        "masks/mine.png",
+        "descriptors.npz",
+        "transforms.json",
+        ".hidden",
+        "other/run.json",
     ],
 )
-def test_a_result_with_what_no_run_wrote_is_refused_and_named(name, told, tmp_path):
+def test_what_no_run_wrote_is_there_after_the_result_was_replaced(name, tmp_path):
     folder = result(tmp_path / "out", "scene.ply", "masks/0001.png")
     put(folder / name)
-    with pytest.raises(InputError, match=f"out holds {told}, which is no part of an earlier result; move it away, or"):
-        check_replaceable(folder, RESULT, STORE)
+    check_replaceable(folder, RESULT, STORE)
+    with replacing_own(folder, RESULT) as filling:
+        result(filling, "scene.ply")
+    assert (folder / name).read_text() == "mine"
+    assert not (folder / "masks/0001.png").exists()
 
 
-@pytest.mark.parametrize("what", ["a folder", "nothing"])
-def test_a_link_that_a_user_made_in_a_result_is_not_lost_either(what, tmp_path):
+@pytest.mark.parametrize("linked", [True, False])
+def test_links_that_a_user_made_in_a_result_stay_links(linked, tmp_path, monkeypatch):
     folder = result(tmp_path / "out", "scene.ply")
-    (tmp_path / "a folder").mkdir()
-    (folder / "link").symlink_to(tmp_path / what)
-    with pytest.raises(InputError, match=r"out holds link,"):
-        check_replaceable(folder, RESULT, STORE)
+    for name, what in (("folder", tmp_path), ("nothing", tmp_path / "nothing")):
+        (folder / name).symlink_to(what)
+    put(folder / "notes.txt")
+    if not linked:
+        monkeypatch.setattr(os, "link", lambda *_, **__: os.readlink(tmp_path))  # fails as on a disk that has no links
+    with replacing_own(folder, RESULT) as filling:
+        result(filling, "scene.ply")
+    assert {name: os.readlink(folder / name) for name in ("folder", "nothing")} == {
+        "folder": str(tmp_path),
+        "nothing": str(tmp_path / "nothing"),
+    }
+    assert (folder / "notes.txt").read_text() == "mine"
 
 
 def test_names_that_another_disk_spells_otherwise_are_the_same(tmp_path):
     folder = result(tmp_path / "out", "masks/K\u00fcche.png")
     (folder / "masks/K\u00fcche.png").rename(folder / "masks/Ku\u0308che.png")
-    check_replaceable(folder, RESULT, STORE)
-
-
-def test_a_result_in_a_result_is_no_part_of_it(tmp_path):
-    folder = result(tmp_path / "out", "scene.ply")
-    result(folder / "other", "scene.ply")
-    with pytest.raises(InputError, match=r"out holds other/,"):
-        check_replaceable(folder, RESULT, STORE)
+    assert others(folder, RESULT) == []
 
 
 @pytest.mark.parametrize(
@@ -97,44 +95,27 @@ def test_any_form_in_which_a_mark_lists_files_is_understood(files, names, tmp_pa
     for name in names:
         put(tmp_path / "out" / name)
     (tmp_path / "out/mark.json").write_text(json.dumps({"files": files}))
-    check_replaceable(tmp_path / "out", kind, STORE)
+    assert others(tmp_path / "out", kind) == []
     put(tmp_path / "out/00001.png")
-    with pytest.raises(InputError, match=r"out holds 00001.png, which is no part of earlier pictures"):
-        check_replaceable(tmp_path / "out", kind, STORE)
+    assert others(tmp_path / "out", kind) == ["00001.png"]
 
 
-def test_what_commands_wrote_into_a_result_may_be_replaced_unless_it_was_changed(tmp_path):
+def test_a_file_that_a_new_one_would_replace_leaves_all_as_it_was(tmp_path):
     folder = result(tmp_path / "out", "scene.ply")
-    for name in ("page.html", "objects/0001.spz", "objects/export.json"):
-        put(folder / name)
-    note_beside(folder / "page.html")
-    note_beside(folder / "objects")
-    check_replaceable(folder, RESULT, STORE)
-    with (folder / "page.html").open("a") as page:
-        page.write("and my notes")
-    with pytest.raises(InputError, match=r"out holds page.html,"):
-        check_replaceable(folder, RESULT, STORE)
-
-
-def test_what_is_written_outside_of_results_is_not_noted(tmp_path):
-    note_beside(put(tmp_path / "page.html"))
-    assert os.listdir(tmp_path) == ["page.html"]
-
-
-def test_a_note_that_cannot_be_read_makes_what_it_told_of_the_users(tmp_path):
-    folder = result(tmp_path / "out", "scene.ply")
-    note_beside(put(folder / "page.html"))
-    (folder / BESIDE_FILE).write_text("{")
-    with pytest.raises(InputError, match=r"out holds page.html,"):
-        check_replaceable(folder, RESULT, STORE)
+    put(folder / "masks/0002.png")
+    told = r"out holds masks/0002.png, which no command wrote"
+    with pytest.raises(InputError, match=told), replacing_own(folder, RESULT) as filling:
+        result(filling, "scene.ply", "masks/0002.png")
+    assert (folder / "masks/0002.png").read_text() == "mine" and (folder / "scene.ply").is_file()
+    assert os.listdir(tmp_path) == ["out"]
 
 
 def test_what_a_user_puts_there_while_a_run_goes_on_stays_too(tmp_path):
     folder = result(tmp_path / "out", "scene.ply")
-    with pytest.raises(InputError, match=r"out holds notes.txt,"), replacing_own(folder, RESULT) as filling:
+    with replacing_own(folder, RESULT) as filling:
         (filling / "scene.ply").write_text("new")
         put(folder / "notes.txt")
-    assert (folder / "notes.txt").read_text() == "mine" and (folder / "scene.ply").read_text() == "x"
+    assert (folder / "notes.txt").read_text() == "mine" and (folder / "scene.ply").read_text() == "new"
 
 
 @pytest.mark.parametrize("read", ["", "masks", "masks/0001.png", "../link"])
