@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 import shutil
 import time
 import uuid
 from pathlib import Path
-
-from blake3 import blake3
 
 from ss_flow.cache.errors import StoreFailure
 
@@ -42,7 +41,7 @@ def hidden(name: str) -> str:
     """What the names begin with of things that will take the place of a file or a folder of this name."""
     whole = os.fsencode(name)
     if len(whole) > _NAME_BYTES:  # with a digest, since names may differ at their ends alone
-        name = f"{whole[: _NAME_BYTES - 9].decode(errors='ignore')}.{blake3(whole).hexdigest(4)}"
+        name = f"{whole[: _NAME_BYTES - 9].decode(errors='ignore')}.{hashlib.blake2b(whole, digest_size=4).hexdigest()}"
     return f".{name}"
 
 
