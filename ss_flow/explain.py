@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
 from typing import Any
 
 from ss_flow.cache.canonical import digest
+from ss_flow.cache.store import Store
 from ss_flow.keys import Components
 
 COMPARED = 10
@@ -15,6 +17,36 @@ COMPARED = 10
 SHOWN_CHARACTERS = 60
 SHOWN_BEFORE = 10
 SHOWN_ITEMS = 3
+
+
+def since_last(
+    known: Sequence[str],
+    now: Components,
+    closure: dict[str, str] | None,
+    store: Store,
+    items: Callable[[Components, str], str] = lambda before, name: "",
+) -> str:
+    """How a key differs from the nearest of those under which results of its label were found before: one phrase.
+
+    known: these keys. closure: that of `now`; None where it is no longer known. items: as for `first_difference`, by
+    the nearest key.
+    """
+    records = [store.action(key, whole=False) for key in known[:COMPARED]]
+    among = [record.components for record in records if record is not None]
+    if not among:
+        return "what changed is not known: the record of the last time is no longer in the store"
+    before = nearest(among, now)
+    codes: list[Any] = [{}, {}]
+    if before["code"] != now["code"]:
+        codes = [part_of(store, before["code"]), closure]
+    known_code = None if None in codes else codes[0]
+    return first_difference({**before, "code": known_code}, {**now, "code": codes[1]}, functools.partial(items, before))
+
+
+def part_of(store: Store, name: str) -> Any:
+    """What a digest in a key stands for; None where the store has lost it, or holds something else by now."""
+    part = store.part(name)
+    return part if digest(part) == name else None
 
 
 def first_difference(before: Components, now: Components, items: Callable[[str], str] = lambda name: "") -> str:

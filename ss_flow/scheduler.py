@@ -15,7 +15,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from typing import Any
 
-from ss_flow.cache.canonical import digest
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.store import Action, Store
@@ -24,7 +23,7 @@ from ss_flow.events import Reporter
 from ss_flow.execute import Invocation, reference_to
 from ss_flow.executors import Executor
 from ss_flow.executors.worker import WorkerDied
-from ss_flow.explain import COMPARED, changed_items, first_difference, nearest
+from ss_flow.explain import changed_items, part_of, since_last
 from ss_flow.graph import Call, Flow, Node, Stored
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.kept_closures import kept_closure
@@ -190,30 +189,17 @@ class Scheduler:
             return f"{'never computed' if self._dry else 'computed for the first time'} for this scene"
         if key in known:
             return "its result is no longer in the store"
-        records = [self._store.action(one, whole=False) for one in known[:COMPARED]]
-        among = [record.components for record in records if record is not None]
-        if not among:
-            return "what changed is not known: the record of the last time is no longer in the store"
-        before = nearest(among, parts)
         closure = self._keys.recipe(node.task).closure
-        code = before["code"]
-        known_code = closure if code == parts["code"] else self._part(code)
-        items = functools.partial(self._changed_items, node, before["inputs"])
-        return first_difference({**before, "code": known_code}, {**parts, "code": closure}, items)
+        return since_last(known, parts, closure, self._store, functools.partial(self._changed_items, node))
 
-    def _changed_items(self, node: Call, before: Mapping[str, str], name: str) -> str:
+    def _changed_items(self, node: Call, before: Components, name: str) -> str:
         now = self._graph.values[node.inputs[name]]
-        if not isinstance(now, tuple) or name not in before:
+        if not isinstance(now, tuple) or name not in before["inputs"]:
             return ""
-        then = self._part(before[name])
+        then = part_of(self._store, before["inputs"][name])
         if not isinstance(then, list):  # it was one artifact; or what its digest stood for is no longer known
             return ""
         return changed_items(then, now, self._graph.item_names(node.inputs[name]))
-
-    def _part(self, name: str) -> Any:
-        """What a digest in a key stands for; None where the store has lost it, or holds something else by now."""
-        part = self._store.part(name)
-        return part if digest(part) == name else None
 
     def _submit(self) -> None:
         """Hand out what fits into the tokens that are left."""

@@ -11,10 +11,9 @@ from rich.markup import escape
 
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
-from ss_flow.explain import COMPARED, first_difference, nearest
+from ss_flow.explain import part_of, since_last
 from ss_flow.flows.cli.context import PositionalPath, StoreOptions, console
 from ss_flow.flows.cli.inspect import named, runs_to_ask
-from ss_flow.keys import Components
 from ss_flow.runs import DONE, PreviousKeys, Run
 from ss_flow.sweep import scene_of
 
@@ -82,17 +81,11 @@ class Reasons:
         known = self._known(node["label"])
         if not known or node["key"] in known:
             return ""
-        among = [record for key in known[:COMPARED] if (record := self._parts(key)) is not None]
-        now = self._parts(node["key"])
-        if not among or now is None:
-            return "what changed is not known: a record is no longer in the store"
-        before = nearest(among, now)
-        codes = [{}, {}] if before["code"] == now["code"] else [self._store.part(one["code"]) for one in (before, now)]
-        return first_difference({**before, "code": None if None in codes else codes[0]}, {**now, "code": codes[1]})
-
-    def _parts(self, key: str) -> Components | None:
-        record = self._store.action(key, whole=False)
-        return None if record is None else record.components
+        record = self._store.action(node["key"], whole=False)
+        if record is None:
+            return "what changed is not known: its record is no longer in the store"
+        now = record.components
+        return since_last(known, now, part_of(self._store, now["code"]), self._store)
 
 
 def _causes(node: dict[str, Any], nodes: list[dict[str, Any]], reason_of: Reasons) -> list[str]:
