@@ -26,7 +26,7 @@ from pathlib import Path
 
 from ss_flow.cache.canonical import DIGEST
 from ss_flow.cache.errors import writing
-from ss_flow.cache.files import remove
+from ss_flow.cache.files import UNFINISHED, remove
 from ss_flow.cache.store import GRACE_SECONDS, Entry, Store
 from ss_flow.cache.survey import Survey, Tally
 
@@ -35,8 +35,6 @@ THREADS = 8
 ORPHANS = "objects of no result"
 HIDDEN = (".*", "roots/*/.*", "roots/runs/*/.*")
 """Where files are written beside those that they replace."""
-_BESIDE = re.compile(r"\..+\.[0-9a-f]{32}")
-"""What `write_atomically` calls them."""
 _CHECKPOINT = re.compile(rf"{DIGEST.pattern}\.(npz|partial)")
 
 
@@ -105,7 +103,7 @@ def collect(
             if file.stem not in living:
                 _take(file, size, others["checkpoints"], dry=dry)
         # Another process may be writing these files now, so they stay for an hour, however short the grace period.
-        for file, size in _old_files(store.root, HIDDEN, _BESIDE, now - GRACE_SECONDS):
+        for file, size in _old_files(store.root, HIDDEN, UNFINISHED, now - GRACE_SECONDS):
             _take(file, size, others["temporary files"], dry=dry)
     if not dry:
         others["temporary files"].count += store.sweep_temporaries()

@@ -14,7 +14,9 @@ from pathlib import Path
 from ss_flow.cache.errors import StoreFailure
 
 AT_WORK_SECONDS = 3600.0
-"""For so long after its last change an unfinished file counts as being written."""
+"""For so long after its last change an unfinished file, or folder, counts as being written."""
+UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}")
+"""What `write_atomically` calls files that are not yet whole."""
 _NAME_BYTES = 200
 """How much of a name goes into a hidden one: file systems allow 255 bytes in all."""
 

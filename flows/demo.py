@@ -119,7 +119,7 @@ def _placed(
         if there or engine["dry"]:
             return
         if isinstance(known, dict) and SCENE.listing in known and (beside := others(folder, SCENE)):
-            raise InputError(f"{folder} holds {beside[0]}, which is no part of the room; move it away.")
+            raise InputError(f"{folder} holds {beside[0]}, which is no part of {SCENE.what}; move it away.")
         with replacing(folder) as filling:
             for digest in digests:
                 _write(store.get(digest), filling)

@@ -97,11 +97,12 @@ def _draw(value: object, context: Context) -> UInt8:
 
 
 def _said(value: object) -> str:
-    text = f"{value:.6g}" if isinstance(value, float) else str(value)
     if isinstance(value, np.ndarray):
         short = 0 < value.size <= 8 and value.dtype.kind in "iuf"
         words = ", ".join(f"{number:.4g}" for number in value.flat) if short else statistics(value)
         text = f"{value.dtype} [{', '.join(map(str, value.shape))}]{': ' if words else ''}{words}"
+    else:
+        text = f"{value:.6g}" if isinstance(value, float) else str(value)
     return text if len(text) <= 90 else text[:89] + "…"
 
 

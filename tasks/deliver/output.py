@@ -16,7 +16,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from ss_flow.cache.files import hidden
+from ss_flow.cache.files import AT_WORK_SECONDS, hidden
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap
 from ss_flow.tasks.capture.lens import Lens
@@ -29,8 +29,6 @@ OWN_FILES = {RUN_FILE, "report.html", "instances.json", "descriptors.npz", "desc
 OWN_FILES |= {"scene.ply", "scene_labeled.ply", "cloud_labeled.ply"}
 OWN_FOLDERS = {"instances", "masks", "masks_split", "undistorted"}
 """What a result consists of; other files beside these are the user's."""
-GRACE_SECONDS = 3600.0
-"""For so long after its last change an unfinished folder counts as being filled, where no lock tells."""
 
 
 def check_place(folder: Path, mark: str = RUN_FILE, what: str = "an earlier result") -> None:
@@ -149,7 +147,7 @@ def _is_filled(filling: Path) -> bool:
     except BlockingIOError:
         return True
     except OSError:
-        return time.time() - os.fstat(handle).st_mtime < GRACE_SECONDS
+        return time.time() - os.fstat(handle).st_mtime < AT_WORK_SECONDS
     finally:
         os.close(handle)
 

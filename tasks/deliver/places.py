@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ss_flow.cache.files import UNFINISHED
 from ss_flow.cache.location import is_url
 from ss_flow.errors import InputError
 from ss_flow.tasks.deliver.output import OWN_FILES, OWN_FOLDERS, RUN_FILE, check_place, replacing
 
-_LITTER = re.compile(r"\.DS_Store|Thumbs\.db|desktop\.ini|\._.*|\..+\.[0-9a-f]{32}")
+_LITTER = re.compile(rf"\.DS_Store|Thumbs\.db|desktop\.ini|\._.*|{UNFINISHED.pattern}")
 """What file managers leave in any folder, and what a command leaves that is killed while it writes a file."""
 
 
@@ -89,14 +90,12 @@ def sizes(folder: Path) -> dict[str, int]:
 
 def others(folder: Path, kind: Written) -> list[str]:
     """The files in a folder that no command wrote as part of it, and links, by their names from there, with "/"."""
-    listed = _read(folder / kind.mark).get(kind.listing)
+    names, listed = _files(folder), _read(folder / kind.mark).get(kind.listing)
     own = {kind.mark, *kind.unlisted, *map(_name, listed or ())}
     if listed is None:  # by an older version
-        own |= {name for name in _files(folder) if name in OWN_FILES or name.partition("/")[0] in OWN_FOLDERS}
+        own |= {name for name in names if name in OWN_FILES or name.partition("/")[0] in OWN_FOLDERS}
     own = set(map(_spelt, own))
-    return [
-        name for name in _files(folder) if _spelt(name) not in own and not _LITTER.fullmatch(name.rpartition("/")[2])
-    ]
+    return [name for name in names if _spelt(name) not in own and not _LITTER.fullmatch(name.rpartition("/")[2])]
 
 
 def _name(entry: Any) -> str:
