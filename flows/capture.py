@@ -196,12 +196,18 @@ def _known_names(scene: SceneFiles) -> tuple[str, ...] | None:
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> tuple[Frame, ...]:
     if scene.kind == "video":
         assert scene.recording is not None
-        sparser = replace(
-            params.video,
-            max_frames=-(-params.video.max_frames // params.stride),
-            stride=params.video.stride * params.stride,
+        return recordings.video_frames(video=reference(scene.recording), params=params.video.every(params.stride))
+    if scene.kind == "stray":
+        assert scene.recording is not None and scene.lenses is not None
+        return recordings.recorded_frames(
+            recording=reference(scene.recording),
+            names=scene.names,
+            entries=scene.entries,
+            lenses=scene.lenses,
+            valid=all_of(reference, scene.valid),
+            skipped=scene.skipped,
+            params=params.ingest,
         )
-        return recordings.video_frames(video=reference(scene.recording), params=sparser)
     if scene.kind == "sens":
         assert scene.recording is not None
         return recordings.sens_frames(
@@ -217,5 +223,6 @@ def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> t
         valid=all_of(reference, scene.valid),
         lenses=scene.lenses,
         skipped=scene.skipped,
+        black_borders=scene.black_borders,
         params=params.ingest,
     )

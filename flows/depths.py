@@ -50,6 +50,7 @@ def measured(scene: SceneFiles, reference: Reference, frames: tuple[Frame, ...])
         frames,
         names=scene.names,
         files=all_of(reference, scene.depths),
+        confidences=all_of(reference, scene.confidences),
         scale=scene.depth_scale,
         metric=scene.metric,
         lenses=scene.lenses,

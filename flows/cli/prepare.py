@@ -26,6 +26,7 @@ from ss_flow.flows.split import Networks
 from ss_flow.flows.split_splat import LEADS_TO, LEADS_TO_CAMERAS, split_splat
 from ss_flow.graph import Call, Flow, Gather, Node, gather, nodes_by_step
 from ss_flow.resolution import Failure
+from ss_flow.tasks.capture.layout_stray import steadiest
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.gaussians.rasterize import device_here
@@ -139,7 +140,11 @@ def prepare(
     text: what to search the result for, as one more step, "query".
     Raises InputError when a network cannot be used.
     """
-    scene = scene.every(params.capture.stride)
+    if scene.kind == "stray":
+        taken = params.capture.video.every(params.capture.stride)
+        scene = steadiest(scene, taken.stride, taken.max_frames)
+    else:
+        scene = scene.every(params.capture.stride)
     if params.evaluate.zero_is_void is None:
         params = replace(params, evaluate=replace(params.evaluate, zero_is_void=scene.zero_is_void))
     held_out = scene.root / "held_out"

@@ -34,8 +34,8 @@ class Run:
     """Turn a capture into instance-labelled Gaussians."""
 
     capture: Annotated[Path, tyro.conf.Positional]
-    """A folder of photos, a video, a COLMAP workspace, a nerfstudio transforms.json, a ScanNet export or .sens file, or
-    a TUM RGB-D folder."""
+    """A folder of photos, a video, a COLMAP workspace, a nerfstudio transforms.json, a ScanNet export or .sens file, a
+    TUM RGB-D folder, a room of Replica, Polycam's raw data, or a recording of Stray Scanner."""
     out: OptionalPath = None
     """The folder to write; by default ss-flow-out/NAME, the name of the folder, or of the file without its
     ending; for a transforms.json, the name of its folder."""

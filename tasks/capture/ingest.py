@@ -6,14 +6,14 @@ Masks and depth follow the frames they belong to by name, so that frames may hav
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, task
-from ss_flow.tasks.artifacts import Bool, Cameras, Frame
+from ss_flow.tasks.artifacts import Bool, Cameras, Frame, UInt8
 from ss_flow.tasks.capture.layout_colmap import read_points
 from ss_flow.tasks.capture.lens import Lens, without_distortion
 from ss_flow.tasks.capture.photo_files import Photo, Pixels, pixels_of, read_gray, read_photo
@@ -22,6 +22,8 @@ from ss_flow.tasks.geometry.images import averaged_valid, encode_png
 from ss_flow.tasks.ranges import Count, JpegQuality
 from ss_flow.tasks.words import first_of
 
+_BLACK = 8
+"""Of 255; JPEG makes black up to so bright beside a picture."""
 _UPRIGHT = {2: "flip", 3: "180", 4: "flip 180", 5: "flip 270", 6: "90", 7: "flip 90", 8: "270"}
 
 
@@ -43,6 +45,7 @@ def frames(
     valid: tuple[FileRef | None, ...] = (),
     lenses: tuple[Lens, ...] | None = None,
     skipped: tuple[str, ...] = (),
+    black_borders: bool = False,
     params: IngestParams = IngestParams(),
 ) -> tuple[Frame, ...]:
     """The photos as frames: upright, without distortion, not above `params.max_side`.
@@ -50,7 +53,8 @@ def frames(
     A photo that is all this already keeps its bytes. Where intrinsics are known, a photo is turned upright (EXIF) only
     if they refer to the turned one. Pixels that the lens does not reach after undistortion become invalid, as do those
     that an alpha channel does not show. Warns of photos of 16 bits that are nearly black.
-    skipped: views of the capture that are not among these, of which the run is to warn.
+    skipped: views of the capture that are not among these, of which the run is to warn. black_borders: whether borders
+    of the photos that are black become invalid, too.
     Raises InputError when a photo is damaged, or its size or that of its valid mask is not the stated one.
     """
     warn_of_skipped(skipped, "without a readable photo, a pose or a depth map")
@@ -61,6 +65,8 @@ def frames(
         photo, mask = read_photo(ref.path), valid[i] if valid else None
         lens = lenses[i] if lenses else None
         pixels = pixels_of(photo, str(ref.path))
+        if black_borders:
+            pixels = replace(pixels, opaque=~black_border(pixels.image))
         frame = frame_of(name, photo, pixels, str(ref.path), mask, lens, params)
         if pixels.dim:
             dim.append(name)
@@ -97,7 +103,9 @@ def frame_of(
     image = pixels.image
     stored = image.shape[1::-1]
     turn = _UPRIGHT.get(photo.orientation, "")
-    if lens is not None and lens.width and stored == (lens.width, lens.height):
+    if lens is not None and lens.turns:
+        turn = str(360 - 90 * lens.turns)
+    elif lens is not None and lens.width and stored == (lens.width, lens.height):
         turn = ""
     image = _turned(image, turn)
     height, width = image.shape[:2]
@@ -126,6 +134,19 @@ def frame_of(
         encoded = np.frombuffer(photo.data, np.uint8)
     packed = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
     return Frame(name, w, h, encoded, packed, width, height, photo.focal)
+
+
+def black_border(image: UInt8) -> Bool:
+    """[H, W] the pixels near a photo's border, within a thirtieth of its longer side, from which only black ones lead
+    there: what undistorting it has left empty."""
+    import cv2
+
+    height, width = image.shape[:2]
+    black = image.max(axis=2) <= _BLACK
+    margin = max(height, width) // 30
+    black[margin : height - margin, margin : width - margin] = False
+    _, piece = cv2.connectedComponents(np.pad(black, 1, constant_values=True).astype(np.uint8), connectivity=4)
+    return np.asarray(piece[1:-1, 1:-1] == piece[0, 0])
 
 
 def _turned(image: np.ndarray, turn: str) -> np.ndarray:

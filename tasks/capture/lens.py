@@ -31,6 +31,9 @@ class Lens:
     distortion: tuple[float, ...] = ()
     """OpenCV's order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of a fisheye; empty for a pinhole."""
     fisheye: bool = False
+    turns: int = 0
+    """Quarter turns, counterclockwise, that bring the photo, its depth too, from how they are stored to how they are
+    seen here; all else is of the turned photo."""
 
     @property
     def pinhole(self) -> bool:
@@ -41,9 +44,8 @@ class Lens:
         """The same lens for an image of another size (pixel borders map to pixel borders)."""
         sx = width / self.width if self.width else 1.0
         sy = height / self.height if self.height else 1.0
-        return Lens(
-            width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.distortion, self.fisheye
-        )
+        focal, center = (self.fx * sx, self.fy * sy), (self.cx * sx, self.cy * sy)
+        return Lens(width, height, *focal, *center, self.distortion, self.fisheye, self.turns)
 
 
 def undistortion_map(lens: Lens) -> Float32:

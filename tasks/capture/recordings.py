@@ -1,10 +1,10 @@
-"""Frames out of one file: a video, or ScanNet's `.sens`."""
+"""Frames out of one file: a video, with poses or without, or ScanNet's `.sens`."""
 
 from __future__ import annotations
 
 import shlex
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import DepthMap, Frame, UInt8
 from ss_flow.tasks.capture.ingest import IngestParams, frame_of, warn_of_skipped
 from ss_flow.tasks.capture.layout_scannet import read_sens_index
-from ss_flow.tasks.capture.photo_files import inspect, pixels_of
+from ss_flow.tasks.capture.lens import Lens
+from ss_flow.tasks.capture.photo_files import Photo, Pixels, inspect, pixels_of
 from ss_flow.tasks.capture.sensor_depth import in_world_units, registered_depth
 from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
@@ -28,7 +29,7 @@ class VideoParams:
     """Which frames of a video are used."""
 
     max_frames: Count = 120
-    """The most frames that are taken, spread evenly over the video."""
+    """The most frames that are taken, spread evenly over the video, or a recording of Stray Scanner."""
     stride: Natural = 0
     """Take one frame out of so many, or of more where `max_frames` would be exceeded; 0 = as many as that allows."""
     candidates: Count = 5
@@ -39,6 +40,10 @@ class VideoParams:
     """Frames whose longer side is above this are scaled down to it, in pixels."""
     jpeg_quality: JpegQuality = 95
     """Quality at which frames are encoded."""
+
+    def every(self, stride: int) -> VideoParams:
+        """Where only one frame out of so many of them is to be taken."""
+        return replace(self, max_frames=-(-self.max_frames // stride), stride=self.stride * stride)
 
 
 @task(name="capture.video_frames")
@@ -130,6 +135,48 @@ def _encode(image: UInt8, index: int, params: VideoParams) -> Frame:
         image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
     encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
     return Frame(f"frame-{index:06d}", w, h, encoded, np.zeros(0, np.uint8), width, height)
+
+
+@task(name="capture.recorded_frames")
+def recorded_frames(
+    *,
+    recording: FileRef,
+    names: tuple[str, ...],
+    entries: tuple[int, ...],
+    lenses: tuple[Lens, ...],
+    valid: tuple[FileRef | None, ...] = (),
+    skipped: tuple[str, ...] = (),
+    params: IngestParams = IngestParams(),
+) -> tuple[Frame, ...]:
+    """Some frames of a video whose poses are known, as `capture.ingest` has photos.
+
+    entries: their places in the video, from 0, ascending. skipped: views that are not among these, of which the run is
+    to warn.
+    Raises InputError when the video ends before the last of them.
+    """
+    import cv2
+
+    warn_of_skipped(skipped, "without depth, or beyond the video's end")
+    reader = cv2.VideoCapture(str(recording.path))
+    reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    result: list[Frame] = []
+    for place in range(entries[-1] + 1):
+        i = len(result)
+        ok = reader.grab()
+        if ok and place == entries[i]:
+            ok, image = reader.retrieve()
+        if not ok:
+            raise InputError(
+                f"{recording.path} ends or is damaged at frame {place} of {entries[-1] + 1} that are needed; copy the "
+                "recording again."
+            )
+        if place == entries[i]:
+            where, mask = f"{recording.path}, frame {place},", valid[i] if valid else None
+            stored = Photo(b"", "other", 0, 0, 1)
+            result.append(frame_of(names[i], stored, Pixels(image, None, False), where, mask, lenses[i], params))
+        progress(place + 1, entries[-1] + 1, names[i])
+    reader.release()
+    return tuple(result)
 
 
 @task(name="capture.sens_frames")

@@ -12,7 +12,10 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.capture.hints import read_hints
 from ss_flow.tasks.capture.layout_colmap import is_colmap, open_colmap
 from ss_flow.tasks.capture.layout_nerfstudio import open_nerfstudio
+from ss_flow.tasks.capture.layout_polycam import is_polycam, open_polycam
+from ss_flow.tasks.capture.layout_replica import is_replica, open_replica
 from ss_flow.tasks.capture.layout_scannet import is_scannet, open_scannet, open_sens
+from ss_flow.tasks.capture.layout_stray import is_stray, open_stray
 from ss_flow.tasks.capture.layout_tum import open_tum
 from ss_flow.tasks.capture.scene_files import (
     HEIC_SUFFIXES,
@@ -28,7 +31,8 @@ from ss_flow.tasks.capture.scene_files import (
 
 ACCEPTED = (
     "a folder of photos, a video, a COLMAP workspace (sparse/ and images/), a nerfstudio transforms.json, a ScanNet "
-    "export (color/ depth/ pose/ intrinsic/) or .sens file, or a TUM RGB-D sequence (rgb.txt)"
+    "export (color/ depth/ pose/ intrinsic/) or .sens file, a TUM RGB-D sequence (rgb.txt), a room of Replica (results/"
+    " and traj.txt), Polycam's raw data (keyframes/), or a recording of Stray Scanner (rgb.mp4 and odometry.csv)"
 )
 _OTHER_TRANSFORMS = "transforms_*.json"
 """As NeRF's synthetic scenes have them, one for the views to train on and others to test with."""
@@ -118,6 +122,8 @@ def _open_layout(path: Path) -> SceneFiles:
             return open_nerfstudio(path)
         if path.match(_OTHER_TRANSFORMS):
             raise InputError(f"{path} is not read under this name; copy it to {path.with_name('transforms.json')}.")
+        if path.suffix.lower() == ".zip":
+            raise InputError(f"{path} is an archive; unzip it, and give the folder that comes out.")
         suffixes = " ".join(sorted(VIDEO_SUFFIXES))
         raise InputError(f"{path} is no scene; give {ACCEPTED}; videos end in {suffixes}.")
     if (path / "transforms.json").is_file():
@@ -126,6 +132,12 @@ def _open_layout(path: Path) -> SceneFiles:
         return open_scannet(path)
     if (path / "rgb.txt").is_file():
         return open_tum(path)
+    if is_replica(path):
+        return open_replica(path)
+    if is_polycam(path):
+        return open_polycam(path)
+    if is_stray(path):
+        return open_stray(path)
     if is_colmap(path):
         return open_colmap(path)
     return _open_loose(path)

@@ -64,21 +64,26 @@ class SceneFiles:
     """The files of a capture, in the order of the views; `tuple[... | None, ...]` fields have one entry a view."""
 
     kind: str
-    """"photos", "video", "colmap", "nerfstudio", "scannet", "sens" or "tum"."""
+    """"photos", "video", "colmap", "nerfstudio", "scannet", "sens", "tum", "replica", "polycam" or
+    "stray"."""
     root: Path
     opened: Path | None = None
     """What the user named: the folder, or the video or JSON file in it."""
     names: tuple[str, ...] = ()
     """Name of each view; unique. Empty for a video, whose frames are chosen later."""
     photos: tuple[Path, ...] = ()
-    """The photos; empty for a video and for a .sens file."""
+    """The photos; empty where they are in a recording."""
     recording: Path | None = None
-    """The video or the .sens file."""
+    """A video, one whose frames have poses, or a .sens file."""
     entries: tuple[int, ...] = ()
-    """For a .sens file: which of its frames each view is."""
+    """Which frame of the recording each view is; empty for a video, whose frames are chosen later."""
     valid: tuple[Path | None, ...] = ()
     """One-channel images, 0 where a pixel is to be ignored."""
+    black_borders: bool = False
+    """Whether black borders of the photos are to be ignored: distortion was taken out of them."""
     depths: tuple[Path, ...] | None = None
+    confidences: tuple[Path | None, ...] = ()
+    """One-channel images, 0 where the depth is not to be relied on; empty where there are none."""
     depth_scale: float = 0.001
     """World units per unit of the depth files."""
     depth_lens: Lens | None = None
@@ -157,7 +162,10 @@ class SceneFiles:
 
     def pick(self, views: list[int]) -> SceneFiles:
         """Only these views, in this order."""
-        per_view = ("names", "photos", "entries", "valid", "depths", "lenses", "poses", "ready_masks", "ground_truth")
+        per_view = (
+            "names", "photos", "entries", "valid", "depths", "confidences", "lenses", "poses", "ready_masks",
+            "ground_truth",
+        )  # fmt: skip
         kept: dict[str, Any] = {}
         for name in per_view:
             values = getattr(self, name)

@@ -24,6 +24,7 @@ def depth(
     *,
     names: tuple[str, ...],
     files: tuple[FileRef, ...],
+    confidences: tuple[FileRef | None, ...] = (),
     scale: float,
     metric: bool,
     lenses: tuple[Lens, ...] | None = None,
@@ -32,7 +33,7 @@ def depth(
     """Sensor depth, registered to the frames' cameras, at the sensor's own resolution.
 
     files: one-channel images, 16 bit in units of `scale` world units (0 and 65535: unknown), or 32-bit floats in world
-    units.
+    units. confidences: one-channel images of their sizes, 0 where the depth is not to be relied on.
     depth_lens: the depth camera, where it is not the colour camera at another resolution; same centre and axes.
     Pixels that the frame's valid mask leaves out, and those that are not finite, become unknown (0). Warns of views
     without a known pixel.
@@ -50,11 +51,26 @@ def depth(
                 f"{ref.path} holds {raw.dtype} pixels; depth of 16 bits a pixel (or 32-bit floats) is expected."
             )
         values = raw if raw.dtype == np.float32 else in_world_units(raw, scale)
+        if confidences and (confidence := confidences[row[frame.name]]) is not None:
+            values = _reliable(values, confidence, ref)
+        if lens is not None:
+            values = np.rot90(values, lens.turns)
         measured = measured or bool((np.isfinite(values) & (values > 0)).any())
         result.append(registered_depth(frame, values, str(ref.path), metric, lens, depth_lens))
         progress(i + 1, len(frames), frame.name)
     _check_known(result, measured, str(files[0].path.parent))
     return tuple(result)
+
+
+def _reliable(values: Float32, confidence: FileRef, depth: FileRef) -> Float32:
+    """[h, w] depth, 0 where its confidence is."""
+    known = read_gray(confidence.path)
+    if known.shape != values.shape:
+        raise InputError(
+            f"{confidence.path} is {known.shape[1]}x{known.shape[0]} pixels and the depth that it belongs to, "
+            f"{depth.path}, {values.shape[1]}x{values.shape[0]}; the two must agree."
+        )
+    return np.where(known > 0, values, np.float32(0))
 
 
 def in_world_units(raw: np.ndarray, scale: float) -> Float32:

@@ -114,6 +114,18 @@ def tum(root: Path) -> Path:
     return root
 
 
+def replica(root: Path, **changes) -> Path:
+    """A room in the form of NICE-SLAM; changes: of its camera."""
+    for i in range(len(NAMES)):
+        write(root / "results" / f"frame{i:06d}.jpg", photo(i))
+        write(root / "results" / f"depth{i:06d}.png", depth_image(13107))
+    rows = [" ".join(map(str, pose(i).ravel())) for i in range(len(NAMES))]
+    (root / "traj.txt").write_text("\n".join(rows))
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": 30.0, "fy": 30.0, "cx": 15.5, "cy": 11.5, "scale": 6553.5, **changes}
+    (root / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return root
+
+
 def colmap(root: Path, binary: bool = True, distortion: float = 0.0, registered: int = 3) -> Path:
     """A workspace with two models: `sparse/0` with one image, `sparse/1` with all."""
     for i, name in enumerate(NAMES):
@@ -179,3 +191,70 @@ def video(path: Path, count: int = 40) -> Path:
         writer.write(image if i % 4 == 1 else cv2.GaussianBlur(image, (0, 0), 4))
     writer.release()
     return path
+
+
+def phone_pose(x: float, turns: int) -> np.ndarray:
+    """Camera-to-world (x right, y down, z forward) of a phone in a world with y up, whose stored photo must be turned
+    so many quarters counterclockwise to stand upright."""
+    forward = np.array([0.0, 0.0, -1.0])
+    right, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])
+    for _ in range(turns):  # what is up in the world lies to the right of a photo that misses one turn
+        right, down = -down, right
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([right, down, forward, (x, 1.5, 4.0)])
+    return matrix
+
+
+def lying_lens() -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of that phone, for a photo that is WIDTH x HEIGHT when it lies as it is stored."""
+    return 30.0, 31.0, 16.5, 11.0
+
+
+def polycam(root: Path, turns: int = 0, corrected: bool = True, **changes) -> Path:
+    """Photos, depth and confidence stored lying; the phone stands upright after so many quarter turns."""
+    for i, name in enumerate(NAMES):
+        for prefix in ("", "corrected_") if corrected else ("",):
+            write(root / "keyframes" / f"{prefix}images" / f"{name}.jpg", photo(i + 10 * bool(prefix)))
+            moved = phone_pose(i + 5 * (not prefix and corrected), turns) @ np.diag([1.0, -1.0, -1.0, 1.0])
+            values = {f"t_{r}{c}": moved[r, c] for r in range(3) for c in range(4)}
+            lens = dict(zip(("fx", "fy", "cx", "cy"), lying_lens(), strict=True))
+            document = {"width": WIDTH, "height": HEIGHT, **lens, **values, "blur_score": 100.0, **changes}
+            folder = root / "keyframes" / f"{prefix}cameras"
+            folder.mkdir(exist_ok=True)
+            (folder / f"{name}.json").write_text(json.dumps(document))
+        depth = depth_image(1000 + i, 16, 12)
+        depth[0, :4] = 3000
+        confidence = np.full((12, 16), 255, np.uint8)
+        confidence[0, :3], confidence[0, 3] = 0, 127
+        write(root / "keyframes" / "depth" / f"{name}.png", depth)
+        write(root / "keyframes" / "confidence" / f"{name}.png", confidence)
+    return root
+
+
+STRAY_HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw"
+
+
+def stray(root: Path, turns: int = 0, frames: int = 4, lens_of_rows: bool = False, size=(64, 48)) -> Path:
+    """A recording whose frame n has the gray level 40 n on its left half, and black on its right one."""
+    from scipy.spatial.transform import Rotation
+
+    root.mkdir(parents=True, exist_ok=True)
+    width, height = size
+    video = cv2.VideoWriter(str(root / "rgb.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, size)
+    lines = [STRAY_HEADER + (", fx, fy, cx, cy, distortion_center_x" if lens_of_rows else "")]
+    for i in range(frames):
+        image = np.zeros((height, width, 3), np.uint8)
+        image[:, : width // 2] = 40 * (i + 1) % 256
+        video.write(image)
+        write(root / "depth" / f"{i:06d}.png", depth_image(1000 + i, 16, 12))
+        confidence = np.full((12, 16), 2, np.uint8)
+        confidence[0, 0] = 0
+        write(root / "confidence" / f"{i:06d}.png", confidence)
+        matrix = phone_pose(i, turns)
+        quaternion = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+        numbers = [*matrix[:3, 3], *quaternion, *((60.0 + i, 60.0, 32.0, 24.0) if lens_of_rows else ())]
+        lines.append(f"{100 + i / 30}, {i:06d}, " + ", ".join(map(repr, map(float, numbers))) + ", " * lens_of_rows)
+    video.release()
+    (root / "odometry.csv").write_text("\n".join(lines))
+    (root / "camera_matrix.csv").write_text("60.0, 0.0, 32.0\n0.0, 60.0, 24.0\n0.0, 0.0, 1.0")
+    return root

@@ -99,6 +99,35 @@ def test_nerfstudio_without_depth_is_not_metric_and_may_be_named_by_its_file(tmp
     assert scene.depths is None and not scene.metric
 
 
+def test_a_room_of_replica_has_its_lens_beside_or_above_it_or_that_of_all_such_rooms(tmp_path):
+    scene = open_scene(made.replica(tmp_path / "office0"))
+    assert (scene.kind, scene.metric, scene.depth_scale) == ("replica", True, 1 / 6553.5)
+    assert scene.names == ("frame000000", "frame000001", "frame000002")
+    assert_cameras(scene)
+    assert [p.name for p in scene.depths] == ["depth000000.png", "depth000001.png", "depth000002.png"]
+    (tmp_path / "office0/cam_params.json").rename(tmp_path / "cam_params.json")
+    assert open_scene(tmp_path / "office0").lenses == scene.lenses
+    (tmp_path / "cam_params.json").unlink()
+    lens = open_scene(tmp_path / "office0").lenses[0]
+    assert (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy) == (1200, 680, 600, 600, 600, 340)
+
+
+@pytest.mark.parametrize(
+    "spoil, message",
+    [
+        (lambda root: (root / "results/depth000001.png").unlink(), "lacks the depth map of frame000001.jpg"),
+        (lambda root: (root / "results/frame000001.jpg").unlink(), "traj.txt holds 3 poses, and .*results 2 photos"),
+        (lambda root: (root / "traj.txt").write_text("1 2 3"), "traj.txt does not hold 16 numbers for each photo"),
+        (lambda root: made.replica(root, scale=0), "cam_params.json has no `camera` with a number `scale`"),
+        (lambda root: made.replica(root, fy=None), "cam_params.json has no `camera` with a number `fy`"),
+    ],
+)
+def test_a_room_of_replica_that_makes_no_sense_is_refused(spoil, message, tmp_path):
+    spoil(made.replica(tmp_path))
+    with pytest.raises(InputError, match=message):
+        open_scene(tmp_path)
+
+
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".JPEG"])
 def test_nerfstudio_names_may_lack_their_ending_and_have_the_backslashes_of_windows(ending, tmp_path):
     whole = open_scene(made.nerfstudio(tmp_path))

@@ -1,0 +1,148 @@
+"""Recordings of the app Stray Scanner: a video, LiDAR depth and a pose for each of its frames."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import Float64
+from ss_flow.tasks.capture.layout_colmap import rotation_of
+from ss_flow.tasks.capture.lens import Lens
+from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, by_stem, check_lens, files_in, read_text, rigid_inverse
+from ss_flow.tasks.capture.upright import upright
+from ss_flow.tasks.geometry.cameras import centers_of
+
+_PLACE, _TURN, _LENS = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("fx", "fy", "cx", "cy")
+_DISTANCE = 1.5
+"""Metres to what a phone is held towards: at this distance a step blurs as much as a turn by its angle does."""
+
+
+def is_stray(root: Path) -> bool:
+    """Whether a folder holds a recording of Stray Scanner."""
+    return (root / "rgb.mp4").is_file() and (root / "odometry.csv").is_file()
+
+
+def open_stray(root: Path) -> SceneFiles:
+    """A recording of Stray Scanner: `rgb.mp4`, `odometry.csv`, `camera_matrix.csv`, `depth/` and `confidence/`.
+
+    Row n of `odometry.csv` is frame n of the video; its number names the frame's depth, in millimetres, and the
+    confidence in that: 0, 1 or 2, where depth of 0 counts as unknown. Poses are camera-to-world in a world with y up,
+    of cameras that look along z. Rows may hold the lens, otherwise one holds for all. Frames without depth, and rows
+    beyond the video's end, are left out. Photos are turned upright; views are named `frame-000000` and on.
+    Raises InputError when a file is missing or makes no sense, or no frame is whole.
+    """
+    track = root / "odometry.csv"
+    rows = _rows(track)
+    width, height, length = _video(root / "rgb.mp4")
+    common = None if all(key in rows[0] for key in _LENS) else _camera_matrix(root / "camera_matrix.csv")
+    depths, confidences = by_stem(files_in(root / "depth")), by_stem(files_in(root / "confidence"))
+    stems = [f"{int(_number(row, 'frame', track)):06d}" for row in rows]
+    names = [f"frame-{stem}" for stem in stems]
+    kept = [i for i, stem in enumerate(stems) if i < length and (stem in depths or not depths)]
+    if not kept:
+        raise InputError(f"{root / 'depth'} holds no depth map of a frame that {track.name} lists; 000000.png is one.")
+    lenses, poses = upright(
+        [check_lens(Lens(width, height, *_lens(rows[i], common, track)), str(track)) for i in kept],
+        [_pose(rows[i], track) for i in kept],
+    )
+    return SceneFiles(
+        kind="stray",
+        root=root,
+        names=tuple(names[i] for i in kept),
+        recording=root / "rgb.mp4",
+        entries=tuple(kept),
+        depths=tuple(depths[stems[i]] for i in kept) if depths else None,
+        confidences=tuple(confidences.get(stems[i]) for i in kept) if depths else (),
+        lenses=lenses,
+        poses=poses,
+        metric=True,
+        skipped=tuple(name for i, name in enumerate(names) if i not in set(kept)),
+        all_names=tuple(names),
+    )
+
+
+def steadiest(scene: SceneFiles, stride: int, max_frames: int) -> SceneFiles:
+    """One frame out of each `stride` of a recording, or of more where that gives above `max_frames`: the one before and
+    after which the phone moved least, and so the sharpest."""
+    poses = scene.world_to_camera
+    assert poses is not None
+    count = len(poses)
+    stride = max(stride, -(-count // max_frames))
+    motion = _motion(poses)
+    chosen = [start + int(np.argmin(motion[start : start + stride])) for start in range(0, count, stride)]
+    told = {*(scene.names[i] for i in chosen), *scene.skipped}
+    return replace(scene.pick(chosen), all_names=tuple(name for name in scene.all_names if name in told))
+
+
+def _motion(poses: Float64) -> Float64:
+    """[K] how far what a camera sees moves across the picture, from the frame before or to the frame after: radians.
+
+    poses: [K, 4, 4] world to camera.
+    """
+    turn = np.einsum("kij,kij->k", poses[1:, :3, :3], poses[:-1, :3, :3])
+    steps = np.linalg.norm(np.diff(centers_of(poses), axis=0), axis=1) / _DISTANCE
+    steps += np.arccos(np.clip((turn - 1) / 2, -1, 1))
+    padded = np.concatenate([steps[:1], steps, steps[-1:]]) if len(steps) else np.zeros(2)
+    return np.maximum(padded[:-1], padded[1:])
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    header, *lines = csv.reader(read_text(path).splitlines(), skipinitialspace=True)
+    columns = [name.strip() for name in header]
+    lacking = [key for key in ("frame", *_PLACE, *_TURN) if key not in columns]
+    if lacking:
+        raise InputError(f"{path} has no column `{lacking[0]}` in its first line; {_EXPECTED}.")
+    # Columns of the lens may be there and empty.
+    rows = [{key: word for key, word in zip(columns, line, strict=False) if word.strip()} for line in lines if line]
+    if not rows:
+        raise InputError(f"{path} lists no frame; {_EXPECTED}.")
+    return rows
+
+
+_EXPECTED = "timestamp, frame, x, y, z, qx, qy, qz, qw are expected, as Stray Scanner writes them"
+
+
+def _number(row: dict[str, str], key: str, path: Path) -> float:
+    try:
+        return float(row[key])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path} has a row without a number for `{key}`; {_EXPECTED}.") from error
+
+
+def _pose(row: dict[str, str], path: Path) -> Pose:
+    where = f"{path} for frame {row['frame']}"
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_of(np.array([_number(row, key, path) for key in _TURN]), where)
+    matrix[:3, 3] = [_number(row, key, path) for key in _PLACE]
+    return rigid_inverse(matrix, where)
+
+
+def _lens(row: dict[str, str], common: tuple[float, ...] | None, path: Path) -> tuple[float, ...]:
+    return common or tuple(_number(row, key, path) for key in _LENS)
+
+
+def _camera_matrix(path: Path) -> tuple[float, ...]:
+    """fx, fy, cx, cy."""
+    try:
+        matrix = np.array([float(word) for word in read_text(path).replace(",", " ").split()]).reshape(3, 3)
+    except ValueError as error:
+        raise InputError(f"{path} does not hold a 3x3 matrix of numbers.") from error
+    return tuple(float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+
+
+def _video(path: Path) -> tuple[int, int, int]:
+    """Width and height of the stored frames, and how many there are."""
+    import cv2
+
+    reader = cv2.VideoCapture(str(path))
+    reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the lens is that of the frames as they are stored
+    found = [int(reader.get(what)) for what in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+    length = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
+    reader.release()
+    if min(*found, length) <= 0:
+        raise InputError(f"{path} cannot be opened as a video: it is cut short or damaged; copy the recording again.")
+    return found[0], found[1], length
