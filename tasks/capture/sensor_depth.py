@@ -9,13 +9,16 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, task
-from ss_flow.tasks.artifacts import DepthMap, Float32, Frame
+from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Frame
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
 from ss_flow.tasks.geometry.images import decode_valid, pixels_under
 from ss_flow.tasks.words import first_of
 
 _NO_RETURN = np.iinfo(np.uint16).max
+_SKY = 100
+"""Floats above so many times the depth that a tenth of their map lies below are none: renderers write such numbers
+where nothing is."""
 
 
 @task(name="capture.sensor_depth")
@@ -33,15 +36,17 @@ def depth(
     """Sensor depth, registered to the frames' cameras, at the sensor's own resolution.
 
     files: one-channel images, 16 bit in units of `scale` world units (0 and 65535: unknown), or 32-bit floats in world
-    units. confidences: one-channel images of their sizes, 0 where the depth is not to be relied on.
+    units, of which such are unknown, too, as renderers write for the sky. confidences: one-channel images of their
+    sizes, 0 where the depth is not to be relied on.
     depth_lens: the depth camera, where it is not the colour camera at another resolution; same centre and axes.
     Pixels that the frame's valid mask leaves out, and those that are not finite, become unknown (0). Warns of views
-    without a known pixel.
+    without a known pixel, and of those with such a sky.
     Raises InputError when a file is damaged, not depth, or implausible for a metric scene.
     """
     row = {name: i for i, name in enumerate(names)}
     result = []
     measured = False
+    skies: list[str] = []
     for i, frame in enumerate(frames):
         ref = files[row[frame.name]]
         lens = lenses[row[frame.name]] if lenses else None
@@ -50,7 +55,12 @@ def depth(
             raise InputError(
                 f"{ref.path} holds {raw.dtype} pixels; depth of 16 bits a pixel (or 32-bit floats) is expected."
             )
-        values = raw if raw.dtype == np.float32 else in_world_units(raw, scale)
+        if raw.dtype == np.float32:
+            sky = _sky(raw)
+            values = np.where(sky, np.float32(0), raw)
+            skies += [frame.name] * bool(sky.any())
+        else:
+            values = in_world_units(raw, scale)
         if confidences and (confidence := confidences[row[frame.name]]) is not None:
             values = _reliable(values, confidence, ref)
         if lens is not None:
@@ -59,7 +69,18 @@ def depth(
         result.append(registered_depth(frame, values, str(ref.path), metric, lens, depth_lens))
         progress(i + 1, len(frames), frame.name)
     _check_known(result, measured, str(files[0].path.parent))
+    if skies:
+        warn(
+            f"Depth of {_SKY} times what is near in its view counts as unknown, as renderers write such numbers for "
+            f"the sky: in {len(skies)} of {len(frames)} views, {first_of(skies)}."
+        )
     return tuple(result)
+
+
+def _sky(values: Float32) -> Bool:
+    """[h, w] where a map of floats has a number that is no depth."""
+    known = np.isfinite(values) & (values > 0)
+    return known & (values > _SKY * np.quantile(values[known], 0.1)) if known.any() else known
 
 
 def _reliable(values: Float32, confidence: FileRef, depth: FileRef) -> Float32:

@@ -7,8 +7,12 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, SceneUnit
+from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view
 from ss_flow.tasks.geometry.fusion import with_sparse_points
+
+_LEAST_DEPTHS = 2
+"""How many times as far as the near plane views must look."""
 
 
 @task(name="capture.by_view")
@@ -22,7 +26,8 @@ def unit(cameras: Cameras, depths: tuple[DepthMap, ...]) -> SceneUnit:
     """The length that plays the part of one metre: 1.0 where the scale is known (spec 3.0).
 
     Otherwise half the median, over the views, of the median known depth; where none is known, of the depth of the
-    sparse points. Raises InputError when there are none either, or when views were compared without any result.
+    sparse points. Raises InputError when there are none either, when views were compared without any result, or when
+    that depth is so small that what is near would be cut off.
     """
     if all(depth.source == "mvs" and not depth.depth.any() for depth in depths):
         raise InputError(
@@ -34,4 +39,11 @@ def unit(cameras: Cameras, depths: tuple[DepthMap, ...]) -> SceneUnit:
     medians = [float(np.median(d.depth[d.depth > 0])) for d in depths if (d.depth > 0).any()]
     if not medians:
         raise InputError("None of the depth maps of this scene has a known depth; at least one view should.")
-    return SceneUnit(1.0 if cameras.metric else float(np.median(medians)) / 2)
+    typical = float(np.median(medians))
+    if typical < _LEAST_DEPTHS * NEAR_PLANE:
+        larger = 10 ** -np.floor(np.log10(typical))
+        raise InputError(
+            f"what the views show is {typical:.2g} units away from them (median), and renderers leave out what is "
+            f"nearer than {NEAR_PLANE:g}; multiply the places of the poses, and the depth, by {larger:g}."
+        )
+    return SceneUnit(1.0 if cameras.metric else typical / 2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ _SAMPLE = 20_000
 _ELSEWHERE = 0.05
 """Share of the depth from which on a view sees another surface than the point's."""
 _AT_ONCE = 1 << 22
-"""So many sums are held at once, or twice as many as there are voxels; each takes 56 bytes, thrice while added."""
+"""So many sums are held at once, or twice as many as there are voxels; each takes 64 bytes, thrice while added."""
 _CELLS = 1 << 21
 """Voxels a side that fit the 63-bit code of a voxel; farther points wrap around, which needs 40 km at 2 cm."""
 
@@ -35,6 +35,8 @@ class VoxelSums:
     """[N, 3] weighted sum, RGB 0..255."""
     weight: Float64
     """[N] how many samples."""
+    side: Float64
+    """[N] weighted sum of the sides that their cubes are to have at least, world units; 0 = any."""
 
     def means(self) -> tuple[Float64, Float64]:
         """Mean position and colour of each voxel: [N, 3], [N, 3]."""
@@ -42,12 +44,13 @@ class VoxelSums:
 
     def take(self, keep: Bool) -> VoxelSums:
         """The voxels where `keep` [N] holds."""
-        return VoxelSums(self.position[keep], self.color[keep], self.weight[keep])
+        return VoxelSums(self.position[keep], self.color[keep], self.weight[keep], self.side[keep])
 
 
 def sum_by_voxel(parts: Iterable[VoxelSums], voxel: float) -> VoxelSums:
     """Add up the points whose means lie in the same cube of side `voxel`; the order is that of the cubes in space.
 
+    Where points are to have cubes of twice the side at least, of four times and so on, such cubes follow the others.
     The origin is the centre of a cube, not a corner: a floor at height zero must not fall apart into two layers.
     Of an iterator, hundreds of views are never held at once: what has come is added up in between.
     """
@@ -62,9 +65,20 @@ def sum_by_voxel(parts: Iterable[VoxelSums], voxel: float) -> VoxelSums:
 
 
 def _added_up(parts: list[VoxelSums], voxel: float) -> VoxelSums:
-    position, color, weight = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("position", "color", "weight")
-    )
+    sums = _all_of(parts)
+    doublings = np.floor(np.log2(np.maximum(sums.side / (sums.weight * voxel), 1)))
+    sizes = np.unique(doublings)
+    if len(sizes) < 2:
+        return _in_cubes(sums, voxel * 2 ** sizes.max(initial=0))
+    return _all_of([_in_cubes(sums.take(doublings == size), voxel * 2**size) for size in sizes])
+
+
+def _all_of(parts: list[VoxelSums]) -> VoxelSums:
+    return VoxelSums(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(VoxelSums)))
+
+
+def _in_cubes(sums: VoxelSums, voxel: float) -> VoxelSums:
+    position, weight = sums.position, sums.weight
     cell = np.floor(position / weight[:, None] / voxel + 0.5).astype(np.int64) & (_CELLS - 1)
     code = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
     _, inverse = np.unique(code, return_inverse=True)
@@ -74,8 +88,9 @@ def _added_up(parts: list[VoxelSums], voxel: float) -> VoxelSums:
 
     return VoxelSums(
         np.stack([added(position[:, i]) for i in range(3)], axis=-1),
-        np.stack([added(color[:, i]) for i in range(3)], axis=-1),
+        np.stack([added(sums.color[:, i]) for i in range(3)], axis=-1),
         added(weight),
+        added(sums.side),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -28,7 +28,8 @@ class DenseParams:
     """How densely the scene's surfaces are sampled."""
 
     voxel: Positive = 0.02
-    """Upper limit of the side of a sampling cube, in scene units (metres where the scale is known)."""
+    """Upper limit of the side of a sampling cube, in scene units (metres where the scale is known); cubes where pixels
+    cover more are twice, four times and so on as large."""
     voxel_pixels: Positive = 2.0
     """The cube's side in median pixel footprints, where that is finer than `voxel`."""
     max_points: Annotated[int, Range(100, float("inf"))] = 400_000
@@ -92,9 +93,10 @@ def consistent_cloud(
         )
         if kept.sum() <= params.max_points:
             break
-        # On surfaces the count falls with the square of the side.
-        voxel = _one_of_few(voxel * np.sqrt(kept.sum() / params.max_points), np.ceil)
-        cloud = sum_by_voxel([cloud.take(kept)], voxel)
+        # On surfaces the count falls with the square of the side; far and near ones grow alike.
+        grown = _one_of_few(voxel * np.sqrt(kept.sum() / params.max_points), np.ceil)
+        cloud = cloud.take(kept)
+        cloud, voxel = sum_by_voxel([replace(cloud, side=cloud.side * (grown / voxel))], grown), grown
     points = means[kept].astype(np.float32)
     rounded = np.rint(colors[kept]).astype(np.uint8)
     return PointCloud(points, rounded, unit.length, nearest_spacing(points), depth_noise(means[kept], cameras, depths))
@@ -123,10 +125,16 @@ def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
 
 
 def depth_samples(frame: Frame, cameras: Cameras, view: int, depth: DepthMap) -> VoxelSums:
-    """The known depth pixels of one view as points with the colours of its photo."""
+    """The known depth pixels of one view as points with the colours of its photo, in cubes of a pixel's size at least.
+
+    In smaller ones each pixel of each view would be a point of its own, and far walls would leave hardly any of
+    `max_points` to what is near.
+    """
     height, width = depth.depth.shape
     pick = np.ix_(pixels_under(height, frame.height), pixels_under(width, frame.width))
     known = ((depth.depth > 0) & decode_valid(frame)[pick]).ravel()
-    points = backproject(depth.depth, camera_of(cameras, view).scaled(width, height))[known]
+    camera = camera_of(cameras, view).scaled(width, height)
+    points = backproject(depth.depth, camera)[known]
     colors = decode_rgb(frame)[pick].reshape(-1, 3)[known].astype(np.float64)
-    return VoxelSums(points, colors, np.ones(len(points)))
+    sides = depth.depth.ravel()[known].astype(np.float64) / camera.fx
+    return VoxelSums(points, colors, np.ones(len(points)), sides)

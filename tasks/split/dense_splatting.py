@@ -132,7 +132,7 @@ def _centres(gaussians: Gaussians, min_opacity: float) -> VoxelSums:
     """The centres of the opaque Gaussians, with their colours."""
     opaque = gaussians.opacities >= min_opacity
     colors = np.clip(255 * (0.5 + SH_ZERO * gaussians.sh[opaque, 0].astype(np.float64)), 0, 255)
-    return VoxelSums(gaussians.means[opaque].astype(np.float64), colors, np.ones(len(colors)))
+    return VoxelSums(gaussians.means[opaque].astype(np.float64), colors, np.ones(len(colors)), np.zeros(len(colors)))
 
 
 def _completed(depth: DepthMap, view: TrainView, gaussians: Gaussians) -> DepthMap:

@@ -111,3 +111,17 @@ def test_views_that_were_compared_without_any_result_are_refused(scene, swept):
 
 def test_sweeping_twice_gives_the_same_bits(scene, swept):
     np.testing.assert_array_equal(swept_view(scene, 0).depth, swept[0].depth)
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_a_scene_so_small_that_renderers_would_cut_it_off_is_refused(scene, metric):
+    frames, cameras, _ = scene
+    cameras = replace(cameras, metric=metric)
+
+    def flat(away):
+        return tuple(DepthMap(frame.name, np.full((6, 8), away, np.float32), "sensor") for frame in frames)
+
+    assert unit(cameras, flat(0.03)).length == pytest.approx(1.0 if metric else 0.015)
+    said = r"is 0\.0076 units away from them \(median\), .* nearer than 0\.01; .* depth, by 1000\."
+    with pytest.raises(InputError, match=said):
+        unit(cameras, flat(0.0076))

@@ -275,6 +275,20 @@ def test_float_depth_is_in_world_units_and_what_is_not_finite_is_unknown(tmp_pat
     assert not found[0, :3].any() and (found[1:] == 2.5).all()
 
 
+@pytest.mark.parametrize("nothing", [65504, 1e10])
+def test_what_a_renderer_writes_for_the_sky_is_no_depth(tmp_path, nothing):
+    made.scannet(tmp_path)
+    values = np.full((12, 16), 2.5, np.float32)
+    values[:8], values[8, 0] = nothing, 200  # far, but there
+    (tmp_path / "depth" / "2.png").unlink()
+    made.write(tmp_path / "depth" / "2.tiff", values)
+    scene = open_scene(tmp_path)
+    frames = ingested(scene)
+    with pytest.warns(UserWarning, match=r"for the sky: in 1 of 3 views, 2\."):
+        found = read_depth(scene, frames)[0].depth
+    assert not found[:8].any() and found[8, 0] == 200 and (found[9:] == 2.5).all()
+
+
 def test_the_largest_number_of_sixteen_bits_is_no_depth(tmp_path):
     made.scannet(tmp_path)
     values = np.full((12, 16), 1000, np.uint16)

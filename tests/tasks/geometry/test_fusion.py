@@ -10,9 +10,9 @@ from ss_flow.tasks.geometry import fusion
 from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_at, depth_noise, sum_by_voxel
 
 
-def samples(points, color=0.0):
+def samples(points, color=0.0, side=0.0):
     points = np.asarray(points, float)
-    return VoxelSums(points, np.full((len(points), 3), color), np.ones(len(points)))
+    return VoxelSums(points, np.full((len(points), 3), color), np.ones(len(points)), np.full(len(points), side))
 
 
 def test_points_of_one_voxel_are_averaged_by_weight():
@@ -35,7 +35,7 @@ def test_many_views_are_added_up_as_they_come_and_never_held_at_once(monkeypatch
     found = sum_by_voxel(views(), 1.0)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 60 * 4000 * 56 / 4
+    assert peak < 60 * 4000 * 64 / 4
     np.testing.assert_allclose(found.position, whole.position, atol=1e-9)
     np.testing.assert_allclose(found.color, whole.color)
     assert found.weight.tolist() == whole.weight.tolist()
@@ -51,6 +51,18 @@ def test_summing_agrees_with_a_dictionary_of_voxels(seed, voxel):
     expected = sorted(tuple(np.mean(c, axis=0)) for c in cells.values())
     found = sorted(map(tuple, sum_by_voxel([samples(points)], voxel).means()[0]))
     np.testing.assert_allclose(found, expected)
+
+
+def test_points_that_are_to_have_larger_cubes_have_them_and_follow_the_others():
+    near = samples(np.array([[0.1, 0, 0], [-0.2, 0, 0], [1.2, 0, 0]]), side=1.9)
+    far = samples(np.array([[4.4, 0, 0], [5.1, 0, 0], [8.0, 0, 0]]), side=4.1)
+    found = sum_by_voxel([far, near], 1.0)
+    np.testing.assert_allclose(found.means()[0][:, 0], [-0.05, 1.2, 4.75, 8.0])
+    assert found.weight.tolist() == [2, 1, 2, 1]
+    again = sum_by_voxel([found], 1.0)
+    np.testing.assert_allclose(again.position, found.position)
+    coarse = sum_by_voxel([found], 8.0)  # now all fit the same size
+    assert coarse.weight.tolist() == [3, 3]
 
 
 def test_depth_of_a_smaller_map_is_read_at_the_pixel_centre():

@@ -35,6 +35,20 @@ def test_no_more_points_remain_than_asked_for():
     assert 500 < len(fuse(max_points=1000).points) <= 1000
 
 
+def test_a_far_background_leaves_the_near_surface_its_points():
+    def near_points(far):
+        frames, cameras, depths = box_scene.frames(), box_scene.cameras(), []
+        for depth in box_scene.depths():
+            values = np.where(np.arange(depth.depth.shape[1]) < 20, np.float32(far), depth.depth)
+            depths.append(replace(depth, depth=values))
+        params = DenseParams(max_points=3000)
+        cloud = dense(frames, cameras, tuple(depths), SceneUnit(1.0), params=params)
+        return int((box_scene.distance_to_scene(cloud.points) < 0.05).sum())
+
+    alone, beside = near_points(0), near_points(400)
+    assert alone > 2000 and beside > 0.4 * alone
+
+
 def test_one_view_less_leaves_the_cubes_where_they_are():
     fine = DenseParams(voxel=1.0)  # the footprint of a pixel decides
     every = box_scene.depths()
