@@ -144,6 +144,20 @@ def test_strays_frames_come_out_of_the_video_by_their_place(tmp_path):
         assert decode_rgb(frame)[24, 50].max() < 16
 
 
+def test_a_video_that_players_are_to_turn_is_read_as_it_is_stored_since_the_lens_is_of_that(tmp_path):
+    scene = open_made("stray", tmp_path)
+    data = bytearray(scene.recording.read_bytes())
+    matrix = data.index(b"tkhd") + 4 + 40  # of the track's header, behind its times, number and volume
+    quarter = (0, 1 << 16, 0, -1 << 16, 0, 0, 0, 0, 1 << 30)
+    data[matrix : matrix + 36] = b"".join(number.to_bytes(4, "big", signed=True) for number in quarter)
+    scene.recording.write_bytes(data)
+    player = cv2.VideoCapture(str(scene.recording))
+    assert player.read()[1].shape == (64, 48, 3)
+    turned = open_scene(tmp_path)
+    assert turned.lenses == scene.lenses
+    assert read(replace(turned, valid=()))[0][0].width == 64
+
+
 def test_strays_rows_may_hold_the_lens(tmp_path):
     common = open_made("stray", tmp_path / "a")
     assert {(lens.fx, lens.cx, lens.width) for lens in common.lenses} == {(60, 32, 64)}
