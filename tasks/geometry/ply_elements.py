@@ -106,7 +106,7 @@ def _ascii(stream: BinaryIO, count: int, properties: list[_Property], order: str
     rows = [stream.readline().split() for _ in range(count)]
     if len({len(row) for row in rows}) > 1:
         raise ValueError("rows of different lengths")
-    table = np.array(rows, np.float64).reshape(count, -1)
+    table = np.array(rows, np.float64).reshape(count, len(rows[0]) if rows else 0)
     columns: Columns = {}
     place = 0
     for one in properties:

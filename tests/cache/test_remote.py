@@ -11,6 +11,7 @@ import time
 import urllib.request
 import uuid
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -151,7 +152,8 @@ def test_what_was_read_once_is_read_here_the_next_time(here, there, bucket):
     object_digest = here.put(label_map())
     there.get(object_digest)
     bucket.delete(names(bucket, "objects"))
-    assert digest(RemoteStore(there.location, there.root).get(object_digest)) == object_digest
+    again = RemoteStore(there.location, there.root)
+    assert digest(again.get(object_digest)) == digest(again.read(object_digest)) == object_digest
 
 
 def test_the_bucket_is_asked_once_whether_it_holds_an_object_and_never_for_what_is_here(here, there, asked):
@@ -218,6 +220,23 @@ def test_files_of_an_object_are_written_before_the_one_that_makes_it_count(here,
     object_digest = here.put(label_map())
     assert len(written) > 2
     assert written[-1] == f"objects/{object_digest[:2]}/{object_digest}/{MANIFEST}"
+
+
+def test_what_makes_an_object_count_is_deleted_before_its_other_files(here, bucket, monkeypatch):
+    object_digest = here.put(label_map())
+    deleted, delete = [], Bucket.delete
+    monkeypatch.setattr(
+        Bucket, "delete", lambda self, files: deleted.append(sorted(files)) or delete(self, deleted[-1])
+    )
+    assert here.discard(object_digest)
+    first, rest = deleted
+    assert first == [f"objects/{object_digest[:2]}/{object_digest}/{MANIFEST}"] and len(rest) > 1
+
+
+def test_the_time_is_that_of_the_buckets_clock(here, monkeypatch):
+    head = Bucket.head
+    monkeypatch.setattr(Bucket, "head", lambda self, name: replace(head(self, name), written=123.0))
+    assert here.now() == 123.0
 
 
 def test_of_two_that_write_the_same_object_both_have_it(here, there):
@@ -785,11 +804,15 @@ def test_a_path_is_a_folder_and_a_url_a_bucket(location, tmp_path):
 
 
 def test_every_location_and_endpoint_has_a_folder_of_its_own(monkeypatch):
-    monkeypatch.delenv("AWS_ENDPOINT_URL", raising=False)
+    for name in ("AWS_ENDPOINT_URL", "AWS_ENDPOINT"):
+        monkeypatch.delenv(name, raising=False)
     folders = [default_folder("s3://a/b"), default_folder("s3://a-b")]
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9000")
     folders.append(default_folder("s3://a/b"))
-    assert len({*folders}) == 3
+    monkeypatch.delenv("AWS_ENDPOINT_URL")
+    monkeypatch.setenv("AWS_ENDPOINT", "http://127.0.0.1:9001")
+    folders.append(default_folder("s3://a/b"))
+    assert len({*folders}) == 4
 
 
 def test_the_command_line_takes_a_location_from_the_option_and_from_the_environment(location, monkeypatch):

@@ -21,7 +21,7 @@ from ss_flow.cache.store import Store
 from ss_flow.closure import Closure, closure_of
 from ss_flow.engine import run_flow
 from ss_flow.events import Reporter
-from ss_flow.explain import first_difference
+from ss_flow.explain import first_difference, nearest
 from ss_flow.graph import INDEX, Flow, each, expand, gather, labelled, otherwise, pick, stored
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
@@ -79,6 +79,16 @@ def test_who_gets_some_of_a_list_does_not_depend_on_the_others(store):
 
     assert value(store, run(store, lambda: flow(1.0, 2.0, 4.0)).values["total"]) == 5
     assert ran(run(store, lambda: flow(1.0, 3.0, 4.0, 8.0))) == ["ss_flow_toy.source"]
+
+
+def test_an_event_names_the_steps_that_its_inputs_come_from(store):
+    def flow():
+        squares = each(toy.source(values=(1.0, 2.0)), build=toy.square)
+        return {"total": toy.total(pick(squares, [1])), "half": toy.half(squares[0])}
+
+    told = {node["label"]: set(node["inputs"].values()) for node in run(store, flow).nodes if "inputs" in node}
+    assert told["ss_flow_toy.total"] == told["ss_flow_toy.half"] == {"ss_flow_toy.square"}
+    assert told["ss_flow_toy.square[0]"] == {"ss_flow_toy.source"}
 
 
 def test_each_hands_out_positions(store):
@@ -157,6 +167,18 @@ def test_a_failed_item_fails_what_depends_on_it_and_nothing_else(store):
     assert isinstance(report.values["total"], Failure)
     assert value(store, report.values["square"]) == 1.0
     assert [f.label for f in report.failures] == ["ss_flow_toy.half[1]"]
+    (follows,) = (node for node in report.nodes if node["event"] == "skipped")
+    assert (follows["label"], follows["because"]) == ("ss_flow_toy.total", "ss_flow_toy.half[1]")
+
+
+def test_what_is_picked_of_a_list_that_failed_fails_as_it_did(store):
+    def build():
+        halves = each(toy.source(values=(4.0, -1.0)), build=toy.half)
+        return {"one": toy.square(halves[0]), "some": toy.total(pick(halves, [0]))}
+
+    report = run(store, build)
+    assert {report.values[name].label for name in ("one", "some")} == {"ss_flow_toy.half[1]"}
+    assert [failure.label for failure in report.failures] == ["ss_flow_toy.half[1]"]
 
 
 def test_with_on_error_skip_the_run_goes_on_without_the_failed_item(store):
@@ -627,12 +649,43 @@ def test_values_that_only_python_takes_for_equal_are_told_apart(then, now, said)
     assert first_difference(same, {**parts, "parameters": {"y": {"b": 2, "a": 1}, "x": float("nan")}}) == ""
 
 
+def test_why_tells_what_changed_from_cause_to_effect():
+    names = ("parameters", "code", "packages", "environment", "inputs")
+    then, now = ({"task": n, **{name: {f"a_{name}": n} for name in names}} for n in (1, 2))
+    said = []
+    for name in ("task", *names):
+        said.append(first_difference(then, now))
+        then[name] = now[name]
+    assert said == [
+        "the format of keys changed",
+        "parameter a_parameters 1 -> 2",
+        "code of a_code changed",
+        "package a_packages 1 -> 2",
+        "a_environment of this machine 1 -> 2",
+        "input a_inputs changed",
+    ]
+    assert first_difference(then, now) == ""
+    without = {**then, "parameters": {}}
+    assert first_difference(without, then) == "parameter a_parameters (absent) -> 2"
+    assert first_difference(then, without) == "parameter a_parameters 2 -> (absent)"
+    assert first_difference({**then, "code": {}}, then) == "code of a_code is new or gone"
+
+
+def test_of_calls_that_differ_in_one_parameter_the_nearest_has_the_same_code():
+    now = {"code": "a", "parameters": {"x": 1}, "packages": {}, "environment": {}, "inputs": {}}
+    other, same_code = ({**now, "parameters": {"x": 2}, "code": code} for code in "ba")
+    assert nearest([other, same_code], now) is same_code
+
+
 def test_of_long_values_why_shows_where_they_differ():
     parts = {"task": {}, "code": {}, "packages": {}, "environment": {}, "inputs": {}}
     then, now = list(range(1000)), [*range(990), 1, *range(991, 1000)]
     changed = first_difference({**parts, "parameters": {"x": then}}, {**parts, "parameters": {"x": now}})
     old, new = changed.removeprefix("parameter x ").split(" -> ")
     assert "989, 990, 991" in old and "989, 1, 991" in new and max(len(old), len(new)) <= 60
+    whole = ["a" * 59 + end for end in "bc"]
+    changed = first_difference(*({**parts, "parameters": {"x": text}} for text in whole))
+    assert changed == f"parameter x {whole[0]} -> {whole[1]}"
 
 
 def test_why_compares_a_call_with_that_one_of_its_label_that_it_differs_from_least(store):

@@ -68,7 +68,8 @@ def test_links_that_a_user_made_in_a_result_stay_links(linked, tmp_path, monkeyp
     folder = result(tmp_path / "out", "scene.ply")
     for name, what in (("folder", tmp_path), ("nothing", tmp_path / "nothing")):
         (folder / name).symlink_to(what)
-    put(folder / "notes.txt")
+    for name in ("notes.txt", "photos/0001.jpg"):
+        put(folder / name)
     if not linked:
         monkeypatch.setattr(os, "link", lambda *_, **__: os.readlink(tmp_path))  # fails as on a disk that has no links
     with replacing_own(folder, RESULT) as filling:
@@ -77,7 +78,7 @@ def test_links_that_a_user_made_in_a_result_stay_links(linked, tmp_path, monkeyp
         "folder": str(tmp_path),
         "nothing": str(tmp_path / "nothing"),
     }
-    assert (folder / "notes.txt").read_text() == "mine"
+    assert (folder / "notes.txt").read_text() == (folder / "photos/0001.jpg").read_text() == "mine"
 
 
 def test_names_that_another_disk_spells_otherwise_are_the_same(tmp_path):

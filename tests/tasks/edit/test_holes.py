@@ -104,6 +104,16 @@ def test_a_place_that_a_view_looked_through_is_not_filled(seen, removed):
     assert not after.filled.any() and len(after) == len(removed)
 
 
+def test_what_was_hidden_inside_of_what_has_left_goes_when_its_hole_is_filled(seen):
+    measured, scene = seen
+    centre, size = box_scene.BOXES[BOX - 1].mean(axis=0), np.diff(box_scene.BOXES[BOX - 1], axis=0)[0]
+    places = (centre + np.random.default_rng(0).uniform(-0.15, 0.15, (40, 3)) * size).astype(np.float32)
+    hidden = operations.begin(initialise(places, np.full((40, 3), 255, np.uint8), 1, 1.0, opacity=0.9))
+    now = operations.joined([scene, hidden])
+    after = fill(now, operations.remove(now, instances=(BOX,)), measured, instances=(BOX,), gone=(BOX,))
+    assert after.filled.any() and not np.isin(after.means, places).all(axis=1).any()
+
+
 def test_where_nothing_is_left_nothing_is_filled(seen):
     measured, scene = seen
     nothing = operations.remove(scene, instances=(0, 1, 2, 3))

@@ -12,10 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
-from ss_flow.tasks.artifacts import EditedScene, Gaussians
+from ss_flow.tasks.artifacts import Cameras, EditedScene, Gaussians
+from ss_flow.tasks.deliver.compressed import decompressed
 from ss_flow.tasks.deliver.ply import write_gaussians
 from ss_flow.tasks.edit import operations
 from ss_flow.tasks.edit.operations import Motion, some_rows
+from ss_flow.tasks.edit.pictures import before_and_after
 from ss_flow.tasks.gaussians.initialise import SH_ZERO
 from ss_flow.tasks.gaussians.read_ply import read_columns
 from ss_flow.tasks.gaussians.render import render
@@ -202,3 +204,20 @@ def test_only_a_scene_with_filled_gaussians_has_the_column_that_says_so(tmp_path
     flags = np.arange(len(scene)) % 2
     write_gaussians(tmp_path / "b.ply", replace(scene, filled=flags.astype(np.uint8)), labelled=True)
     assert np.array_equal(read_columns(tmp_path / "b.ply")["filled"], flags)
+
+
+def test_pictures_show_the_three_views_that_changed_most_before_on_the_left_and_after_on_the_right():
+    before = scene_of()
+    after = operations.remove(before, instances=(1,))
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])  # looks the other way: nothing to be seen
+    poses = [POSE if shows else away for shows in (False, True, True, False, True)] + [POSE.copy()]
+    poses[5][2, 3] = 9.0  # far off
+    k = len(poses)
+    cameras = Cameras(
+        tuple("abcdef"), np.tile(np.int32([64, 48]), (k, 1)), np.tile([60.0, 60, 32, 24], (k, 1)), np.array(poses), True
+    )
+    found = before_and_after(before, after, cameras)
+    assert [picture.name for picture in found] == [f"{name}: before and after" for name in "bce"]
+    shown = np.concatenate([render(scene, camera_at(POSE)).rgb for scene in (before, after)], axis=1)
+    assert np.abs(decompressed(found[0].content) / 255 - shown.clip(0, 1)).mean() < 0.02
+    assert before_and_after(before, some_rows(after, np.zeros(len(after), bool)), cameras) == ()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import LabelMap
+from ss_flow.tasks.artifacts import Hierarchy, LabelMap
 from ss_flow.tasks.evaluate.instances import evaluate_masks
 
 
@@ -64,6 +64,17 @@ def test_an_unmatched_prediction_is_a_false_positive_only_when_it_lies_mostly_on
     outside = evaluate_masks(_maps([[*good, 0, 6, 6, 6, 6, 0]]), truth, zero_is_void=True).values
     assert inside["rq"] == pytest.approx(1 / 1.5)
     assert outside["rq"] == 1
+
+
+def test_predicted_stuff_is_no_false_positive_where_only_things_are_annotated() -> None:
+    truth, predicted = _maps([[1, 1, 0, 0, 0, 0, 0, 0]]), _maps([[5, 5, 8, 8, 9, 9, 0, 0]])
+    tree = Hierarchy(np.int32([5, 8, 9]), np.zeros(3, np.int32), np.ones(3, np.float32), np.array([False, True, False]))
+    values = evaluate_masks(predicted, truth, tree).values
+    assert values["pq"] == pytest.approx(1 / 2) and values["pq_things"] == pytest.approx(1 / 1.5)
+    assert "pq_things" not in evaluate_masks(predicted, truth).values
+    # Beside what lies on void, which is none either.
+    void = evaluate_masks(_maps([[5, 5, 8, 8, 8, 9, 9, 9]]), _maps([[1, 1, 2, 2, 2, 2, 0, 0]]), tree, zero_is_void=True)
+    assert void.values["pq_things"] == pytest.approx(void.values["pq"]) == pytest.approx((1 + 3 / 4) / 2)
 
 
 def test_nothing_predicted_scores_zero() -> None:

@@ -159,6 +159,15 @@ def test_rendered_features_find_and_localise(tmp_path: Path) -> None:
     swapped = (("red mug", "blue"), ("blue box", "red"))
     values = langsplat_2d(FRAMES, CAMERAS, SCENE, DESCRIPTORS, labels=labels, texts=swapped).values
     assert values["localised"] == 0 and values["macc25"] == 0
+    one = langsplat_2d(FRAMES, CAMERAS, SCENE, DESCRIPTORS, labels=labels, texts=texts[:1]).values
+    assert one["localised"] == one["macc25"] == 0.5, "a category without a text scores 0"
+
+
+def test_a_label_file_that_is_damaged_is_named(tmp_path: Path) -> None:
+    labels = _labels(tmp_path, a=MUG_AND_BOX)
+    labels.files[0].path.write_text("{")
+    with pytest.raises(InputError, match=r"a\.json cannot be read as JSON"):
+        _strict(labels, "red mug")
 
 
 @pytest.mark.parametrize(("columns", "found"), [((20, 24), (20, 24)), ((20, 23), (0, 0)), ((0, 3), (0, 2))])

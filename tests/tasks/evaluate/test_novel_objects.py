@@ -94,6 +94,15 @@ def test_pixels_that_are_not_valid_do_not_count() -> None:
     assert found.psnr.tolist() == [100, 100] and found.whole_psnr == 100
 
 
+def test_a_view_without_an_object_has_no_band_and_counts_in_the_whole_alone() -> None:
+    cameras = Cameras(("a", "b"), *(np.repeat(x, 2, axis=0) for x in list(vars(CAMERAS).values())[1:4]), True)
+    frames = _frame(SEEN // 2), replace(_frame(SEEN), name="b")
+    alone = object_views(frames[:1], CAMERAS, SCENE, (TRUTH,))
+    found = object_views(frames, cameras, SCENE, (TRUTH, LabelMap("b", np.zeros_like(TRUTH.ids))))
+    assert (found.band_psnr, found.psnr.tolist()) == (alone.band_psnr, alone.psnr.tolist())
+    assert found.whole_psnr == pytest.approx((alone.whole_psnr + 100) / 2)
+
+
 def test_views_without_an_object_are_refused() -> None:
     with pytest.raises(InputError, match="show no instance"):
         object_views((_frame(SEEN),), CAMERAS, SCENE, (LabelMap("a", np.zeros_like(TRUTH.ids)),))

@@ -89,6 +89,8 @@ def test_the_oracle_picks_by_ground_truth_and_uses_an_instance_once() -> None:
 def test_oracle_scores_are_means_of_frame_means() -> None:
     scores = oracle_scores([[1.0, 0.0], [0.25], []])
     assert scores == pytest.approx({"miou": (0.5 + 0.25) / 2, "macc25": (0.5 + 1) / 2, "macc50": (0.5 + 0) / 2})
+    assert oracle_scores([[0.25, 0.5, 0.49, 0.24]])["macc25"] == 0.75, "an IoU of exactly 0.25 is a hit"
+    assert oracle_scores([[0.25, 0.5, 0.49, 0.24]])["macc50"] == 0.25, "and one of exactly 0.5"
 
 
 @pytest.mark.parametrize(
@@ -99,6 +101,7 @@ def test_oracle_scores_are_means_of_frame_means() -> None:
         {"info": {"name": "a", "width": "wide", "height": 4}, "objects": []},
         _document(("mug", [[0, 0], [1, 1]])),
         _document(("mug", [])),
+        _document(("mug", [[0, 0, 1], [3, 0, 1], [3, 3, 1]])),
         {**_document(), "objects": [{"category": "mug"}]},
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,12 +22,14 @@ from ss_flow.tasks.evaluate.points import (
     evaluate_gaussians,
     evaluate_points,
     ig_metrics,
+    instance_ious,
     lifted,
     point_metrics,
     transfer_nearest,
 )
 from ss_flow.tasks.evaluate.scannet import scannet_truth
 from ss_flow.tasks.evaluate.scannet_ap import scannet_ap
+from ss_flow.tasks.gaussians.initialise import initialise
 
 TRUTH = np.array([0, 0, 0, 0, 1, 1, 2, -1])
 PREDICTED = np.array([5, 5, 5, 7, 7, 7, 5, 9])
@@ -133,6 +136,9 @@ def test_average_precision_follows_scannets_rules() -> None:
     assert _ap(wrong, {5: 0.7, 6: 0.7, 7: 0.7}, 0.5) == pytest.approx((1 + 2 / 3) / 2 * 2 / 3)
     # What lies for more than the threshold on points without annotation is no false positive.
     assert _ap([*both, (-1, 7, 160), (1, 7, 40)], {5: 1.0, 7: 2.0, 6: 0.5}, 0.5) == 1.0
+    # With exactly that share it is one: precision 1, 0, 1/2, 2/3 at recall 0, 0, 1/2, 1.
+    half = [*both, (-1, 7, 100), (1, 7, 100)]
+    assert _ap(half, {5: 1.0, 7: 2.0, 6: 0.5}, 0.5) == pytest.approx((0 + 1 / 2) / 4 + (1 / 2 + 2 / 3) / 4)
     # Instances and predictions of fewer than 100 points do not count; what lies on such an instance is ignored.
     assert _ap([*both, (2, 8, 99), (0, 9, 30)], {5: 1.0, 6: 0.5, 8: 3.0, 9: 3.0}, 0.5) == 1.0
     assert _ap([*both, (2, 8, 90), (-1, 8, 30)], {5: 1.0, 6: 0.5, 8: 3.0}, 0.5) == 1.0
@@ -145,6 +151,24 @@ def test_below_one_half_the_first_prediction_is_taken_and_the_surest_counts() ->
     # 6 meets both, but was not taken: right for both, and wrong besides. Precision 1, 1, 2/3 at recall 0, 1/2, 1.
     twice = _ap([(0, 5, 100), (0, 6, 100), (1, 6, 100), (1, 0, 100)], {5: 0.9, 6: 0.4}, 0.25)
     assert twice == pytest.approx(1 / 2 + (1 + 2 / 3) / 2 / 2)
+
+
+def test_the_surer_predictions_are_those_of_more_confidence_and_of_more_views() -> None:
+    count = [200, 200, 40, 160, 300]
+    truth, predicted = np.repeat([0, 1, -1, 2, 2], count), np.repeat([5, 6, 7, 7, 0], count)
+    place = np.arange(len(truth))[:, None] * np.float32([1, 0, 0])
+    instances = [
+        SimpleNamespace(instance_id=i, confidence=confidence, views=("v",) * views)
+        for i, confidence, views in ((5, 0.5, 16), (7, 0.9, 4), (6, 0.2, 25))  # times the root: 2, 1.8 and 1
+    ]
+    found = evaluate_points(
+        _cloud(place), _labels(predicted.tolist()), instances, TruePoints(place, truth.astype(np.int32))
+    )
+    # As in the second case above: the wrong one comes between two right ones.
+    assert found.values["ap50"] == pytest.approx(1 / 3 + (1 / 2 + 2 / 3) / 2 / 3)
+    assert found.values["ap"] == pytest.approx(found.values["ap50"]), "the mean over all thresholds, from 0.5 on"
+    assert found.values["ap25"] == 1.0
+    assert found.values["num_truth"] == 3 and found.values["pq"] == pytest.approx(2 / 3)
 
 
 def test_without_predictions_or_instances_that_count_the_average_precision_is_zero() -> None:
@@ -213,3 +237,18 @@ def test_damaged_annotations_are_named(tmp_path: Path) -> None:
     files["segments"].path.write_text('{"segIndices": [0, 0, 1, 1, 2, 3]}')
     with pytest.raises(InputError, match="segGroups is expected"):
         scannet_truth(**files)
+    files["mesh"].path.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    with pytest.raises(InputError, match=r"mesh\.ply holds no vertices"):
+        scannet_truth(**files)
+
+
+def test_each_true_instance_has_the_label_that_covers_it_best() -> None:
+    place = np.arange(20)[:, None] * np.float32([1, 0, 0])
+    # 5 has most of the chair and all of the table besides, 6 the rest of the chair.
+    truth, predicted = np.repeat([0, 1, 3, -1], [4, 12, 2, 2]), np.repeat([5, 6, 5, 0], [3, 1, 12, 4])
+    scene = initialise(place, np.zeros((20, 3), np.uint8), predicted.astype(np.int32), 1.0)
+    found = instance_ious(scene, TruePoints(place, truth.astype(np.int32), ("chair", "table")))
+    assert found.instance.tolist() == [0, 1, 3] and found.names == ("chair", "table", "")
+    assert found.best.tolist() == [6, 5, 0] and found.iou.tolist() == pytest.approx([1 / 4, 12 / 15, 1])
+    with pytest.raises(InputError, match="no annotated point"):
+        instance_ious(scene, TruePoints(place, np.full(20, -1, np.int32)))

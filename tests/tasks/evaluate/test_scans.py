@@ -119,6 +119,14 @@ def test_damaged_files_of_replica_are_named(tmp_path: Path) -> None:
     files["info"].path.write_text('{"objects": [{"id": 1}]}')
     with pytest.raises(InputError, match=r"info_semantic\.json cannot be read"):
         replica_truth(**files)
+    whole = files["mesh"].path.read_bytes()
+    last = struct.pack("<6f3B", 3, 1, 0, 0, 0, 1, 9, 9, 9)
+    files["mesh"].path.write_bytes(whole.replace(b"element vertex 8", b"element vertex 7").replace(last, b""))
+    with pytest.raises(InputError, match=r"mesh_semantic\.ply has faces of vertices that it does not hold"):
+        replica_truth(**files)
+    files["mesh"].path.write_bytes(whole.replace(b"int object_id", b"int some_other"))
+    with pytest.raises(InputError, match=r"no faces with an object_id"):
+        replica_truth(**files)
     files["info"].path.unlink()
     with pytest.raises(InputError, match=r"no info_semantic\.json"):
         scan_truth(folder.parent, _reference)
@@ -134,6 +142,8 @@ def test_things_and_stuff_have_a_quality_of_their_own() -> None:
         "pq_things": pytest.approx(0.6),
         "pq_stuff": 0.0,
     }
+    unlabelled = quality_by_kind(truth, np.array([5] * 6 + [0] * 6 + [5]), stuff)
+    assert unlabelled == {"pq_things": 1.0, "pq_stuff": 0.0}, "what has no label is no prediction"
 
 
 def test_what_lies_mostly_where_nothing_is_annotated_is_no_false_positive_of_either_kind() -> None:

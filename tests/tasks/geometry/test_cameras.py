@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view, project, surface_of_pixels
+from ss_flow.tasks.artifacts import Cameras
+from ss_flow.tasks.geometry.cameras import (
+    Camera,
+    backproject,
+    looking,
+    nearest_views,
+    pixels_in_view,
+    project,
+    surface_of_pixels,
+)
 
 
 def turned() -> Camera:
@@ -63,3 +72,16 @@ def test_a_crop_keeps_the_borders_of_its_photo():
     assert camera.cropped(20, 3, 38, 12).scaled(5, 7).cropped(1, 1, 3, 4).borders == camera.borders
     assert camera.scaled(80, 15).borders == pytest.approx(camera.borders)
     assert camera.scaled(80, 15).photo_borders is None
+
+
+def test_the_nearest_views_are_other_ones_that_look_within_45_degrees_of_the_same_way():
+    places = [(0.0, 0), (2.0, 0), (-1.0, 44), (0.5, 46), (3.0, -44), (0.1, 180)]
+    ways = np.radians([turn for _, turn in places])
+    poses = [
+        looking(np.array([x, 0, 0]), np.array([np.sin(way), 0, np.cos(way)]), np.array([0, 1, 0]))
+        for (x, _), way in zip(places, ways, strict=True)
+    ]
+    names, k = tuple("abcdef"), len(poses)
+    cameras = Cameras(names, np.full((k, 2), 9, np.int32), np.ones((k, 4)), np.array(poses), True)
+    assert nearest_views(cameras, 0, 2) == [2, 1] and nearest_views(cameras, 0, 9) == [2, 1, 4]
+    assert nearest_views(cameras, 5, 9) == []

@@ -36,8 +36,15 @@ AHEAD, BACK, UP, DOWN, LEFT, RIGHT = (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1
         (posed((DOWN, AHEAD), (DOWN, LEFT), (DOWN, BACK), (DOWN, RIGHT)), UP),
         (posed((AHEAD, UP), (AHEAD, DOWN)), BACK),
         (posed((AHEAD, LEFT), (BACK, RIGHT)), LEFT),
+        (posed(*[(DOWN, AHEAD), (DOWN, BACK)] * 9, (DOWN, AHEAD)), UP),
     ],
-    ids=["upright", "straight down from all sides", "opposite", "opposite and facing each other"],
+    ids=[
+        "upright",
+        "straight down from all sides",
+        "opposite",
+        "opposite and facing each other",
+        "straight down, from one side once more",
+    ],
 )
 def test_up_is_what_photos_agree_on_else_where_they_look_away_from_else_the_first_ones(poses, up):
     np.testing.assert_allclose(up_of(poses), up, atol=1e-12)

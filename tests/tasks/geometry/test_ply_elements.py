@@ -44,11 +44,10 @@ def test_scalars_and_lists_come_back_as_they_were_written(tmp_path: Path, form: 
     assert found["face"]["object_id"].tolist() == [-1, 12]
 
 
-def test_an_element_without_rows_is_empty(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_an_element_without_rows_is_empty(tmp_path: Path, form: str) -> None:
     path = tmp_path / "none.ply"
-    header = (
-        "ply\nformat binary_little_endian 1.0\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
-    )
+    header = f"ply\nformat {form} 1.0\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
     path.write_bytes(header.encode())
     assert read_elements(path)["face"]["vertex_indices"].shape == (0, 0)
 

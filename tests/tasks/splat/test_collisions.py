@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Appearances, Gaussians
 from ss_flow.tasks.splat.collisions import collision_matrix, group_box, match_pairs
+from ss_flow.tasks.splat.merge import collision_box
 from ss_flow.tasks.splat.plan import PlanParams, plan
 
 UNTIL_NONE = PlanParams(max_rounds=1_000_000)
@@ -65,6 +66,14 @@ def table_cup_book_floor_lamp() -> dict[str, Gaussians]:
         ),
         "E": group(spread(10, [9, 9, 9], [10, 10, 10]), 5),
     }  # fmt: skip
+
+
+def test_the_box_of_what_collides_is_that_of_the_solid_centres_widened_by_a_share_of_its_diagonal():
+    solid = group(spread(201, [0, 0, 0], [30, 40, 0]), 1)  # of which 1 is trimmed off at each end
+    faint = group([[99, 99, 99]], 1, opacity=0.05)
+    box = np.array([[0.15, 0.2, 0], [29.85, 39.8, 0]])
+    np.testing.assert_allclose(collision_box(union(solid, faint), 0.0), box, atol=1e-6)
+    np.testing.assert_allclose(collision_box(union(solid, faint), 0.1), box + 4.95 * np.array([[-1], [1]]), atol=1e-6)
 
 
 def test_the_golden_scene_has_the_collision_shares_of_the_specification():

@@ -16,16 +16,19 @@ from ss_flow.tasks.artifacts import Appearances, Gaussians
 from ss_flow.tasks.gaussians.initialise import concatenate, extents, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainResult
+from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE, TrainView
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
+from ss_flow.tasks.splat import global_pass as global_module
+from ss_flow.tasks.splat import guard as guard_module
 from ss_flow.tasks.splat import merge as module
 from ss_flow.tasks.splat import reconstruct as reconstruct_module
 from ss_flow.tasks.splat.global_pass import assemble, global_pass
-from ss_flow.tasks.splat.guard import Quality, acceptable
-from ss_flow.tasks.splat.merge import MergeParams, merge_pair
+from ss_flow.tasks.splat.guard import Quality, acceptable, guarded, quality
+from ss_flow.tasks.splat.merge import MergeParams, extent, merge_pair
 from ss_flow.tasks.splat.plan import PlanParams, plan
 from ss_flow.tasks.splat.reconstruct import ReconstructParams, reconstruct, retrain, thin
 from ss_flow.tasks.splat.render_masks import RenderMasksParams, render_masks
@@ -164,6 +167,16 @@ def test_a_merge_leaves_what_is_far_from_the_smaller_group_as_it_was(built):
     assert not same(select(merged, merged.instance_id == 1), built.box)
 
 
+def test_a_merge_keeps_what_it_does_not_reach_though_no_view_shows_it(built):
+    away = replace(built.box, means=built.box.means + np.float32(50))
+    whole = concatenate([built.box, away])
+    merged = merge_pair(built.views, whole, built.ball, built.scene.maps, params=MERGE, w_mask=0.05)
+    assert (merged.means > 25).all(axis=1).sum() == len(away)
+    everywhere = replace(MERGE, local=False)
+    merged = merge_pair(built.views, whole, built.ball, built.scene.maps, params=everywhere, w_mask=0.05)
+    assert not (merged.means > 25).all(axis=1).any()
+
+
 @pytest.mark.parametrize(("steps", "expected"), [(3, [0, 4, 7]), (8, range(8)), (30, range(8))])
 def test_of_more_views_than_steps_as_many_are_trained_on_evenly_spread(built, monkeypatch, steps, expected):
     heard = []
@@ -178,6 +191,42 @@ def test_of_more_views_than_steps_as_many_are_trained_on_evenly_spread(built, mo
     np.testing.assert_array_equal(heard, built.scene.cameras.world_to_camera[list(expected)])
 
 
+def test_steps_grow_with_the_views_within_their_limits(built):
+    params = ReconstructParams(iterations_per_view=8, min_iterations=30, max_iterations=60, background_scale=2.0)
+
+    def steps(instance_id: int, views: int) -> int:
+        return params.iterations(built.scene.instance(instance_id, views=tuple(range(views))))
+
+    assert [steps(1, views) for views in (2, 5, 8)] == [30, 40, 60]
+    assert [steps(0, views) for views in (2, 5, 8)] == [60, 80, 120]
+    merging = MergeParams(iterations_per_view=6, min_iterations=20, max_iterations=40)
+    assert [merging.iterations(views) for views in (2, 5, 8)] == [20, 30, 40]
+
+
+def test_the_background_gets_more_steps_points_and_gaussians_and_things_the_surface_that_joins_them(built, monkeypatch):
+    asked, free = [], []
+
+    def listening(initial, views, params, **_):
+        asked.append((len(initial), params.iterations, params.max_gaussians))
+        free.append(max(view.free.mean() for view in views))
+        return TrainResult(initial, 0, np.zeros(0, np.float32))
+
+    monkeypatch.setattr(reconstruct_module, "train", listening)
+    params = ReconstructParams(max_points=200, max_gaussians=500, background_scale=2.0, max_iterations=40)
+    for instance_id in (0, 1):
+        reconstruct(built.views, built.scene.instance(instance_id), params=params)
+    assert free[0] < 0.005 < 0.1 < free[1], "the background goes on unseen behind all else"
+    assert 200 < asked[0][0] <= 400 and asked[0][1:] == (80, 1000)
+    assert 100 < asked[1][0] <= 200 and asked[1][1:] == (40, 500)
+    half = built.scene.instance(1)
+    rows = np.flatnonzero(half.points[:, 0] > 0)
+    own = ("points", "colors", "point_confidence", "point_part")
+    half = replace(half, **{name: getattr(half, name)[rows] for name in own})
+    for share in (0.7, 0.0):
+        reconstruct(built.views, half, params=replace(params, max_points=0, tau_agree=share))
+    assert asked[2][0] > 1.2 * len(rows) and asked[3][0] == len(rows)
+
+
 def test_retraining_happens_only_where_refinement_changed_a_mask(built):
     instance = built.scene.instance(2)
     again = replace(TRAIN, retrain_share=0.1)
@@ -189,6 +238,7 @@ def test_retraining_happens_only_where_refinement_changed_a_mask(built):
         assert retrain(built.views, changed, instance, built.ball, params=TRAIN) is built.ball, "a share of 0"
         result = retrain(built.views, changed, instance, built.ball, params=again)
         assert not same(result, built.ball) and len(result)
+        assert len(retrain(built.views, changed, instance, module.NO_GAUSSIANS, params=again)), "from the points"
 
 
 def test_what_was_first_trained_on_dilated_masks_is_trained_again_on_the_masks_themselves(built):
@@ -218,6 +268,19 @@ def test_a_refinement_that_ruins_the_pair_is_undone_with_a_warning(built, monkey
     assert ruined_pair.opacities.max() < 0.05
 
 
+def test_a_merge_keeps_of_what_it_trained_what_is_neither_faint_nor_unseen(built):
+    rows = np.argsort(render(built.ball, camera_of(built.scene.cameras, 0)).max_contribution)[-3:]
+    shown, faint, unseen = (select(built.ball, rows[[i]]) for i in range(3))
+    alone = concatenate([
+        shown,
+        replace(faint, means=faint.means + np.float32([0, 0, 0.5]), opacity_logits=np.float32([np.log(0.0045)])),
+        replace(unseen, means=unseen.means + 50),
+    ])  # fmt: skip
+    views = [TrainView(camera, *[np.zeros((1, 1))] * 4) for camera in built.views.cameras]
+    assert module._shows(alone, views, MergeParams()).tolist() == [True, False, False]
+    assert module._shows(alone, views, MergeParams(prune_opacity=0.0)).tolist() == [True, True, False]
+
+
 def test_merging_with_nothing_or_without_views_is_the_plain_union(built):
     nothing = module.NO_GAUSSIANS
     assert same(merge_pair(built.views, nothing, built.ball, built.scene.maps, params=MERGE, w_mask=0.05), built.ball)
@@ -227,6 +290,44 @@ def test_merging_with_nothing_or_without_views_is_the_plain_union(built):
         union = merge_pair(built.views, built.box, built.ball, unseen, params=MERGE, w_mask=0.05)
     assert same(union, assemble((built.ball, built.box)))
     assert len(assemble(())) == 0
+
+
+def test_cameras_at_one_place_leave_lengths_to_the_size_of_the_instance(built, monkeypatch):
+    views = [TrainView(camera, *[np.zeros((1, 1))] * 4) for camera in built.views.cameras]
+    params = replace(MERGE, extent="cameras")
+    assert extent(built.box, views, params) == pytest.approx(1.1 * 2.2)
+    np.testing.assert_array_equal(extent(built.box, views[:1], params), extents(built.box))
+    asked = []
+
+    def listening(initial, views, extent, **_):
+        asked.append(extent)
+        return TrainResult(initial, 0, np.zeros(0, np.float32))
+
+    monkeypatch.setattr(reconstruct_module, "train", listening)
+    instance = built.scene.instance(1, views=(0,))
+    for measured in ("cameras", "instance"):
+        reconstruct(built.views, instance, params=replace(TRAIN, extent=measured, tau_agree=0.0))
+    assert asked[0] == asked[1] > 0
+
+
+def test_what_has_no_gaussians_is_left_to_the_background_where_there_is_one(built, monkeypatch):
+    asked = []
+
+    def listening(initial, views, **_):
+        asked.append([view.inside.mean() for view in views])
+        return TrainResult(initial, 0, np.zeros(0, np.float32))
+
+    monkeypatch.setattr(global_module, "train", listening)
+    params = replace(MERGE, relabel_after=0, side_weight=0.0, guard_views=0)
+    for scene in (assemble((built.background, built.box)), built.box):
+        global_pass(built.views, scene, built.scene.maps, params=params)
+    assert asked[0] == [1] * VIEWS and max(asked[1]) < 0.2
+
+
+def test_a_last_pass_of_no_steps_and_of_nothing_changes_nothing(built):
+    none = replace(MERGE, global_iterations=0)
+    assert global_pass(built.views, built.ball, built.scene.maps, params=none) is built.ball
+    assert len(global_pass(built.views, module.NO_GAUSSIANS, built.scene.maps, params=MERGE)) == 0
 
 
 def test_thinning_keeps_points_spread_over_the_whole_surface():
@@ -259,6 +360,23 @@ def test_an_instance_without_gaussians_keeps_its_masks_where_the_scene_shows_bac
     for mine, truth in zip(drawn(built, without, background="anywhere"), built.scene.maps, strict=True):
         np.testing.assert_array_equal(mine.ids == 2, (truth.ids == 2) & (mine.ids != 1))
     assert not any((m.ids == 9).any() for m in drawn(built, whole))
+
+
+def test_masks_that_end_where_the_photo_changes_lose_less_to_the_scene_by_the_photo(built, whole):
+    def wrong(**options) -> int:
+        return sum(
+            (m.ids != t.ids).sum() for m, t in zip(drawn(built, whole, **options), built.scene.maps, strict=True)
+        )
+
+    assert wrong() == wrong(strips="photo") < 0.9 * wrong(strips="scene")
+
+
+def test_where_the_scene_shows_nothing_there_is_no_instance(built, whole):
+    scene = select(whole, whole.instance_id > 0)
+    far = scene.means + np.float32([0, 0, 90]) * (scene.instance_id == 1)[:, None]
+    options = {"background": "anywhere", "strips": "scene", "most": 1.0}
+    for mine, truth in zip(drawn(built, replace(scene, means=far), **options), built.scene.maps, strict=True):
+        assert not (mine.ids == 1).any() and (mine.ids[truth.ids == 2] == 2).mean() > 0.8
 
 
 def test_the_background_takes_no_more_of_a_mask_than_its_fringe_and_only_where_depth_is_known(built, whole):
@@ -344,6 +462,32 @@ def test_a_loss_is_accepted_within_its_limit_or_when_the_other_gains_much_more()
         assert acceptable(old, old, MergeParams(**limits))
 
 
+def test_the_quality_of_gaussians_is_that_counted_over_the_pixels_of_their_masks(built):
+    both, camera = concatenate([built.box, built.ball]), camera_of(built.scene.cameras, 0)
+    shown = render(both, camera, label_ids=[1, 2])
+    box, ball = shown.label_masks >= 0.5
+    ids = np.where(box, 0, np.where(ball, 1, NONE_OF_MINE))
+    said, beside = np.flatnonzero(box)[: box.sum() // 4], np.flatnonzero(ball)[: ball.sum() // 3]
+    ids.ravel()[said] = IGNORED  # no error, whatever is shown there
+    ids.ravel()[beside] = NONE_OF_MINE
+    inside, nothing = ids >= 0, np.zeros(ids.shape, bool)
+    image = shown.rgb + np.where(inside, 0.1, 0.5)[..., None].astype(np.float32)
+    view = TrainView(camera, image, inside, nothing, np.zeros(ids.shape, np.float32), ids)
+    found = quality(both, [view, replace(view, inside=nothing)], np.int32([1, 2]))
+    assert found.iou == pytest.approx((1 + 1 - len(beside) / ball.sum()) / 2)
+    assert found.psnr == pytest.approx(20, abs=1e-3)
+    assert quality(both, [replace(view, inside=nothing)], np.int32([1, 2])) == Quality(1.0, 100.0)
+
+
+@pytest.mark.parametrize(("most", "looked_at"), [(3, [0, 3, 6]), (8, range(8)), (12, range(8))])
+def test_the_guard_measures_before_and_after_on_as_many_views_evenly_spread(built, monkeypatch, most, looked_at):
+    heard = []
+    monkeypatch.setattr(guard_module, "quality", lambda *measured: heard.append(measured[:2]) or Quality(1.0, 30.0))
+    params = replace(MERGE, guard_views=most)
+    assert guarded(built.box, built.ball, list(range(8)), np.int32([1]), params) is built.ball
+    assert heard == [(built.box, list(looked_at)), (built.ball, list(looked_at))]
+
+
 def test_no_gaussian_outgrows_its_instance_unless_it_starts_larger(built):
     instance = built.scene.instance(1)
     start = float(np.exp(initialise(instance.points, instance.colors, 1, 1.0).log_scales).max())
@@ -367,6 +511,14 @@ def test_an_instance_that_only_excluded_pixels_show_stays_as_its_points_and_is_t
     views = replace(built.views, frames=tuple(replace(frame, valid=nothing) for frame in built.scene.frames))
     with pytest.warns(UserWarning, match="No view shows instance 1"):
         kept = reconstruct(views, instance, params=replace(TRAIN, max_points=0))
+    np.testing.assert_array_equal(kept.means, instance.points)
+
+
+def test_an_instance_of_which_training_leaves_nothing_stays_as_its_points_and_is_told(built, monkeypatch):
+    instance, nothing = built.scene.instance(1), TrainResult(module.NO_GAUSSIANS, 0, np.zeros(0, np.float32))
+    monkeypatch.setattr(reconstruct_module, "train", lambda *_, **__: nothing)
+    with pytest.warns(UserWarning, match="Training left nothing of instance 1"):
+        kept = reconstruct(built.views, instance, params=replace(TRAIN, max_points=0, tau_agree=0.0))
     np.testing.assert_array_equal(kept.means, instance.points)
 
 
