@@ -37,6 +37,7 @@ from ss_flow.tasks.capture.scene_files import NO_POSE, SceneFiles
 from ss_flow.tasks.capture.sfm import registered
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.lying import quarter_turns
 from ss_flow.tasks.models.catalogue import Model
 
 
@@ -74,6 +75,8 @@ class Capture:
     """Whether the views fit together."""
     given: Gaussians | None = None
     """The scene that is to be labelled, where one was trained elsewhere."""
+    turns: int = 0
+    """Quarter turns, counterclockwise, by which networks are to see the photos turned."""
 
     @property
     def views(self) -> Views:
@@ -142,7 +145,16 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         colours=evened,
         checks=checks(frames, cameras, depths, params=params.checks),
         given=given,
+        turns=int(turned(scene, params).turns),
     )
+
+
+def turned(scene: SceneFiles, params: CaptureParams) -> CaptureParams:
+    """With the turns that "auto" comes to. Photos without poses stand upright, turned as their EXIF says."""
+    if params.turns != "auto":
+        return params
+    known = scene.world_to_camera
+    return replace(params, turns="0" if known is None else str(quarter_turns(known)))
 
 
 def _placed(

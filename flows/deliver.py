@@ -48,6 +48,10 @@ UNCOMPARED = (
     "The poses that came with the capture are taken as they are: they could be compared with the photos if pycolmap "
     "were on this machine."
 )
+LYING = (
+    "By their poses the photos lie on their side, so networks see them turned upright; masks and all else stay as the "
+    "photos are. capture.turns=0 leaves them as they are, capture.turns=2 is for a camera that hung upside down."
+)
 FALLBACKS = {
     "segmenter": "colour, depth and normals (no network)",
     "encoder": "colour words (no network)",
@@ -91,11 +95,16 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
 
 
 def remarks(scene: SceneFiles, params: Params, networks: Networks) -> list[str]:
-    """What to say of a run that leaves something out only because this machine lacks what it takes."""
+    """What to say of a run beforehand: what it leaves out only because this machine lacks it, and what it takes for so.
+
+    params: with the turns that "auto" comes to.
+    """
     brings_masks = scene.has_masks or scene.hints is not None  # hints without a segmenter are refused
     weight_free = networks.segmenter is None and params.split.segmenter == "auto" and not brings_masks
     uncompared = compares_poses(scene, params.capture) and not has_pycolmap()
-    return [*[WEIGHT_FREE] * weight_free, *[UNCOMPARED] * uncompared]
+    seen = networks.encoder is not None or (networks.segmenter is not None and not scene.has_masks)
+    lying = seen and scene.poses is not None and params.capture.turns in ("1", "3")
+    return [*[WEIGHT_FREE] * weight_free, *[UNCOMPARED] * uncompared, *[LYING] * lying]
 
 
 def node_records(report: Report) -> list[dict[str, Any]]:

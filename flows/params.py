@@ -59,6 +59,9 @@ class CaptureParams:
     refine_poses: Literal["auto", "always", "never"] = "auto"
     """Whether poses that come with the capture are first refined by bundle adjustment; "auto" does so where photos do
     not fit the given ones, and uses what it finds where photos then fit better and measured depth no worse."""
+    turns: Literal["auto", "0", "1", "2", "3"] = "auto"
+    """Quarter turns, counterclockwise, by which the segmenter and the encoder see the photos turned, since they know
+    things as they stand; "auto" turns photos that by the given poses lie on their side. Nothing else is turned."""
     monodepth: str = "auto"
     """The network for depth=mono: a name of the catalogue, or "auto"."""
     ingest: IngestParams = field(default_factory=IngestParams)

@@ -16,12 +16,15 @@ NEEDED = ("ingest", "cameras", "scene", "masks")
 
 
 def described_parts(
-    nodes: Mapping[str, Any], encoder: Model | None, params: DescribeParams
+    nodes: Mapping[str, Any], encoder: Model | None, params: DescribeParams, turns: int
 ) -> tuple[tuple[PartMasks, ...], tuple[PartDescriptors, ...]]:
     """Where the parts of all instances are seen, and what the encoder says of each.
 
-    nodes: the results of a run by name.
+    nodes: the results of a run by name. turns: as the run had it.
     """
-    params = params.in_use(encoder)
+    params, turns = params.in_use(encoder), turns if encoder is not None else 0
     parts = part_masks(nodes["cameras"], nodes["scene"], nodes["masks"])
-    return parts, each(parts, build=lambda part: describe_part(nodes["ingest"], part, encoder=encoder, params=params))
+    return parts, each(
+        parts,
+        build=lambda part: describe_part(nodes["ingest"], part, encoder=encoder, params=params, turns=turns),
+    )

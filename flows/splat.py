@@ -123,7 +123,8 @@ def described(
                 visibility=params.split.visibility,
             )
         frames = pick(capture.frames, seen)
-        return describe(frames, pictured, encoder=networks.encoder, params=describing)
+        turns = capture.turns if networks.encoder is not None else 0  # colours have no upper side
+        return describe(frames, pictured, encoder=networks.encoder, params=describing, turns=turns)
 
     return each(
         found.instances,

@@ -84,7 +84,11 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     segmenter = networks.segmenter
     embeddings: tuple[Embedding, ...] = ()
     if segmenter is not None:
-        embeddings = each(capture.frames, names=capture.names, build=lambda frame: embed(frame, model=segmenter))
+        embeddings = each(
+            capture.frames,
+            names=capture.names,
+            build=lambda frame: embed(frame, model=segmenter, turns=capture.turns),
+        )
     seen = _seen(capture, points, params)
     hinted: PointLabels | None = None
     if capture.masks is not None:

@@ -18,7 +18,7 @@ from ss_flow.engine import Report
 from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows import settings
-from ss_flow.flows.capture import Capture, capture
+from ss_flow.flows.capture import Capture, capture, turned
 from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model, choose_patches, references
 from ss_flow.flows.deliver import deliver, remarks, run_document
 from ss_flow.flows.params import Params
@@ -145,6 +145,7 @@ def prepare(
         scene = steadiest(scene, taken.stride, taken.max_frames)
     else:
         scene = scene.every(params.capture.stride)
+    params = replace(params, capture=turned(scene, params.capture))
     if params.evaluate.zero_is_void is None:
         params = replace(params, evaluate=replace(params.evaluate, zero_is_void=scene.zero_is_void))
     held_out = scene.root / "held_out"

@@ -89,7 +89,8 @@ class Query:
             descriptors = nodes["describe"]
             if self.parts:
                 describing = settings.recorded(DescribeParams(), document["params"], "semantics.describe")
-                known["parts"], descriptors = described_parts(nodes, encoder, describing)
+                turns = int(document["params"].get("capture.turns", 0))
+                known["parts"], descriptors = described_parts(nodes, encoder, describing, turns)
             found = query(descriptors, text=self.text, params=params, encoder=encoder, background=self.background)
             return {"query": found, **known}
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, Int32
+from ss_flow.tasks.geometry.lying import quarter_turns
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,12 @@ _AGREED = 0.1
 def up_of(poses: Float64 | Sequence[Float64]) -> Float64:
     """[3] the direction of length 1 that is up in most photos.
 
-    poses: [K, 4, 4] world to camera, K > 0. Photos are taken upright. Where the pictures' upper borders point all ways,
-    as in photos straight down on a table from all its sides, up is where they look away from; where they look all
-    ways, too, the first one says what is up.
+    poses: [K, 4, 4] world to camera, K > 0. Photos are taken upright, or lie on their side (`quarter_turns`). Where the
+    pictures' upper borders point all ways, as in photos straight down on a table from all its sides, up is where they
+    look away from; where they look all ways, too, the first one says what is up.
     """
-    _, down, forward = np.asarray(poses)[:, :3, :3].mean(axis=0)
+    right, down, forward = np.asarray(poses)[:, :3, :3].mean(axis=0)
+    down = {0: down, 1: -right, 3: right}[quarter_turns(poses)]
     for away in (down, forward):
         length = float(np.linalg.norm(away))
         if length >= _AGREED:

@@ -29,7 +29,9 @@ class Embedding:
     """[1, 256, 64, 64]."""
     height: int
     width: int
-    """Size of the image, in pixels."""
+    """Size of the image as the network saw it, in pixels."""
+    turns: int = 0
+    """Quarter turns, counterclockwise, by which the image was turned before."""
 
     @property
     def scale(self) -> float:
@@ -81,10 +83,11 @@ class Sam:
         self._encoder = open_session(model.file("encoder"), inputs=("input",))
         self._decoder = open_decoder(model.file("decoder"), model.names_inside)
 
-    def encode(self, rgb: UInt8) -> Embedding:
-        """The embedding of an image: rgb is [H, W, 3] uint8."""
+    def encode(self, rgb: UInt8, turns: int = 0) -> Embedding:
+        """The embedding of an image [H, W, 3] uint8, turned first by so many quarters counterclockwise."""
         import cv2
 
+        rgb = np.rot90(rgb, turns)
         height, width = rgb.shape[:2]
         scale = FRAME / max(height, width)
         inner_height, inner_width = round(height * scale), round(width * scale)
@@ -95,7 +98,7 @@ class Sam:
         )
         padded = np.zeros((1, 3, FRAME, FRAME), np.float32)
         padded[0, :, :inner_height, :inner_width] = ((small - _MEAN) / _DEVIATION).transpose(2, 0, 1)
-        return Embedding(run(self._encoder, {"input": padded})[0], height, width)
+        return Embedding(run(self._encoder, {"input": padded})[0], height, width, turns)
 
     def image(self, embedding: Embedding, *, few: bool = False) -> PromptedImage:
         """An image that prompts ask on.
@@ -122,7 +125,8 @@ class PromptedImage:
     def predict(self, points: Float32 | Float64, labels: Int32 | None = None) -> tuple[Float32, Float32]:
         """The four masks of each of M single-point prompts.
 
-        points: [M, 2] x, y in pixels of the image. labels: [M] 1 = inside (the default), 0 = outside.
+        points: [M, 2] x, y in pixels of the image as the network saw it. labels: [M] 1 = inside (the default), 0 =
+        outside.
         Returns logits: [M, 4, h, w] (see `Embedding.upsample`), predicted_iou: [M, 4].
         """
         if labels is None:
@@ -139,16 +143,25 @@ class PromptedImage:
     def predict_prompt(self, points: Float32 | Float64, labels: Int32 | None = None) -> tuple[Bool, float]:
         """The one mask that several points ask for together.
 
-        points: [n, 2] x, y in pixels of the image, n >= 1. labels: [n] 1 = inside (the default), 0 = outside, 2 and 3 =
-        upper left and lower right corner of a box round it.
-        Returns the mask [H, W] and its predicted IoU. A single point is ambiguous and gets the best of the
-        alternatives; several points get the mask made for them.
+        points: [n, 2] x, y in pixels of the image before it was turned, n >= 1. labels: [n] 1 = inside (the default),
+        0 = outside, 2 and 3 = corners of a box round it, upper left and lower right once it is turned.
+        Returns the mask [H, W] of the image before it was turned, and its predicted IoU. A single point is ambiguous
+        and gets the best of the alternatives; several points get the mask made for them.
         """
         if labels is None:
             labels = np.ones(len(points), np.int32)
-        logits, scores = self._decode(points[None], labels[None])
+        logits, scores = self._decode(self._turned(points)[None], labels[None])
         best = 1 + int(np.argmax(scores[0, 1:])) if len(points) == 1 else 0
-        return self._embedding.upsample(logits[0, best : best + 1])[0] > 0, float(scores[0, best])
+        mask = self._embedding.upsample(logits[0, best : best + 1])[0] > 0
+        return np.rot90(mask, -self._embedding.turns), float(scores[0, best])
+
+    def _turned(self, points: Float32 | Float64) -> Float32 | Float64:
+        """Where points of the image lie in it once it is turned."""
+        sides = self._embedding.height, self._embedding.width
+        for turn in range(self._embedding.turns):
+            width = sides[(self._embedding.turns - 1 - turn) % 2]
+            points = np.stack([points[:, 1], width - points[:, 0]], axis=1)
+        return points
 
     def _decode(self, points: Float32 | Float64, labels: Int32) -> tuple[Float32, Float32]:
         places = np.asarray(points, np.float64) * self._embedding.scale

@@ -59,10 +59,12 @@ def describe(
     *,
     encoder: Model | None = None,
     params: DescribeParams = DescribeParams(),
+    turns: int = 0,
 ) -> Descriptors:
     """An instance's pictures, or a part's, as unit vectors, and their mean, brought back to unit length.
 
-    frames: at least those with a mask of the instance. encoder: None for colour words.
+    frames: at least those with a mask of the instance. encoder: None for colour words. turns: by how many quarters,
+    counterclockwise, pictures are turned to stand upright.
     Returns zeros and no views when no mask covers `min_area` of its image, or erosion leaves nothing of those that do.
     Raises InputError when a frame's size is not that of the masks.
     """
@@ -90,7 +92,7 @@ def describe(
             x0, y0, x1, y1 = bounds(mask)
             vectors.append(model.encode_images([image[y0:y1, x0:x1]], [mask[y0:y1, x0:x1]])[0])
         else:
-            vectors.append(model.encode_images([crop(image, mask, params)])[0])
+            vectors.append(model.encode_images([np.rot90(crop(image, mask, params), turns)])[0])
         progress(done + 1, len(chosen), frame.name)
     of_views = np.array(vectors, np.float32).reshape(len(used), model.dimension)
     weights = (area[used] if params.weighted else np.ones(len(used))).astype(np.float32)
@@ -106,9 +108,10 @@ def describe_part(
     *,
     encoder: Model | None = None,
     params: DescribeParams = DescribeParams(),
+    turns: int = 0,
 ) -> PartDescriptors:
     """What `describe` says of a part of an instance."""
-    found = describe(frames, part, encoder=encoder, params=params)
+    found = describe(frames, part, encoder=encoder, params=params, turns=turns)
     return PartDescriptors(**vars(found), part_id=part.part_id)
 
 

@@ -126,21 +126,21 @@ class _Candidates:
 def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model: Model) -> MaskSet:
     """The masks that Segment Anything finds in one view (Split&Splat, M_k; spec S1).
 
-    embedding: the frame's, by the same model. Pixels that the frame marks as not valid belong to no mask. The masks
-    come in canonical order: area descending.
+    embedding: the frame's, by the same model, turned or not; masks are those of the frame as it is. Pixels that the
+    frame marks as not valid belong to no mask. The masks come in canonical order: area descending.
     Raises InputError when the model's files are missing, damaged or other networks.
     """
     image = Sam(model).image(embedding)
-    valid = decode_valid(frame)
+    valid = np.rot90(decode_valid(frame), embedding.turns)
     valid_low = _low_resolution(valid)
 
     grids: list[_Candidates] = []
     agreed: Int32 = np.zeros(valid_low.shape, np.int32)
     for level, side in enumerate(params.grids):
-        points = grid_points(side, frame.width, frame.height)
+        points = grid_points(side, embedding.width, embedding.height)
         points = points[valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
         if params.adaptive and level == len(params.grids) - 1:
-            points = points[_at(points, agreed, frame) < params.settled_by]
+            points = points[_at(points, agreed, embedding) < params.settled_by]
         accepted, held = _ask(image, points, level, valid_low, params, model)
         grids.append(accepted)
         agreed += held
@@ -152,7 +152,7 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
     if params.max_area < 1:
         found = found[np.flatnonzero(~whole_pictures(found.masks, valid_low, params.max_area)).astype(np.int32)]
     thresholds = np.array(params.mask_threshold, np.float32)[found.grid]
-    masks = np.empty((len(thresholds), frame.height, frame.width), bool)
+    masks = np.empty((len(thresholds), embedding.height, embedding.width), bool)
     for mask, logits, threshold in zip(masks, found.logits, thresholds, strict=True):
         mask[:] = without_speckles(embedding.upsample(logits[None])[0] > threshold, params.speckle) & valid
     if params.merge == "union":
@@ -161,7 +161,7 @@ def segment(frame: Frame, embedding: Embedding, *, params: SegmentParams, model:
         found = found[large[origin]]
     rows = np.flatnonzero(_large_enough(masks, params)).astype(np.int32)
     rows = rows[canonical_order(masks[rows])]
-    masks, found = masks[rows], found[rows]
+    masks, found = np.rot90(masks[rows], -embedding.turns, axes=(1, 2)), found[rows]
     return MaskSet(
         **vars(Masks.of(masks)),
         name=frame.name,
@@ -230,10 +230,10 @@ def _filter(
     return _Candidates(flat, masks, quality, stability, grid)[passed], prompt[passed].astype(np.int32)
 
 
-def _at(points: Float64, image: Int32, frame: Frame) -> Int32:
-    """The pixels of an image of any size [h, w] at points [M, 2] of the frame: [M]."""
+def _at(points: Float64, image: Int32, seen: Embedding) -> Int32:
+    """The pixels of an image of any size [h, w] at points [M, 2] of what the network saw: [M]."""
     h, w = image.shape
-    return image[(points[:, 1] * h / frame.height).astype(int), (points[:, 0] * w / frame.width).astype(int)]
+    return image[(points[:, 1] * h / seen.height).astype(int), (points[:, 0] * w / seen.width).astype(int)]
 
 
 def _box_iou(masks: Bool) -> Float32:

@@ -50,6 +50,25 @@ def test_prompt_on_a_disk_gives_the_disk(encoded):
 
 
 @needs_weights
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_an_image_that_is_turned_first_gives_masks_of_the_image_as_it_is(encoded, turns):
+    sam, _ = encoded
+    rgb, disk = disk_image()
+    embedding = sam.encode(rgb, turns)
+    assert (embedding.height, embedding.width) == np.rot90(disk, turns).shape
+    inside, outside = np.array([[45.0, 60.0], [75.0, 80.0]]), np.array([[155.0, 85.0]])
+    mask, _ = sam.image(embedding, few=True).predict_prompt(np.vstack([inside, outside]), np.array([1, 1, 0]))
+    assert mask.shape == disk.shape and iou(mask, disk) > 0.9
+    # The network sees the very image that lies so, and the very point.
+    place = {1: [170.0, 20.0], 2: [180.0, 120.0], 3: [30.0, 130.0]}[turns]
+    mask, score = sam.image(embedding, few=True).predict_prompt(np.array([place]))
+    lying = sam.encode(np.ascontiguousarray(np.rot90(rgb, turns)))
+    seen, same = sam.image(lying, few=True).predict_prompt(np.array([[20.0, 30.0]]))
+    np.testing.assert_array_equal(np.rot90(mask, turns), seen)
+    assert score == same
+
+
+@needs_weights
 def test_several_points_ask_for_one_mask_and_an_outside_point_keeps_the_square_away(encoded):
     sam, embedding = encoded
     points = np.array([[45.0, 60.0], [75.0, 80.0], [155.0, 85.0]])

@@ -39,9 +39,9 @@ class ScriptedSam(sam_module.Sam):
     def __init__(self, model):
         pass
 
-    def encode(self, rgb):
+    def encode(self, rgb, turns=0):
         type(self).prompts = []
-        return sam_module.Embedding(np.zeros((1, 256, 64, 64), np.float32), *rgb.shape[:2])
+        return sam_module.Embedding(np.zeros((1, 256, 64, 64), np.float32), *np.rot90(rgb, turns).shape[:2], turns)
 
     def image(self, embedding):
         return self
@@ -103,6 +103,17 @@ def test_pixels_that_do_not_count_are_in_no_mask_and_get_no_prompt(scripted):
     assert len(masks) == 2
     assert not masks.dense()[:, ~valid].any()
     assert all((points[:, 0] >= 32).all() for points in scripted.prompts)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_masks_are_those_of_the_photo_though_the_network_saw_it_turned(scripted, turns):
+    valid = np.ones((SIDE, SIDE), bool)
+    valid[:, :6] = False
+    masks = segment(frame(valid), embed(frame(valid), model=MODEL, turns=turns), params=LOOSE, model=MODEL)
+    assert len(masks) == 3 and not masks.dense()[:, ~valid].any()
+    for mask, name in zip(masks.dense(), ("table", "plate", "cup"), strict=True):
+        seen = np.rot90(rectangle(name), -turns) & valid  # the network finds the rectangles in what it sees
+        assert (mask & seen).sum() > 0.9 * (mask | seen).sum()
 
 
 FOUR_GRIDS = replace(LOOSE, grids=(1, 4, 8, 16))
