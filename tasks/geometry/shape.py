@@ -25,7 +25,7 @@ def thinned(points: Float32, enough: int) -> Float64:
 def plane_through(points: Float64) -> tuple[Float64, Float64]:
     """The plane with the least squared distances from points [N, 3]: their mean, and its unit normal."""
     centre = points.mean(axis=0)
-    return centre, np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    return centre, np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
 
 
 def plane_of_most(points: Float64, thickness: float, rounds: int) -> tuple[Float64, Float64]:
