@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64
-from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.cameras import centers_of
 
 
 def box_diagonal(points: Float32 | Float64, trim: float = 0.005) -> float:
@@ -44,7 +44,7 @@ def plane_of_most(points: Float64, thickness: float, rounds: int) -> tuple[Float
 
 def middle_of(cameras: Cameras) -> Float64:
     """[3] the mean place of the cameras."""
-    return np.mean([camera_of(cameras, view).center for view in range(len(cameras))], axis=0)
+    return np.asarray(centers_of(cameras.world_to_camera).mean(axis=0))
 
 
 def towards(normal: Float64, centre: Float64, eye: Float64) -> Float64:
