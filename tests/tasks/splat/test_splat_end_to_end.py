@@ -13,6 +13,7 @@ from view_masks import as_fields
 
 from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Appearances, Gaussians
+from ss_flow.tasks.gaussians.densification import Schedule
 from ss_flow.tasks.gaussians.initialise import concatenate, extents, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainResult
@@ -176,6 +177,15 @@ def test_of_more_views_than_steps_as_many_are_trained_on_evenly_spread(built, mo
     params = replace(TRAIN, min_iterations=1, max_iterations=steps)
     reconstruct(built.views, built.scene.instance(1), params=params)
     np.testing.assert_array_equal(heard, built.scene.cameras.world_to_camera[list(expected)])
+
+
+@pytest.mark.parametrize(("steps", "background_scale", "read"), [(120, 1.0, False), (60, 2.0, False), (120, 2.0, True)])
+def test_how_clones_and_splits_come_enters_the_key_only_where_a_training_is_long_enough_for_them(
+    built, steps, background_scale, read
+):
+    plain = replace(TRAIN, min_iterations=steps, max_iterations=steps, background_scale=background_scale)
+    for changed in ({"max_gaussians": 7}, {"densify": "none"}, {"schedule": Schedule(start=0)}):
+        assert (replace(plain, **changed).of_first() != plain.of_first()) == read
 
 
 def test_retraining_happens_only_where_refinement_changed_a_mask(built):
