@@ -189,6 +189,7 @@ TABLE = {
     "splat.refine.min_opacity": (0.0, 0.0, 0.05),
     "splat.refine.max_scale": (0.0, 0.0, 0.5),
     "splat.refine.cut_occluded": (False, False, True),
+    "splat.refine.box_margin": (0.0, 0.0, 16.0),
     "splat.reconstruct.max_scale": (0.0, 0.0, 0.05),
     "splat.merge.max_scale": (0.0, 0.0, 0.05),
     # 29
