@@ -205,7 +205,7 @@ def thin(points: Float32, limit: int) -> Int32:
 def _trained(
     scene: SceneViews, instance: InstanceMasks, initial: Gaussians, params: ReconstructParams, iterations: int
 ) -> Gaussians:
-    instance = _evenly(instance, params.iterations(instance))
+    instance = _evenly(instance, iterations)
     surface = PointSurface.of(instance.points)
     build = background_view if instance.instance_id == 0 else group_view
     row_of = scene.row_of()

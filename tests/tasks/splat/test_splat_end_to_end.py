@@ -175,7 +175,13 @@ def test_of_more_views_than_steps_as_many_are_trained_on_evenly_spread(built, mo
 
     monkeypatch.setattr(reconstruct_module, "train", listening)
     params = replace(TRAIN, min_iterations=1, max_iterations=steps)
-    reconstruct(built.views, built.scene.instance(1), params=params)
+    whole = built.scene.instance(1)
+    reconstruct(built.views, whole, params=params)
+    np.testing.assert_array_equal(heard, built.scene.cameras.world_to_camera[list(expected)])
+
+    heard.clear()
+    again = replace(params, max_iterations=4 * steps, min_iterations=4 * steps, retrain_share=0.25)
+    retrain(built.views, whole, built.scene.instance(1, views=(0,)), built.box, params=again)
     np.testing.assert_array_equal(heard, built.scene.cameras.world_to_camera[list(expected)])
 
 
