@@ -1,4 +1,7 @@
-"""What the masks and the depth of all views say together: about the pixels of one, and about points without a label."""
+"""What the masks and the depth of all views say together: about the pixels of one, and about points without a label.
+
+Beyond Split&Splat.
+"""
 
 from __future__ import annotations
 

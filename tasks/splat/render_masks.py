@@ -1,4 +1,7 @@
-"""The instance ids that the finished scene shows: what its Gaussians say of the masks they grew from."""
+"""The instance ids that the finished scene shows: what its Gaussians say of the masks they grew from.
+
+Beyond Split&Splat.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the instances of a scene should cover from where no photo was taken."""
+"""What the instances of a scene should cover from where no photo was taken. Beyond Split&Splat."""
 
 from __future__ import annotations
 
@@ -53,7 +53,8 @@ def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], c
     has no such views.
 
     scene: ordered by instance, not yet trained together. masks: exclusive label maps of all views. count: views of each
-    instance; fewer, where all instances together would have more than `most`. Returns targets whose alpha counts alone.
+    instance; where these are more than `most` in all, an equal share of `most`, rounded up. Returns targets whose alpha
+    counts alone.
     """
     own = {int(i): scene.means[scene.instance_id == i] for i in np.unique(scene.instance_id) if i}
     spacings = {i: float(np.median(neighbour_spread(centres))) for i, centres in own.items() if len(centres) >= FEWEST}

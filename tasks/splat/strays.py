@@ -1,4 +1,7 @@
-"""Gaussians that stand apart from the thing whose label they carry, where the views show something else."""
+"""Gaussians that stand apart from the thing whose label they carry, where the views show something else.
+
+Beyond Split&Splat.
+"""
 
 from __future__ import annotations
 
