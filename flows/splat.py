@@ -35,7 +35,7 @@ R = TypeVar("R")
 def splat(capture: Capture, found: Split, networks: Networks, params: Params) -> dict[str, Any]:
     """Instances -> Gaussians, each on its own; refined masks; one scene (Split&Splat, Sec. 3.2)."""
     views = capture.views
-    settings, visibility = params.splat, params.split.visibility
+    settings, visibility = params.splat, params.split.visibility.of_splat()
 
     @functools.cache
     def reconstructed(row: int) -> Gaussians:
@@ -120,7 +120,7 @@ def described(
                 pictured,
                 gaussians(row),
                 params=params.splat.refine.in_use(None),
-                visibility=params.split.visibility,
+                visibility=params.split.visibility.of_splat(),
             )
         frames = pick(capture.frames, seen)
         turns = capture.turns if networks.encoder is not None else 0  # colours have no upper side
@@ -171,7 +171,7 @@ def merge_rounds(
                     pick(masks, seen),
                     params=params.splat.merge.of_pairs(),
                     w_mask=planned.mask_weight,
-                    visibility=params.split.visibility,
+                    visibility=params.split.visibility.of_splat(),
                 )
                 # A pair that cannot be refined is joined as it is.
                 merged.append(otherwise(refined, functools.partial(assemble, pair)))

@@ -12,10 +12,9 @@ import numpy as np
 
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import DepthMap, Float32, Frame, Int32
-from ss_flow.tasks.capture.sensor_depth import resampled
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.holes import close_holes
-from ss_flow.tasks.geometry.images import decode_valid, size_within
+from ss_flow.tasks.geometry.images import decode_valid, resampled, size_within
 from ss_flow.tasks.ranges import Fraction
 
 

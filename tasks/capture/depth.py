@@ -12,7 +12,7 @@ from ss_flow.errors import InputError
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import DepthMap, Float32, Frame
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.geometry.images import averaged_valid, shared_rgb, shared_valid
+from ss_flow.tasks.geometry.images import averaged_valid, shared_rgb, shared_valid, size_within
 from ss_flow.tasks.geometry.plane_sweep import (
     SweepView,
     agreeing_depth,
@@ -131,11 +131,10 @@ def photo_at_size(frame: Frame, camera: Camera, max_side: int) -> SweepView:
     """The gray photo of a view, scaled down to a longer side of `max_side` pixels, with its camera."""
     import cv2
 
-    scale = min(1.0, max_side / max(camera.width, camera.height))
-    size = (round(camera.width * scale), round(camera.height * scale))
+    size = size_within(max_side, camera.width, camera.height)
     gray = cv2.cvtColor(shared_rgb(frame), cv2.COLOR_RGB2GRAY).astype(np.float32)
     valid = shared_valid(frame)
-    if scale < 1:
+    if size != (camera.width, camera.height):
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         valid = averaged_valid(valid, *size)
     return SweepView(gray, valid, camera.scaled(*size))

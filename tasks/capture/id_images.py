@@ -10,7 +10,7 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Cameras, Frame, LabelMap, MaskSet
 from ss_flow.tasks.capture.lens import Lens, photo_lens, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
-from ss_flow.tasks.capture.sensor_depth import resampled
+from ss_flow.tasks.geometry.images import resampled
 from ss_flow.tasks.masks.pool import masks_by_id
 
 

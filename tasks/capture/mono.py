@@ -12,7 +12,7 @@ from ss_flow.task import FileRef, Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.geometry.alignment import fit_scale_shift
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, pixels_under
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, resampled
 from ss_flow.tasks.models.onnx import load_onnxruntime, network_identity, providers
 from ss_flow.tasks.ranges import Count, Fraction, Positive
 
@@ -75,7 +75,7 @@ def mono(
     keep = inverse > 1 / farthest
     height, width = predicted.shape
     if frame.valid.size:
-        keep &= decode_valid(frame)[np.ix_(pixels_under(height, frame.height), pixels_under(width, frame.width))]
+        keep &= resampled(decode_valid(frame), height, width)
     return DepthMap(frame.name, np.where(keep, 1 / np.where(keep, inverse, 1), 0).astype(np.float32), "mono")
 
 

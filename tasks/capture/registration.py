@@ -17,7 +17,7 @@ from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame, Registration
 from ss_flow.tasks.geometry.holes import close_holes
-from ss_flow.tasks.geometry.images import decode_rgb
+from ss_flow.tasks.geometry.images import decode_rgb, resampled
 from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.unread import by_default
 
@@ -167,7 +167,7 @@ def _view(frame: Frame, intrinsics: Float64, depth: DepthMap, jump: float) -> _V
     edges = strength / (strength + 3 * np.median(strength) + 1e-6)
     values = close_holes(depth.depth)
     if values.shape[0] > height:
-        values = cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST)
+        values = resampled(values, height, width)
     center = intrinsics[2:] * (width / frame.width, height / frame.height)
     scale = width / values.shape[1], height / values.shape[0]
     return _View(edges.astype(np.float32), _outline(values, jump) * scale - center, center)

@@ -12,7 +12,7 @@ from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Frame
 from ss_flow.tasks.capture.lens import Lens, depth_to_color_map, undistortion_map
 from ss_flow.tasks.capture.photo_files import read_gray
-from ss_flow.tasks.geometry.images import decode_valid, pixels_under
+from ss_flow.tasks.geometry.images import decode_valid, resampled
 from ss_flow.tasks.words import first_of
 
 _NO_RETURN = np.iinfo(np.uint16).max
@@ -164,8 +164,3 @@ def _check_known(maps: Sequence[DepthMap], measured: bool, where: str) -> None:
         )
     views = "1 view has" if len(empty) == 1 else f"{len(empty)} views have"
     warn(f"{views} no known depth, 0 everywhere or where the valid mask is not 0: {first_of(empty)}.")
-
-
-def resampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width] an image at another size, nearest neighbour (ids and depths must not be blended)."""
-    return image[np.ix_(pixels_under(height, image.shape[0]), pixels_under(width, image.shape[1]))]

@@ -16,6 +16,7 @@ from ss_flow.tasks.capture.depth import photo_at_size, source_views
 from ss_flow.tasks.capture.patchmatch import PatchMatchParams, Source, patchmatch, stereo_identity
 from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view
 from ss_flow.tasks.geometry.holes import close_holes
+from ss_flow.tasks.geometry.images import resampled
 from ss_flow.tasks.ranges import Count, Fraction, Natural
 
 
@@ -52,21 +53,21 @@ def stereo(
     Depth stays unknown throughout where the view has none yet.
     """
     reference = photo_at_size(frames[0], cameras[0], params.max_side)
-    guess = _at_size(agreed[0].depth, reference.gray)
+    guess = resampled(agreed[0].depth, *reference.gray.shape)
     if not found.depth.any():
         return DepthMap(frames[0].name, np.zeros_like(reference.gray), "mvs")
     typical = float(np.median(found.depth[found.depth > 0]))
     lent = zip(agreed[1:], cameras[1:], strict=True)
     for other in (
         carried([(lender.depth, camera) for lender, camera in lent], reference.camera),
-        _at_size(found.depth, reference.gray),
+        resampled(found.depth, *reference.gray.shape),
         np.full_like(guess, typical),
     ):
         guess = np.where(guess > 0, guess, other)
     near, far = np.quantile(guess, (0.005, 0.995))
     guess = np.clip(guess, 0.8 * near, 1.25 * far)
     sources = [
-        Source(other, _at_size(agreed[k].depth, other.gray))
+        Source(other, resampled(agreed[k].depth, *other.gray.shape))
         for k in source_views(cameras, guess, params.sources)
         for other in (photo_at_size(frames[k], cameras[k], params.max_side),)
     ]
@@ -89,10 +90,3 @@ def carried(maps: list[tuple[Float32, Camera]], camera: Camera) -> Float32:
         np.minimum.at(front, row * camera.width + column, z.astype(np.float32))
     seen: Bool = np.isfinite(front)
     return close_holes(np.where(seen, front, 0).astype(np.float32).reshape(camera.height, camera.width))
-
-
-def _at_size(depth: Float32, like: Float32) -> Float32:
-    import cv2
-
-    size = (like.shape[1], like.shape[0])
-    return cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST) if depth.shape != like.shape else depth

@@ -49,14 +49,19 @@ class Schedule:
     reset_every: Count = 3_000
     """Steps from one reset of all opacities, to at most 0.01, to the next."""
     shorten: bool = True
-    """Whether a short training begins after a fifth of its steps and stops at the half of them at the latest; if not,
-    as in 3DGS, it merely ends before `stop`, and nothing comes with its last step, which no step follows."""
+    """Whether a short training begins after a fifth of its steps and stops at the half of them at the latest, so that
+    one of less than twice `every` steps clones nothing; if not, as in 3DGS, it merely ends before `stop`, and nothing
+    comes with its last step, which no step follows."""
 
     def of(self, iterations: int) -> Schedule:
         """The same for a training of so many steps."""
         if not self.shorten:
             return replace(self, stop=min(self.stop, iterations) - 1)
         return replace(self, start=min(self.start, iterations // 5), stop=min(self.stop, iterations // 2))
+
+    def reached(self, most: int) -> bool:
+        """Whether a training of at most so many steps can be long enough for anything of this to happen."""
+        return self.of(most).stop >= min(self.every, self.reset_every)
 
     def densifies(self, step: int) -> bool:
         return self.start < step <= self.stop and step % self.every == 0

@@ -86,7 +86,7 @@ class PointSurface:
 
     @classmethod
     def of(cls, points: Float32) -> PointSurface:
-        return cls(points, nearest_spacing(points) if len(points) > 1 else 0.0)
+        return cls(points, nearest_spacing(points))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Bool, ColourTransform, DepthMap, Float32, Frame, UInt8
+from ss_flow.tasks.artifacts import Bool, ColourTransform, Float32, Frame, UInt8
 
 
 def decode_rgb(frame: Frame) -> UInt8:
@@ -98,10 +98,9 @@ def encode_png(image: np.ndarray) -> UInt8:
     return data.ravel()
 
 
-def depth_at_frame_size(depth: DepthMap, frame: Frame) -> Float32:
-    """The depth map at its frame's resolution, nearest neighbour (depth must not be blended across edges): [H, W]."""
-    h, w = depth.depth.shape
-    return depth.depth[np.ix_(pixels_under(frame.height, h), pixels_under(frame.width, w))]
+def resampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """[height, width] an image at another size, nearest neighbour (ids and depths must not be blended)."""
+    return image[np.ix_(pixels_under(height, image.shape[0]), pixels_under(width, image.shape[1]))]
 
 
 def pixels_under(count: int, size: int) -> NDArray[np.intp]:

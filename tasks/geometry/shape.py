@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64
-from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.cameras import centers_of
 
 
 def box_diagonal(points: Float32 | Float64, trim: float = 0.005) -> float:
@@ -25,7 +25,7 @@ def thinned(points: Float32, enough: int) -> Float64:
 def plane_through(points: Float64) -> tuple[Float64, Float64]:
     """The plane with the least squared distances from points [N, 3]: their mean, and its unit normal."""
     centre = points.mean(axis=0)
-    return centre, np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    return centre, np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
 
 
 def plane_of_most(points: Float64, thickness: float, rounds: int) -> tuple[Float64, Float64]:
@@ -44,7 +44,7 @@ def plane_of_most(points: Float64, thickness: float, rounds: int) -> tuple[Float
 
 def middle_of(cameras: Cameras) -> Float64:
     """[3] the mean place of the cameras."""
-    return np.mean([camera_of(cameras, view).center for view in range(len(cameras))], axis=0)
+    return np.asarray(centers_of(cameras.world_to_camera).mean(axis=0))
 
 
 def towards(normal: Float64, centre: Float64, eye: Float64) -> Float64:

@@ -10,6 +10,7 @@ from ss_flow.tasks.artifacts import DepthMap, Float32, Float64, Int32
 from ss_flow.tasks.geometry.cameras import Camera, pixels_in_view
 from ss_flow.tasks.geometry.fusion import depth_at
 from ss_flow.tasks.ranges import NonNegative, Positive
+from ss_flow.tasks.unread import by_default
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,11 @@ class VisibilityParams:
     photos err by a share of what they measure; 0 in `paper`."""
     deviations: NonNegative = 100.0
     """Standard deviations of the depth that count as the scene unit where they are more than it: at a tau_depth of 0.02
-    a point may lie two of them away; 0 in `paper`."""
+    a point may lie two of them away; 0 in `paper`. Read by Split only."""
+
+    def of_splat(self) -> VisibilityParams:
+        """For the steps of Splat: what only Split reads is as by default, so that it does not enter the key."""
+        return by_default(self, "deviations")
 
     def tolerance(self, depth: Float32 | Float64, unit: float, noise: float = 0.0) -> Float32 | Float64:
         """How far two depths of one surface may differ, world units; unit: length of a scene unit in these; noise:

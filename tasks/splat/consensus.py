@@ -1,4 +1,7 @@
-"""What the masks and the depth of all views say together: about the pixels of one, and about points without a label."""
+"""What the masks and the depth of all views say together: about the pixels of one, and about points without a label.
+
+Beyond Split&Splat.
+"""
 
 from __future__ import annotations
 
@@ -64,8 +67,7 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     """
     from scipy.spatial import cKDTree
 
-    spacing = nearest_spacing(instance.points) if len(instance.points) > 1 else 0.0
-    if not spacing:
+    if not (spacing := nearest_spacing(instance.points)):
         return instance
     tree = cKDTree(instance.points)
     found: list[tuple[Float32, UInt8, Float32]] = []

@@ -1,4 +1,7 @@
-"""The whole scene as one: assembled, and trained together on whole photos (Split&Splat, Sec. 3.2.3; spec P4)."""
+"""The whole scene as one: assembled, and trained together on whole photos (spec P4, A22).
+
+Beyond Split&Splat, which merges pairs (Sec. 3.2.3) and ends with the last one.
+"""
 
 from __future__ import annotations
 

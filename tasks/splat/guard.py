@@ -1,4 +1,4 @@
-"""The guard of refinement: what training made worse than is allowed is undone (spec P4)."""
+"""The guard of refinement: what training made worse than is allowed is undone (spec P4). Beyond Split&Splat."""
 
 from __future__ import annotations
 

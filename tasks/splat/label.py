@@ -1,4 +1,4 @@
-"""A scene that was trained elsewhere, labelled: each view votes on the Gaussians that it shows."""
+"""A scene that was trained elsewhere, labelled: each view votes on the Gaussians that it shows. Beyond Split&Splat."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Instances joined into one scene (Split&Splat, Sec. 3.2.3; spec P4)."""
+"""Pairs of instances that collide, trained together (Split&Splat, Sec. 3.2.3; spec P4).
+
+No pair is merged unless `plan.max_rounds` is set, as in `paper`; `default` leaves all to the last pass (`global_pass`).
+"""
 
 from __future__ import annotations
 
@@ -78,7 +81,8 @@ class MergeParams:
     """Weight, in the last pass, of the alpha where an instance, seen alone from anywhere, has no surface near: summed
     there, as a share of all pixels of such a view; 0 = only photos count."""
     side_views: Count = 24
-    """Views of each instance that this is looked at from; no more in all than steps."""
+    """Views of each instance that this is looked at from; where these are more in all than steps, as many as share out
+    the steps, rounded up."""
     relabel_after: Natural = 100
     """Steps of the last pass after which its Gaussians get their labels anew, from what the scene shows by then; 0 =
     labels stay, as they do where the pass has no more steps. From there on rates fall from their first values."""

@@ -55,7 +55,7 @@ class ReconstructParams:
     max_points: Natural = 10_000
     """Most points that training starts from; more are thinned out. 0 = all points, as in the paper."""
     max_gaussians: Natural = 30_000
-    """Most Gaussians of an instance; 0 = any number, as in the paper."""
+    """Most Gaussians of an instance to which clones and splits lead; 0 = any number, as in the paper."""
     background_scale: Positive = 2.0
     """Factor on steps, points and Gaussians for the background, which is the largest by far."""
     thickness: Annotated[float, Range(0.0, 1.0, open_below=True)] = 0.1
@@ -72,7 +72,8 @@ class ReconstructParams:
     ignore_occluded: bool = True
     """Whether pixels where something else is in front are left out; False calls them empty, as in the paper."""
     densify: Literal["classic", "none"] = "classic"
-    """How their number grows: "classic" clones and splits where the picture is still wrong (3DGS), "none" leaves it."""
+    """How their number grows: "classic" clones and splits where the picture is still wrong (3DGS), but nothing in
+    trainings of less than 200 steps, as those of `default` and `fast` are; "none" leaves it."""
     schedule: Schedule = Schedule()
     """When "classic" clones and splits."""
     prune_contribution: Fraction = 1 / 255
@@ -93,8 +94,12 @@ class ReconstructParams:
     """Another one trains on the views in another order, and before other random backgrounds."""
 
     def of_first(self) -> ReconstructParams:
-        """For `reconstruct`: what only `retrain` reads is as by default, so that it does not enter the key."""
-        return by_default(self, "retrain_share", "warm_start")
+        """For `reconstruct`: what it does not read is as by default, so that it does not enter the key. Only `retrain`
+        reads some of it, and some nobody, where no training is long enough for clones and splits."""
+        longest = round(max(1.0, self.background_scale) * self.max_iterations)
+        grows = self.schedule.reached(longest)
+        unread = () if grows else ("densify", "schedule", "max_gaussians")
+        return by_default(self, "retrain_share", "warm_start", *unread)
 
     def iterations(self, instance: InstanceMasks) -> int:
         """Training steps for an instance, by the number of its views (spec row 22)."""
@@ -200,7 +205,7 @@ def thin(points: Float32, limit: int) -> Int32:
 def _trained(
     scene: SceneViews, instance: InstanceMasks, initial: Gaussians, params: ReconstructParams, iterations: int
 ) -> Gaussians:
-    instance = _evenly(instance, params.iterations(instance))
+    instance = _evenly(instance, iterations)
     surface = PointSurface.of(instance.points)
     build = background_view if instance.instance_id == 0 else group_view
     row_of = scene.row_of()

@@ -17,7 +17,7 @@ from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.views import CropParams, SceneViews, Views, crop_camera, sample_depth
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.geometry.images import shared_valid
+from ss_flow.tasks.geometry.images import at_diagonal, shared_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
 from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -68,6 +68,9 @@ class RefineParams:
     """Gaussians longer than this share of the instance's box diagonal are not rendered; 0 = any, as in the paper."""
     cut_occluded: bool = True
     """Whether the rendered mask is cut where something is in front; False in the paper."""
+    box_margin: NonNegative = 16.0
+    """Pixels, in a photo with a diagonal of 800, by which the rendered mask goes on beyond the box around the centres
+    of the Gaussians, less the outermost 0.5 % of them on each side; 0 = anywhere in the photo, as in the paper."""
     tau_iou: Fraction = 0.5
     """IoU with the rendered mask above which a mask is added to a view that had none; 0.95 in the paper."""
     pred_iou: Fraction = 0.8
@@ -198,8 +201,7 @@ def rendered(
     rows, masks = [], []
     for row, name in enumerate(instance.views):
         view = view_of[name]
-        shown = render_mask(solid, scene, view, params.alpha_threshold, cut_occluded=params.cut_occluded).mask
-        shown &= shared_valid(views.frames[view])
+        shown = render_mask(solid, scene, view, params).mask & shared_valid(views.frames[view])
         if shown.any():
             rows.append(row)
             masks.append(Masks.of([shown]))
@@ -208,31 +210,28 @@ def rendered(
 
 
 def render_mask(
-    gaussians: Gaussians,
-    scene: SceneViews,
-    view: int,
-    alpha_threshold: float = 0.5,
-    *,
-    cut_occluded: bool = True,
+    gaussians: Gaussians, scene: SceneViews, view: int, params: RefineParams = RefineParams()
 ) -> RenderedMask:
-    """M^gs of one view: the Gaussians rendered alone with full opacity, cut where something is in front (spec P2).
+    """M^gs of one view: the Gaussians rendered alone with full opacity, cut where something is in front, and far from
+    their centres (spec P2).
 
     Full opacity gives the outline; with it, however, the Gaussian whose centre is nearest hides the surface that it is
     part of, so the depth is that of the ordinary rendering wherever that is solid. Depth is compared no more finely
     than the Gaussians are thick and a pixel is wide.
     """
-    full = scene.cameras[view]
-    nothing = np.zeros((full.height, full.width), bool)
-    whole = CropParams(max_side=max(full.width, full.height))
-    camera = crop_camera(full, nothing, gaussians.means, whole)
+    camera = full = scene.cameras[view]
+    if params.box_margin:
+        margin = round(at_diagonal(params.box_margin, full.height, full.width))
+        nothing = np.zeros((full.height, full.width), bool)
+        camera = crop_camera(full, nothing, gaussians.means, CropParams(margin, max(nothing.shape)))
     outline, surface = (render(gaussians, camera, opaque=opaque, winners=False) for opaque in (True, False))
-    solid = outline.alpha >= alpha_threshold
+    solid = outline.alpha >= params.alpha_threshold
     total, weight = np.where(surface.alpha >= 0.5, (surface.depth, surface.alpha), (outline.depth, outline.alpha))
     depth = np.where(solid, total / np.maximum(weight, 1e-6), 0)
     measured = sample_depth(scene.depths[view], full, camera)
     thickness = float(np.median(np.exp(gaussians.log_scales.max(axis=1))))
     tolerance = scene.tolerance(depth) + thickness + depth / camera.fx
-    visible = solid & ((measured == 0) | (measured + tolerance >= depth) | (not cut_occluded))
+    visible = solid & ((measured == 0) | (measured + tolerance >= depth) | (not params.cut_occluded))
     agrees = visible & (measured > 0) & (np.abs(measured - depth) <= tolerance)
     return RenderedMask(_pasted(visible, camera, full), float(agrees.sum() / max(1, visible.sum())))
 
@@ -274,7 +273,7 @@ def _replacement(
     if len(rows) < params.min_visible:
         return None
     valid = shared_valid(scene.frames[view])
-    rendered = render_mask(gaussians, scene, view, params.alpha_threshold, cut_occluded=params.cut_occluded)
+    rendered = render_mask(gaussians, scene, view, params)
     shown = rendered.mask & valid
     if not shown.any():
         return None

@@ -1,4 +1,7 @@
-"""Labels of Gaussians voted anew, once the scene that they make up together shows where its instances end."""
+"""Labels of Gaussians voted anew, once the scene that they make up together shows where its instances end.
+
+Beyond Split&Splat.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The instance ids that the finished scene shows: what its Gaussians say of the masks they grew from."""
+"""The instance ids that the finished scene shows: what its Gaussians say of the masks they grew from.
+
+Beyond Split&Splat.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.geometry.cameras import Camera
-from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid, depth_at_frame_size, near_border
+from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid, near_border, resampled
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.splat.photo_borders import settled_by_photo
 
@@ -80,7 +83,7 @@ def render_masks(
         reach = round(at_diagonal(_FRINGE, *known.ids.shape))
         keeps = np.isin(known.ids, absent)
         if params.background == "fringe":
-            keeps |= ~(near_border(known.ids, reach) & (depth_at_frame_size(depth, frame) > 0))
+            keeps |= ~(near_border(known.ids, reach) & (resampled(depth.depth, *known.ids.shape) > 0))
         ids = np.where((ids == 0) & keeps, known.ids, ids)
         if params.strips == "photo":
             ids = settled_by_photo(decode_rgb(frame), known.ids, ids, reach)

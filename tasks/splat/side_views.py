@@ -1,4 +1,4 @@
-"""What the instances of a scene should cover from where no photo was taken."""
+"""What the instances of a scene should cover from where no photo was taken. Beyond Split&Splat."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import neighbour_spread
 from ss_flow.tasks.gaussians.objective import Target
 from ss_flow.tasks.gaussians.trainer import PartView
-from ss_flow.tasks.gaussians.views import SceneViews, sample_depth
+from ss_flow.tasks.gaussians.views import SceneViews
 from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, surface_of_pixels
-from ss_flow.tasks.geometry.images import at_diagonal
+from ss_flow.tasks.geometry.images import at_diagonal, resampled
 from ss_flow.tasks.geometry.sampling import cube_of_each, sphere
 
 FEWEST = 20
@@ -53,7 +53,8 @@ def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], c
     has no such views.
 
     scene: ordered by instance, not yet trained together. masks: exclusive label maps of all views. count: views of each
-    instance; fewer, where all instances together would have more than `most`. Returns targets whose alpha counts alone.
+    instance; where these are more than `most` in all, an equal share of `most`, rounded up. Returns targets whose alpha
+    counts alone.
     """
     own = {int(i): scene.means[scene.instance_id == i] for i in np.unique(scene.instance_id) if i}
     spacings = {i: float(np.median(neighbour_spread(centres))) for i, centres in own.items() if len(centres) >= FEWEST}
@@ -83,7 +84,7 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
     area = np.zeros(np.iinfo(np.uint16).max + 1, np.int64)
     known, nearby = np.zeros_like(area), np.zeros_like(area)
     for camera, depth, shown in zip(views.cameras, views.depths, masks, strict=True):
-        z = sample_depth(depth, camera, camera)
+        z = resampled(depth.depth, *shown.ids.shape)
         area += np.bincount(shown.ids.ravel(), minlength=len(area))
         known += np.bincount(shown.ids[z > 0], minlength=len(area))
         nearby += np.bincount(shown.ids[_known_nearby(z > 0, shown.ids)], minlength=len(area))

@@ -1,4 +1,7 @@
-"""Gaussians that stand apart from the thing whose label they carry, where the views show something else."""
+"""Gaussians that stand apart from the thing whose label they carry, where the views show something else.
+
+Beyond Split&Splat.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, La
 from ss_flow.tasks.gaussians.render import weights_by_id
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
-from ss_flow.tasks.geometry.images import size_within
+from ss_flow.tasks.geometry.images import resampled, size_within
 
 MOST_PIXELS = 160
 """Longer side of the renderings that tell where Gaussians weigh."""
@@ -94,13 +97,11 @@ def _weights(
 ) -> tuple[Float64, Float64]:
     """[N] the weight of each Gaussian over all views: in pixels of its instance, where that is one of those asked for;
     and in all pixels."""
-    import cv2
-
     own, everywhere = np.zeros(len(scene)), np.zeros(len(scene))
     rest = np.iinfo(np.uint16).max + 1
     for camera, shown in zip(cameras, masks, strict=True):
         small = camera.scaled(*size_within(MOST_PIXELS, camera.width, camera.height))
-        ids = cv2.resize(shown.ids, (small.width, small.height), interpolation=cv2.INTER_NEAREST).astype(np.int32)
+        ids = resampled(shown.ids, small.height, small.width).astype(np.int32)
         for instance, weights in weights_by_id(scene, small, np.where(np.isin(ids, asked), ids, rest)):
             everywhere += weights
             own += np.where(scene.instance_id == instance, weights, 0)

@@ -15,7 +15,7 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, PointCloud, SceneU
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_noise, sum_by_voxel
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, pixels_under
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, resampled
 from ss_flow.tasks.ranges import Count, NonNegative, Positive, Range
 
 SIDES_PER_OCTAVE = 8
@@ -131,10 +131,9 @@ def depth_samples(frame: Frame, cameras: Cameras, view: int, depth: DepthMap) ->
     `max_points` to what is near.
     """
     height, width = depth.depth.shape
-    pick = np.ix_(pixels_under(height, frame.height), pixels_under(width, frame.width))
-    known = ((depth.depth > 0) & decode_valid(frame)[pick]).ravel()
+    known = ((depth.depth > 0) & resampled(decode_valid(frame), height, width)).ravel()
     camera = camera_of(cameras, view).scaled(width, height)
     points = backproject(depth.depth, camera)[known]
-    colors = decode_rgb(frame)[pick].reshape(-1, 3)[known].astype(np.float64)
+    colors = resampled(decode_rgb(frame), height, width).reshape(-1, 3)[known].astype(np.float64)
     sides = depth.depth.ravel()[known].astype(np.float64) / camera.fx
     return VoxelSums(points, colors, np.ones(len(points)), sides)

@@ -86,10 +86,8 @@ def observe(
         inside = inner[visibility.pixel[row]]
         whole[interior.whole] = inner[interior.pixels] = False
         standing = np.where(inside, INSIDE, BORDER).astype(np.uint8)
-        if params.clusters.eps and inside.any():
-            places = points.points[visibility.point_index[row[inside]]]
-            kept = params.clusters.kept(places, points.spacing)
-            standing[inside] = np.where(kept, INSIDE, STRAY)
+        places = points.points[visibility.point_index[row[inside]]]
+        standing[inside] = np.where(params.clusters.kept(places, points.spacing), INSIDE, STRAY)
         mask.append(interior.mask)
         rows.append(row)
         standings.append(standing)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, DepthMap, Frame, Int32, MaskSet
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.holes import close_holes
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, depth_at_frame_size, pixels_under
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, resampled
 from ss_flow.tasks.masks.overlap import drop_duplicates
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree
 from ss_flow.tasks.packed import Masks
@@ -78,12 +78,11 @@ def segment_rgbd(frame: Frame, depth: DepthMap, camera: Camera, *, params: Segme
     import cv2
 
     small = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
-    pick = np.ix_(pixels_under(height, frame.height), pixels_under(width, frame.width))
-    valid_small = valid[pick]
+    valid_small = resampled(valid, height, width)
     # Thin holes would cut every surface into pieces. They are closed for the masks alone: steps that compare depths
     # must see measured depth only, not guesses.
-    closed = replace(depth, depth=close_holes(depth.depth))
-    surface = surface_of(np.where(valid_small, depth_at_frame_size(closed, frame)[pick], 0).astype(np.float32), camera)
+    closed = resampled(resampled(close_holes(depth.depth), frame.height, frame.width), height, width)
+    surface = surface_of(np.where(valid_small, closed, 0).astype(np.float32), camera)
     boundary = boundaries(surface, valid_small, params.depth_jump, params.crease)
     regions = superpixels(small, surface, boundary, valid_small, params.superpixel)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)

@@ -125,6 +125,11 @@ def test_a_change_that_gives_an_equal_result_stops_there(warm):
     assert again.results() == warm.called.results()
 
 
+def test_a_tolerance_that_only_split_reads_computes_nothing_of_splat_where_views_see_the_same(warm):
+    again = run_tiny(warm.scene, warm.store, "--set", "split.visibility.deviations=99.99", out=warm.out)
+    assert again.computed() == {"split.visibility": 5}
+
+
 def test_why_names_the_parameter_and_the_chain_from_it(warm):
     again = run_tiny(warm.scene, warm.store, "--set", "visibility.tau_depth=0.05", out=warm.out)
     assert again.computed()["split.visibility"] == 5

@@ -399,6 +399,21 @@ def test_a_schedule_that_is_not_shortened_ends_before_the_last_step(stop, reset_
     assert [step for step in range(1, iterations + 1) if schedule.resets(step)] == resets
 
 
+@pytest.mark.parametrize("most", [99, 120, 199, 200, 201, 1_000])
+@pytest.mark.parametrize("shorten", [True, False])
+@pytest.mark.parametrize(("every", "reset_every"), [(100, 3_000), (3_000, 100), (3_000, 4_000)])
+def test_a_schedule_that_is_not_reached_does_nothing_in_any_training_that_short(most, shorten, every, reset_every):
+    schedule = Schedule(0, every=every, reset_every=reset_every, shorten=shorten)
+    acts = [
+        schedule.of(steps).densifies(step) or schedule.of(steps).resets(step)
+        for steps in range(1, most + 1)
+        for step in range(100, steps + 1, 100)
+    ]
+    assert schedule.reached(most) or not any(acts)
+    if reset_every > every:  # a reset comes before the step after which nothing comes
+        assert schedule.reached(most) == any(acts)
+
+
 def test_initial_scales_are_the_root_mean_square_of_three_neighbours():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], np.float32)
     made = initialise(points, np.full((4, 3), 255, np.uint8), 7, 0.25)

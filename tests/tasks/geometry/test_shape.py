@@ -20,3 +20,10 @@ def test_points_beside_a_plane_do_not_draw_away_the_plane_of_most(normal, away):
     centre, found = plane_of_most(points, 0.02, rounds=8)
     assert abs(found @ normal) > 0.9999 and abs((centre - away) @ normal) < 0.01
     assert abs(plane_through(points)[1] @ normal) < 0.99
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_few_points_lie_on_the_plane_through_them(count):
+    points = np.array([(0.0, 0, 2), (1, 0, 2), (0, 3, 2), (5, 1, 2)])[:count]
+    centre, normal = plane_through(points)
+    assert np.allclose((points - centre) @ normal, 0) and np.isclose(np.linalg.norm(normal), 1)

@@ -11,6 +11,8 @@ from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import DRAWN, REFINED, Gaussians, InstanceMasks
 from ss_flow.tasks.gaussians.initialise import initialise, select
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.geometry.cameras import pixels_in_view
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.models.catalogue import Model
@@ -79,8 +81,22 @@ def test_the_rendered_mask_leaves_out_what_the_ball_hides(small, box):
     hidden = small.ids[0] == 2
     assert (render_mask(box, blind, 0).mask & hidden).sum() > 5 * (render_mask(box, scene, 0).mask & hidden).sum()
     assert render_mask(box, blind, 0).support == 0
-    whole = render_mask(box, scene, 0, cut_occluded=False).mask
+    whole = render_mask(box, scene, 0, RefineParams(cut_occluded=False)).mask
     np.testing.assert_array_equal(whole, render_mask(box, blind, 0).mask)
+
+
+def test_the_rendered_mask_ends_a_margin_beyond_the_centres_or_with_the_photo_as_in_the_paper(small, box):
+    scene, camera = small.views.compared(VisibilityParams()), small.views.cameras[0]
+    large = replace(box, log_scales=np.full_like(box.log_scales, np.log(0.1)))
+    covered = render(large, camera, opaque=True).alpha >= 0.5
+    whole = render_mask(large, scene, 0, RefineParams(cut_occluded=False, box_margin=0)).mask
+    np.testing.assert_array_equal(whole, covered)
+
+    low, high = np.quantile(pixels_in_view(box.means, camera)[2], (0.005, 0.995))  # rows
+    for margin, pixels in ((7, 1), (20, 3), (40, 6)):  # the photo's diagonal is 120
+        cut = render_mask(large, scene, 0, RefineParams(cut_occluded=False, box_margin=margin)).mask
+        rows = np.flatnonzero(cut.any(axis=1))
+        assert rows[[0, -1]].tolist() == [int(low) - pixels, int(high) + pixels]
 
 
 def test_without_a_segmenter_masks_stay_and_missing_ones_are_drawn_where_depth_confirms_them(small, box):

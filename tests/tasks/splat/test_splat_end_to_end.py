@@ -13,6 +13,7 @@ from view_masks import as_fields
 
 from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Appearances, Gaussians
+from ss_flow.tasks.gaussians.densification import Schedule
 from ss_flow.tasks.gaussians.initialise import concatenate, extents, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainResult
@@ -187,8 +188,23 @@ def test_of_more_views_than_steps_as_many_are_trained_on_evenly_spread(built, mo
 
     monkeypatch.setattr(reconstruct_module, "train", listening)
     params = replace(TRAIN, min_iterations=1, max_iterations=steps)
-    reconstruct(built.views, built.scene.instance(1), params=params)
+    whole = built.scene.instance(1)
+    reconstruct(built.views, whole, params=params)
     np.testing.assert_array_equal(heard, built.scene.cameras.world_to_camera[list(expected)])
+
+    heard.clear()
+    again = replace(params, max_iterations=4 * steps, min_iterations=4 * steps, retrain_share=0.25)
+    retrain(built.views, whole, built.scene.instance(1, views=(0,)), built.box, params=again)
+    np.testing.assert_array_equal(heard, built.scene.cameras.world_to_camera[list(expected)])
+
+
+@pytest.mark.parametrize(("steps", "background_scale", "read"), [(120, 1.0, False), (60, 2.0, False), (120, 2.0, True)])
+def test_how_clones_and_splits_come_enters_the_key_only_where_a_training_is_long_enough_for_them(
+    built, steps, background_scale, read
+):
+    plain = replace(TRAIN, min_iterations=steps, max_iterations=steps, background_scale=background_scale)
+    for changed in ({"max_gaussians": 7}, {"densify": "none"}, {"schedule": Schedule(start=0)}):
+        assert (replace(plain, **changed).of_first() != plain.of_first()) == read
 
 
 def test_steps_grow_with_the_views_within_their_limits(built):

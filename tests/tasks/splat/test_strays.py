@@ -10,7 +10,8 @@ from ball_and_box import SmallScene
 
 from ss_flow.tasks.artifacts import Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, initialise, select
-from ss_flow.tasks.geometry.cameras import project
+from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.geometry.cameras import Camera, project
 from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.splat.strays import without_strays
 
@@ -124,3 +125,28 @@ def test_few_gaussians_and_none_stay(small, scene):
     assert len(cleaned(small, NO_GAUSSIANS)) == 0
     few = select(scene, np.flatnonzero(scene.instance_id == BALL)[[0, -1]])
     assert np.array_equal(cleaned(small, few).instance_id, few.instance_id)
+
+
+def square(middle: tuple[float, float, float], side: float, count: int, instance: int) -> Gaussians:
+    """count x count solid Gaussians that face the camera."""
+    x, y = np.meshgrid(*2 * [(np.arange(count) - (count - 1) / 2) * side / count])
+    places = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3).astype(np.float32) + np.float32(middle)
+    return initialise(places, np.full(places.shape, 128, np.uint8), instance, 1.0, opacity=0.95)
+
+
+@pytest.mark.parametrize("wide", [640, 1600])
+def test_a_small_piece_that_lies_in_its_own_pixels_stays_however_large_the_photos_are(wide):
+    pieces = [
+        square((0, 0, 2.5), 2, 90, FLOOR),
+        square((-0.3, 0, 2), 0.24, 30, BALL),
+        square((0.3, 0.1, 2), 0.024, 3, BALL),
+    ]
+    scene = concatenate(pieces)
+    cameras, maps = [], []
+    for x, y in ((0, 0), (0.1, 0.03), (-0.1, 0.05), (0.05, -0.1)):
+        pose = np.eye(4)
+        pose[:2, 3] = x, y
+        cameras.append(Camera(wide, wide * 3 // 4, 0.8 * wide, 0.8 * wide, wide / 2, wide * 3 / 8, pose))
+        shown = render(scene, cameras[-1], label_ids=[FLOOR, BALL], winners=False).label_masks.argmax(axis=0)
+        maps.append(LabelMap("v", np.where(shown == 1, BALL, FLOOR).astype(np.uint16)))
+    assert np.array_equal(without_strays(cameras, scene, maps).instance_id, scene.instance_id)
