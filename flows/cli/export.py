@@ -17,7 +17,7 @@ from ss_flow.flows import export as formats
 from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run, references
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.deliver import STATUS_EXIT
-from ss_flow.flows.results import BACKGROUND, FinishedRun
+from ss_flow.flows.results import BACKGROUND, FinishedRun, not_of_an_edit
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.capture.scene import open_scene
@@ -74,6 +74,8 @@ class Export:
         _check_place(out, run.store.location, folder=folder)
         self._check_suffix(out, folder=folder)
         if workspace:
+            if "edit" in run.document:
+                raise not_of_an_edit(run.folder, run.document, "photos")
             return self._write_workspace(out, run)
         if self.format != "coco":
             _check_there(run.results.one("scene"), ids, run.folder)
