@@ -53,8 +53,8 @@ class Export:
     """For meshes: "closed" closes by a guess what no view shows."""
     out: OptionalPath = None
     """The file or folder to write; by default in ss-flow-export: NAME of the result with the format's suffix, as in
-    NAME.ply; NAME-labelled.ply, NAME-flat.glb and NAME-mesh.glb; NAME-0004.ply with --instance 4; and NAME-FORMAT for
-    a folder."""
+    NAME.ply; NAME-labelled.ply, NAME-flat.glb and NAME-mesh.glb; NAME-0004.ply with --instance 4; and NAME-FORMAT,
+    or NAME-0004-FORMAT, for a folder."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""
     json: bool = False
@@ -112,11 +112,11 @@ class Export:
 
     def _ending(self, ids: tuple[int, ...], *, folder: bool) -> str:
         """What the default name has after that of the result: chosen instances must not replace the whole."""
-        if folder:
-            return f"-{self.format}"
         chosen = ""
         if self.instance and self.format != "coco":
             chosen = "".join(f"-{i:04d}" for i in ids) if len(ids) <= _MOST_IN_A_NAME else "-selected"
+        if folder:
+            return f"{chosen}-{self.format}"
         return chosen + _ADDED.get(self.format, "") + formats.suffix_of(self.format)
 
     def _check_suffix(self, out: Path, *, folder: bool) -> None:
