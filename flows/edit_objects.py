@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from ss_flow.errors import InputError
 from ss_flow.flows.results import open_finished
 from ss_flow.tasks.artifacts import Cameras, Gaussians
-from ss_flow.tasks.deliver.instances_json import instance_file, placed
+from ss_flow.tasks.deliver.instances_json import gaussians_placed, instance_file
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.edit.operations import Vector, vector
+from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.geometry.cameras import up_of
 from ss_flow.tasks.geometry.clustering import rows_by_label
 
@@ -196,12 +197,16 @@ class Objects:
         if instance in self.changed:
             part_of, known = scene.part_id[rows], self.parts[instance]
             entry["parts"] = [
-                {"part_id": part, "num_points": known.get(part, 0), **placed(scene.means[rows[part_of == part]])}
+                {
+                    "part_id": part,
+                    "num_points": known.get(part, 0),
+                    **gaussians_placed(select(scene, rows[part_of == part])),
+                }
                 for part in np.unique(part_of[part_of > 0]).tolist()
             ]
             entry["num_parts"] = len(entry["parts"])
         file = None if entry["crumb"] else instance_file(instance)
-        return entry | {**placed(scene.means[rows]), "num_gaussians": len(rows), "file": file}
+        return entry | {**gaussians_placed(select(scene, rows)), "num_gaussians": len(rows), "file": file}
 
     def _is_in(self, instance: int, group: int) -> bool:
         """Whether an instance is still part of a group; what has moved is not."""

@@ -68,7 +68,9 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
     if capture.truth is not None:
         results["truth"] = capture.truth
         with labelled("split"):
-            results["metrics_split"] = evaluate_masks(masks_split, capture.truth, found.tree, zero_is_void=void)
+            results["metrics_split"] = evaluate_masks(
+                masks_split, capture.truth, found.tree, capture.frames, zero_is_void=void
+            )
     if capture.given is None:
         results |= splat(capture, found, networks, params)
     else:
@@ -78,7 +80,7 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
             if masks in results:
                 with labelled(stage):
                     results[f"metrics_{stage}"] = evaluate_masks(
-                        results[masks], capture.truth, found.tree, zero_is_void=void
+                        results[masks], capture.truth, found.tree, capture.frames, zero_is_void=void
                     )
     if held_out is not None:
         results |= {"ingest_held_out": held_out.frames, "cameras_held_out": held_out.cameras}

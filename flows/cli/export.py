@@ -17,7 +17,7 @@ from ss_flow.flows import export as formats
 from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run, references
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.deliver import STATUS_EXIT
-from ss_flow.flows.results import BACKGROUND, FinishedRun
+from ss_flow.flows.results import BACKGROUND, FinishedRun, not_of_an_edit
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.capture.scene import open_scene
@@ -53,8 +53,8 @@ class Export:
     """For meshes: "closed" closes by a guess what no view shows."""
     out: OptionalPath = None
     """The file or folder to write; by default in ss-flow-export: NAME of the result with the format's suffix, as in
-    NAME.ply; NAME-labelled.ply, NAME-flat.glb and NAME-mesh.glb; NAME-0004.ply with --instance 4; and NAME-FORMAT for
-    a folder."""
+    NAME.ply; NAME-labelled.ply, NAME-flat.glb and NAME-mesh.glb; NAME-0004.ply with --instance 4; and NAME-FORMAT,
+    or NAME-0004-FORMAT, for a folder."""
     jobs: int = 0
     """How many tasks may run at once; 0 = one a core."""
     json: bool = False
@@ -74,6 +74,8 @@ class Export:
         _check_place(out, run.store.location, folder=folder)
         self._check_suffix(out, folder=folder)
         if workspace:
+            if "edit" in run.document:
+                raise not_of_an_edit(run.folder, run.document, "photos")
             return self._write_workspace(out, run)
         if self.format != "coco":
             _check_there(run.results.one("scene"), ids, run.folder)
@@ -110,11 +112,11 @@ class Export:
 
     def _ending(self, ids: tuple[int, ...], *, folder: bool) -> str:
         """What the default name has after that of the result: chosen instances must not replace the whole."""
-        if folder:
-            return f"-{self.format}"
         chosen = ""
         if self.instance and self.format != "coco":
             chosen = "".join(f"-{i:04d}" for i in ids) if len(ids) <= _MOST_IN_A_NAME else "-selected"
+        if folder:
+            return f"{chosen}-{self.format}"
         return chosen + _ADDED.get(self.format, "") + formats.suffix_of(self.format)
 
     def _check_suffix(self, out: Path, *, folder: bool) -> None:

@@ -28,10 +28,13 @@ _SELECTED, _MATCHED, _OTHER, _HIDDEN = "orange", "teal", "blue", "gray"
 
 @dataclass
 class _Row:
-    """A button that stands for the object which has come to lie under it."""
+    """The button of an object.
 
+    It stands for no other one: a click tells which button was pressed, and may come when the list has changed since.
+    """
+
+    instance: int
     button: viser.GuiButtonHandle
-    instance: int | None = None
     look: tuple[str, str, str] | None = None
     """What it shows: label, colour, picture."""
 
@@ -39,14 +42,15 @@ class _Row:
 class ObjectList:
     """Objects page by page, the largest first, or those first that a text means.
 
-    Its parts are viser's: `text`, `tau`, `answer`, `rows`, and `turn`, the buttons below them.
+    Its parts are viser's: `text`, `tau`, `answer`, the buttons of the `rows` that are shown, and `turn`, those below
+    them.
     """
 
     def __init__(
         self, gui: viser.GuiApi, session: Session, search: Search | None, choose: Callable[[tuple[int, ...]], None]
     ) -> None:
         """choose: called with the objects that were picked from the list."""
-        self._session, self._search, self._choose = session, search, choose
+        self._gui, self._session, self._search, self._choose = gui, session, search, choose
         self._pictures: dict[int, str] = {}
         self._found: QueryResult | None = None
         self._page = 0
@@ -63,16 +67,12 @@ class ObjectList:
         )
         self.answer = gui.add_markdown("" if search is not None else "This run has no descriptors to search.")
         self.text.disabled = self.tau.disabled = search is None
-        self.rows = [_Row(gui.add_button(" ")) for _ in range(_ROWS)]
+        self._known: dict[int, _Row] = {}
+        self.rows: list[_Row] = []
         self.turn = gui.add_button_group("Page", ("Before", "Next", "Select matches"))
         self.text.on_update(lambda _: self._ask())
         self.tau.on_update(lambda _: self._ask())
         self.turn.on_click(self._turned)
-        for row in self.rows:
-            self._on_click(row)
-
-    def _on_click(self, row: _Row) -> None:
-        row.button.on_click(lambda _: self._choose(() if row.instance is None else (row.instance,)))
 
     def picture(self, instance: int) -> str:
         """A small picture of an object as HTML: a cut-out of a photo, or its colour."""
@@ -89,8 +89,10 @@ class ObjectList:
             order = self._order()
             self._page = min(self._page, max(0, (len(order) - 1) // _ROWS))
             listed = order[self._page * _ROWS : (self._page + 1) * _ROWS]
-            for row, instance in zip(self.rows, [*listed, *[None] * (_ROWS - len(listed))], strict=True):
-                self._fill(row, instance)
+            for row in self.rows:
+                if row.instance not in listed:
+                    row.button.visible = False
+            self.rows = [self._row(instance, place) for place, instance in enumerate(listed)]
             first = self._page * _ROWS
             self.turn.label = f"{first + 1}-{first + len(listed)} of {len(order)}" if order else "none"
 
@@ -103,17 +105,23 @@ class ObjectList:
         ranked = [i for i in self._found.instance_id.tolist() if i in objects.entries]
         return ranked + [i for i in by_size if i not in ranked]
 
-    def _fill(self, row: _Row, instance: int | None) -> None:
-        row.instance = instance
-        if row.button.visible != (instance is not None):
-            row.button.visible = instance is not None
-        if instance is None:
-            return
+    def _row(self, instance: int, place: int) -> _Row:
+        """The row of an object, shown at a place of the list: 0 is the first."""
+        order = self.answer.order + (place + 1) / (_ROWS + 1)
+        row = self._known.get(instance)
+        if row is None:
+            row = self._known[instance] = _Row(instance, self._gui.add_button(" ", order=order))
+            row.button.on_click(lambda _: self._choose((instance,)))
+        if row.button.order != order:
+            row.button.order = order
         look = (self._label(instance), self._color(instance), self.picture(instance))
         if look != row.look:
             row.button.label, row.button.color = look[0], look[1]  # type: ignore[assignment]
             row.button._icon_html = look[2]  # viser's own icons are set through it
             row.look = look
+        if not row.button.visible:
+            row.button.visible = True
+        return row
 
     def _label(self, instance: int) -> str:
         if instance == BACKGROUND:

@@ -20,7 +20,7 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.flows.results import BACKGROUND, FinishedRun
 from ss_flow.flows.view.looking import Viewpoint, start_view
 from ss_flow.tasks.artifacts import Float32, Gaussians
-from ss_flow.tasks.deliver.compressed import Thumbnail, data_uri
+from ss_flow.tasks.deliver.compressed import Thumbnail, compressed, data_uri
 from ss_flow.tasks.deliver.export.content import morton_order
 from ss_flow.tasks.deliver.export.spz import spz
 from ss_flow.tasks.deliver.palette import instance_colors
@@ -108,9 +108,10 @@ def page_html(
 
 def _object(instance_id: int, name: str, about: str, picture: Thumbnail | None) -> dict[str, Any]:
     """What the list says of an object."""
-    color = instance_colors(instance_id + 1)[instance_id].tolist()
-    thumbnail = "data:," if picture is None else data_uri(picture.content)
-    return {"id": instance_id, "name": name, "about": about, "color": color, "thumbnail": thumbnail}
+    color = instance_colors(instance_id + 1)[instance_id]
+    content = compressed(np.full((1, 1, 3), color, np.uint8)) if picture is None else picture.content
+    fields = {"id": instance_id, "name": name, "about": about}
+    return fields | {"color": color.tolist(), "thumbnail": data_uri(content)}
 
 
 def _place(means: Float32, origin: np.ndarray, unit: float) -> dict[str, Any]:

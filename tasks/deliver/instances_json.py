@@ -9,9 +9,13 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Gaussians, Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.palette import instance_color
+from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.semantics.name import InstanceNames
+from ss_flow.tasks.splat.collisions import group_box
 
+_FAINT = 0.15
+"""Opacity below which a Gaussian does not widen a box: strays far off all points are hardly to be seen."""
 _CRUMB = 0.001
 """Share of the views that show an instance which it must fill not to be a crumb."""
 
@@ -31,7 +35,8 @@ def instances_document(
 
     Each instance has: id, name, named_by (the encoder, "hints" for a name of the user's own, or null), kind ("thing" or
     "stuff"), color [r, g, b], parent (the smallest group that holds it, or null), parts (part_id, num_points, bbox and
-    centroid of each), bbox {min, max} and centroid in world units (null without points and Gaussians), views (names),
+    centroid of each), bbox {min, max} and centroid in world units (see `gaussians_placed`; null without points and
+    Gaussians), views (names),
     confidence, num_parts, num_points, num_gaussians, weak, crumb (weak, or it hardly fills anything of the views that
     show it), and file ("instances/0007.ply", null for a crumb and without Gaussians). Names are unique: of several
     "red object" the later ones, by id, are "red object 2" and so on; the user's own stay. The groups follow: id,
@@ -44,7 +49,7 @@ def instances_document(
     entries = []
     for instance in known:
         rows = rows_of.get(instance.instance_id, np.zeros(0, np.intp))
-        places = gaussians.means[rows] if gaussians is not None and len(rows) else instance.points
+        own = select(gaussians, rows) if gaussians is not None and len(rows) else None
         crumb = _is_crumb(instance)
         entry = {
             "id": instance.instance_id,
@@ -54,7 +59,7 @@ def instances_document(
             "color": list(instance_color(instance.instance_id)),
             "parent": parents.get(instance.instance_id),
             "parts": _parts(instance),
-            **placed(places),
+            **(placed(instance.points) if own is None else gaussians_placed(own)),
             "views": list(instance.views),
             "confidence": round(float(instance.confidence), 4),
             "num_parts": int(instance.point_part.max(initial=0)),
@@ -147,8 +152,19 @@ def placed(points: Float32) -> dict[str, Any]:
     """The box and the mean of points [N, 3] as instances.json gives them; null without points."""
     if not len(points):
         return {"bbox": None, "centroid": None}
-    corners = {"min": _rounded(points.min(axis=0)), "max": _rounded(points.max(axis=0))}
-    return {"bbox": corners, "centroid": _rounded(points.mean(axis=0, dtype=np.float64))}
+    return _placed(points.min(axis=0), points.max(axis=0), points)
+
+
+def gaussians_placed(gaussians: Gaussians) -> dict[str, Any]:
+    """The same of at least one Gaussian: the mean of all centres, and the box of those that can be seen, of an opacity
+    of at least 0.15; of all where none has."""
+    low, high = group_box(gaussians, min_opacity=_FAINT, quantile=0.0)
+    return _placed(low, high, gaussians.means)
+
+
+def _placed(low: np.ndarray, high: np.ndarray, centers: Float32) -> dict[str, Any]:
+    corners = {"min": _rounded(low), "max": _rounded(high)}
+    return {"bbox": corners, "centroid": _rounded(centers.mean(axis=0, dtype=np.float64))}
 
 
 def _rounded(point: np.ndarray) -> list[float]:

@@ -29,6 +29,8 @@ from ss_flow.tasks.geometry.shape import plane_through
 
 _NEARBY = 0.5
 """How far around the box of what has left the surfaces are looked for, as a share of its diagonal."""
+_TOUCHING = 4.0
+"""How far apart the boxes of what has left one place are at most, in spacings."""
 _THICK = 1.5
 """Half the thickness of a plane at least, in spacings of the dense points."""
 _NOISE = 2.0
@@ -48,6 +50,7 @@ _COVERED = 0.5
 _DEPTH_ERROR = 0.02
 """Of a depth map, as a share of the depth."""
 _MOST_PLANES = 4
+"""Of each place that something left."""
 _TRIALS = 300
 _FEWEST = 30
 """Points below which nothing is called a plane."""
@@ -68,27 +71,27 @@ def fill(
 ) -> EditedScene:
     """Close the holes that instances leave with the surfaces around them, flagged as filled.
 
-    The dense points near the instances that are still there are cut into planes (at most four, by RANSAC; as thick as
-    the points are rough; connected). The ray of
-    every pixel that showed the instances is followed to the first plane behind them. It counts where it meets the plane
-    inside the convex hull of its points, so that nothing is continued beyond what was seen; further than 1.5 spacings
-    from any of them; where nothing that is still there hides it; and where no view looked through it, by its depth map.
-    One such place in each cube of the points' spacing becomes a Gaussian, with the median colour of the 32 nearest
-    points of the plane and the ids of the scene's nearest Gaussian. Small Gaussians near filled places that only
-    came to light when the instances left are taken away.
+    The dense points that are still there near each place that instances left are cut into planes (at most four a place,
+    by RANSAC; as thick as the points are rough; connected). The ray of every pixel that showed the instances is
+    followed to the first plane behind them. It counts where it meets the plane inside the convex hull of its points, so
+    that nothing is continued beyond what was seen; further than 1.5 spacings from any of them; where nothing that is
+    still there hides it; and where no view looked through it, by its depth map. One such place in each cube of the
+    points' spacing becomes a Gaussian, with the median colour of the 32 nearest points of the plane and the ids of the
+    scene's nearest Gaussian. Small Gaussians near filled places that only came to light when the instances left are
+    taken away.
 
     gone: labels of the dense points that are no longer there, those of the instances among them.
     """
     points, cameras = measured.points, measured.cameras
     spacing = points.spacing
     views = list(uncovered(before, after, cameras, instances))
-    own = np.isin(before.instance_id, instances)
-    if not views or not own.any():
+    if not views:
         return after
-    around = _around(Remains.of(measured, gone), before.means[own])
-    near = points.points[around].astype(np.float64)
+    remains = Remains.of(measured, gone)
+    arounds = [_around(remains, box) for box in _places_left(before, instances, _TOUCHING * spacing)]
+    near = points.points[np.concatenate(arounds)].astype(np.float64)
     thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))
-    planes = _planes(near, spacing, thickness)
+    planes = [plane for around in arounds for plane in _planes(points, around, thickness)]
     places, plane_of = _behind(views, planes, spacing, thickness)
     solid = ~_seen_through(places, cameras, measured.depths, thickness)
     places, plane_of = places[solid], plane_of[solid]
@@ -99,7 +102,7 @@ def fill(
     colors = np.zeros((len(places), 3), np.uint8)
     for number in np.unique(plane_of).tolist():
         of_plane = plane_of == number
-        colors[of_plane] = _colors(places[of_plane], points, around[planes[number].rows])
+        colors[of_plane] = _colors(places[of_plane], points, planes[number].rows)
     shaped = some_rows(after, ~_came_to_light(before, after, instances, views, places, measured, gone))
     return joined([shaped, _with_ids_of(shaped, _flat(places, colors, plane_of, planes, spacing))])
 
@@ -111,7 +114,7 @@ class _Plane:
     axes: Float64
     """[2, 3] unit, in the plane."""
     rows: Int32
-    """[I] its points, as rows of the points that were cut into planes."""
+    """[I] its points, as rows of the dense points."""
     flat: Float64
     """[I, 2] where these lie in the plane."""
 
@@ -120,9 +123,26 @@ class _Plane:
         return (places - self.centre) @ self.axes.T
 
 
-def _around(remains: Remains, means: Float32) -> Int32:
+def _places_left(before: EditedScene, instances: tuple[int, ...], reach: float) -> list[Float64]:
+    """The boxes [2, 3] of what has left its place, one for all whose boxes lie within `reach` of each other.
+
+    One box around things far apart would be the whole room: its floor and walls would take the place of the table top
+    that one of them stood on.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    each = [before.means[before.instance_id == instance].astype(np.float64) for instance in instances]
+    boxes = np.array([np.quantile(means, (0.005, 0.995), axis=0) for means in each if len(means)])
+    low, high = boxes[:, 0], boxes[:, 1]
+    number, place = connected_components(
+        (low[:, None] <= high + reach).all(axis=2) & (low <= high[:, None] + reach).all(axis=2)
+    )
+    return [np.stack([low[place == i].min(axis=0), high[place == i].max(axis=0)]) for i in range(number)]
+
+
+def _around(remains: Remains, box: Float64) -> Int32:
     """Rows of the dense points near what has left its place."""
-    low, high = np.quantile(means.astype(np.float64), (0.005, 0.995), axis=0)
+    low, high = box
     margin = max(_NEARBY * float(np.linalg.norm(high - low)), 10 * remains.points.spacing)
     places = remains.points.points[remains.rows]
     return remains.rows[((places >= low - margin) & (places <= high + margin)).all(axis=1)]
@@ -142,8 +162,9 @@ def _roughness(places: Float64, reach: float) -> float:
     return float(np.median(off)) if off else 0.0
 
 
-def _planes(places: Float64, spacing: float, thickness: float) -> list[_Plane]:
-    """The planes that points [N, 3] lie on, the largest first; each point on one of them at most."""
+def _planes(points: PointCloud, rows: Int32, thickness: float) -> list[_Plane]:
+    """The planes that some of the dense points lie on, the largest first; each point on one of them at most."""
+    places, spacing = points.points[rows].astype(np.float64), points.spacing
     rng = np.random.default_rng(0)
     rest = np.arange(len(places), dtype=np.int32)
     least = max(_FEWEST, len(places) // 20)
@@ -177,7 +198,7 @@ def _planes(places: Float64, spacing: float, thickness: float) -> list[_Plane]:
         together = _largest_piece(flat, spacing)
         piece = flat[together]
         if piece[:, 1].std() > thickness and _coverage(piece, spacing) >= _COVERED:
-            found.append(_Plane(centre, normal, axes, rest[near][together], piece))
+            found.append(_Plane(centre, normal, axes, rows[rest[near][together]], piece))
         rest = rest[~near]
     return found
 

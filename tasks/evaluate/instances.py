@@ -5,11 +5,13 @@ Values are fractions. A match at 25 or 50 means an IoU strictly above 0.25 or 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Float64, Hierarchy, Int32, LabelMap, Metrics
+from ss_flow.tasks.artifacts import Float64, Frame, Hierarchy, Int32, LabelMap, Metrics
 from ss_flow.tasks.evaluate.contingency import Labels, contingency
 from ss_flow.tasks.evaluate.panoptic import (
     hungarian_miou,
@@ -18,6 +20,7 @@ from ss_flow.tasks.evaluate.panoptic import (
     under_segmentation,
     whole,
 )
+from ss_flow.tasks.geometry.images import decode_valid
 
 
 @task()
@@ -25,6 +28,7 @@ def evaluate_masks(
     predicted: tuple[LabelMap, ...],
     truth: tuple[LabelMap, ...],
     tree: Hierarchy | None = None,
+    frames: Sequence[Frame] = (),
     *,
     zero_is_void: bool = False,
 ) -> Metrics:
@@ -35,6 +39,7 @@ def evaluate_masks(
         pixels on 0 are false. Where 0 means "not annotated", set `zero_is_void`: such pixels are dropped on both
         sides, and a prediction most of which lies on them is no false positive.
     tree: tells which predicted ids are stuff.
+    frames: the views; pixels that their `valid` masks exclude are dropped on both sides.
     Returns, on the pixels of all views pooled: miou, the mean over the true instances of the best IoU with any
     predicted id; macc25, macc50; pq, sq, rq (class-agnostic video panoptic quality over the whole scene);
     hungarian_miou (one-to-one); whole, the share of the true instances that are exactly one predicted id (IoU at
@@ -43,7 +48,7 @@ def evaluate_masks(
     num_truth, num_predicted.
     Raises InputError when a view lacks its prediction, sizes differ, or nothing is annotated.
     """
-    true_ids, ids = pooled(predicted, truth)
+    true_ids, ids = pooled(predicted, truth, frames)
     stuff = tree.node[tree.stuff] if tree is not None else None
     return Metrics(segmentation_metrics(true_ids, ids, zero_is_void=zero_is_void, stuff=stuff))
 
@@ -87,24 +92,30 @@ def segmentation_metrics(
     }
 
 
-def pooled(predicted: tuple[LabelMap, ...], truth: tuple[LabelMap, ...]) -> tuple[Labels, Labels]:
+def pooled(
+    predicted: tuple[LabelMap, ...], truth: tuple[LabelMap, ...], frames: Sequence[Frame] = ()
+) -> tuple[Labels, Labels]:
     """The pixels of all annotated views in one row: true ids [N], predicted ids [N].
 
+    frames: the views; pixels that their `valid` masks exclude are left out.
     Raises InputError when a view lacks its prediction, or the sizes differ.
     """
     by_name = {m.name: m for m in predicted}
+    counted = {frame.name: decode_valid(frame) for frame in frames if frame.valid.size}
+    pairs = [(np.zeros(0, np.uint16), np.zeros(0, np.uint16))]
     for true_map in truth:
         if true_map.name not in by_name:
             raise InputError(f"View {true_map.name} has ground truth masks but no predicted ones; both are needed.")
-        shape = by_name[true_map.name].ids.shape
-        if shape != true_map.ids.shape:
+        true_ids, ids = true_map.ids, by_name[true_map.name].ids
+        if ids.shape != true_ids.shape:
             raise InputError(
-                f"The predicted masks of view {true_map.name} have {shape[1]} x {shape[0]} pixels, its ground truth "
-                f"has {true_map.ids.shape[1]} x {true_map.ids.shape[0]}; the sizes must agree."
+                f"The predicted masks of view {true_map.name} have {ids.shape[1]} x {ids.shape[0]} pixels, its ground "
+                f"truth has {true_ids.shape[1]} x {true_ids.shape[0]}; the sizes must agree."
             )
-    empty = np.zeros(0, np.uint16)
-    true_ids = np.concatenate([empty, *(m.ids.ravel() for m in truth)])
-    return true_ids, np.concatenate([empty, *(by_name[m.name].ids.ravel() for m in truth)])
+        inside = counted.get(true_map.name, np.True_)
+        pairs.append((true_ids[inside].ravel(), ids[inside].ravel()))
+    true_pixels, pixels = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    return true_pixels, pixels
 
 
 def summary(best: Float64) -> dict[str, float]:

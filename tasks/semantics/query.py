@@ -92,7 +92,7 @@ class QueryResult:
     matched: UInt8
     """[L] 1 for the instances that the text means."""
     accepted: bool
-    """Whether the best instance fits at all; otherwise nothing in the scene matches."""
+    """Whether the text means any instance; otherwise nothing in the scene matches."""
     part_id: Int32
     """[L] the part of the instance that is meant, 0 = the whole."""
 
@@ -229,7 +229,7 @@ def chosen(found: Similarity, *, params: QueryParams = QueryParams()) -> QueryRe
     delta = score[:1] - score
     fits = relevancy > (_HALF if found.absolute else params.min_relevancy)
     by_delta = (delta < params.tau_corr) | found.absolute
-    near = np.cumsum(fits) <= params.top_k if params.select == "topk" else by_delta
+    matched = fits & (np.cumsum(fits) <= params.top_k if params.select == "topk" else by_delta)
     return QueryResult(
         text=found.text,
         encoder=found.encoder,
@@ -238,8 +238,8 @@ def chosen(found: Similarity, *, params: QueryParams = QueryParams()) -> QueryRe
         margin=score - np.append(score[1:], score[-1:]),
         delta=delta,
         relevancy=relevancy,
-        matched=(fits & near).astype(np.uint8),
-        accepted=bool(fits[:1].any()),
+        matched=matched.astype(np.uint8),
+        accepted=bool(matched.any()),
         part_id=found.part_id[order],
     )
 

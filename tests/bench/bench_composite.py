@@ -137,12 +137,12 @@ def main() -> None:
             room = replace(ROOM, seed=seed, gripper=args.gripper)
             folder = desk_of(seed, Path(kept)) if args.desk else folder_of(room, Path(kept), args.sensor)
             found = outcome(folder, params, Store(Path(kept)))
-            values = evaluate_masks(found.predicted, found.truth).values
+            values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]
             print(f"\n| seed | {' | '.join(COLUMNS + COUNTS)} | seconds |")
             print("|---" * (len(cells) + 2) + "|")
             print(f"| {seed} | {' | '.join(cells)} | {found.seconds:.0f} | (load {os.getloadavg()[0]:.1f})\n")
-            table = contingency(*pooled(found.predicted, found.truth)).without(truth=0, predicted=0)
+            table = contingency(*pooled(found.predicted, found.truth, found.frames)).without(truth=0, predicted=0)
             print("| thing | best IoU | ids on it | |\n|---|---|---|---|")
             print("\n".join(things(folder, table)), flush=True)
             if args.look:

@@ -161,10 +161,10 @@ def test_an_edited_run_is_exported_but_for_what_its_photos_do_not_show(warm):
     called = ss_flow("export", place, "--format", "labelled-ply", "--out", ply, "--cache", warm.store)
     assert called.code == 0, called.err
     assert ply.read_bytes() == (place / "scene_labeled.ply").read_bytes()
-    for format in ("coco", "colmap"):
+    for format, lacking in (("coco", "masks"), ("colmap", "masks"), ("nerfstudio", "photos")):
         refused = ss_flow("export", place, "--format", format, "--out", place.parent / "x", "--cache", warm.store)
         assert refused.code == 2
-        assert f"edited run, which has no masks of its own; take its source, {warm.out.resolve()}." in refused.err
+        assert f"edited run, which has no {lacking} of its own; take its source, {warm.out.resolve()}." in refused.err
 
 
 @pytest.mark.parametrize("protocol", ["views", "points", "objects"])

@@ -124,8 +124,9 @@ def test_without_a_place_no_format_replaces_the_export_of_another(tiny, tmp_path
         answer = export(tiny, "--format", format, *more, "--json")
         assert answer.code == 0, answer.err
         places.append(answer.document()["out"].removeprefix(f"ss-flow-export/{tiny.out.name}"))
-    assert places[:4] == [".ply", "-labelled.ply", ".glb", f"-{ids_of(tiny)[0]:04d}-mesh.glb"]
-    assert places[4:] == ["-mesh-obj", "-mesh-ply", "-colmap", "-nerfstudio", "-ply"]
+    of_one = f"-{ids_of(tiny)[0]:04d}"
+    assert places[:4] == [".ply", "-labelled.ply", ".glb", f"{of_one}-mesh.glb"]
+    assert places[4:] == [f"{of_one}-mesh-obj", f"{of_one}-mesh-ply", "-colmap", "-nerfstudio", f"{of_one}-ply"]
 
 
 def test_without_a_place_chosen_instances_have_their_ids_in_the_name_and_leave_the_whole_scene(

@@ -109,7 +109,7 @@ class Hands:
     def has_listed(self) -> bool:
         """Whether the page's list shows what the server's does: a browser is a moment behind."""
         with self.viewer.panel.lock:  # what is being done is shown, too, before it is let go
-            listed = [row.button.label for row in self.viewer.panel.objects.rows if row.instance is not None]
+            listed = [row.button.label for row in self.viewer.panel.objects.rows]
         drawn = self.page.evaluate("[...document.querySelectorAll('button')].map(b => b.innerText.trim())")
         return [text for text in drawn if " · " in text or text == "background"] == listed
 

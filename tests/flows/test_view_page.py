@@ -17,6 +17,7 @@ from ss_flow.flows.results import finished_run, read_run
 from ss_flow.flows.view.looking import start_view
 from ss_flow.flows.view.page import page_html, write_page
 from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.deliver.compressed import decompressed
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, looking
@@ -77,6 +78,17 @@ def test_a_name_that_is_markup_stays_a_name(run):
     html = page_html(name, scene, start_view(cameras, scene.means), entries)
     assert "alert(1)</script>" not in html
     assert {one["name"] for one in json.loads(part(html, "scene"))["objects"]} == {name, "background"}
+
+
+def test_an_object_without_a_photo_of_its_own_has_its_colour_as_its_picture(run):
+    scene, cameras = run.results.one("scene"), run.results.one("cameras")
+    entries = [(entry, None) for entry in run.instances["instances"]]  # as of an edited run
+    html = page_html("edited", scene, start_view(cameras, scene.means), entries)
+    for one in json.loads(part(html, "scene"))["objects"]:
+        kind, _, content = one["thumbnail"].partition(";base64,")
+        assert kind in ("data:image/png", "data:image/jpeg")
+        picture = decompressed(np.frombuffer(base64.b64decode(content), np.uint8))
+        assert picture[0, 0].tolist() == one["color"]
 
 
 def test_a_scene_without_gaussians_is_a_page_without_objects(run):

@@ -27,7 +27,7 @@ def viewer(tiny, tmp_path: Path) -> Iterator[Viewer]:
 
 
 def _listed(objects: ObjectList) -> list[int]:
-    return [row.instance for row in objects.rows if row.instance is not None]
+    return [row.instance for row in objects.rows]
 
 
 def test_what_is_typed_is_answered_as_by_the_command(viewer: Viewer, tiny) -> None:
@@ -68,3 +68,18 @@ def test_the_slider_lets_more_of_them_match(viewer: Viewer) -> None:
         assert objects.answer.content == f"{matches} match" and _listed(objects)[: len(ids)] == ids
         objects.turn.value = "Select matches"
         assert picked[-1] == tuple(ids[:matches])
+
+
+def test_a_click_means_the_object_that_the_page_showed_though_the_list_has_moved_since(viewer: Viewer) -> None:
+    panel = viewer.panel
+    shown = list(panel.objects.rows)  # by a browser that lags behind
+    gone, meant, after = (row.instance for row in shown[:3])
+    panel.session.do({"op": "remove", "instances": [gone]})
+    panel.refresh()
+    assert _listed(panel.objects)[:2] == [meant, after] and [row.button.visible for row in shown[:2]] == [False, True]
+    orders = [row.button.order for row in panel.objects.rows]
+    assert panel.objects.answer.order < orders[0] and orders == sorted(orders) and orders[-1] < panel.objects.turn.order
+    shown[1].button.value = True
+    assert panel.session.selected == (meant,)
+    shown[0].button.value = True
+    assert panel.session.selected == ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -63,7 +63,7 @@ def usda(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str]) ->
         parts.append(
             _PRIM.format(
                 id=instance_id,
-                name=json.dumps(name, ensure_ascii=False),
+                name=_string(name),
                 extent=_tuples(np.stack([(own.means - reach).min(axis=0), (own.means + reach).max(axis=0)])),
                 positions=_tuples(own.means),
                 orientations=_tuples(own.unit_quaternions),
@@ -74,6 +74,12 @@ def usda(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str]) ->
             )
         )
     return FileContent.of("".join(parts).encode(), b"}\n")
+
+
+def _string(text: str) -> str:
+    """A string in quotes, with USD's escapes."""
+    escaped = re.sub(r'["\\]', r"\\\g<0>", text)
+    return '"' + re.sub(r"[\x00-\x1f]", lambda control: f"\\x{ord(control[0]):02x}", escaped) + '"'
 
 
 def _tuples(rows: np.ndarray) -> str:

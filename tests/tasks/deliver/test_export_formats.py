@@ -310,9 +310,9 @@ def test_instances_of_an_edited_scene_keep_the_column_that_says_what_fills_holes
 
 def test_usda_has_a_prim_for_each_instance_and_numbers_that_read_back():
     made = made_gaussians(40, 1)
-    text = bytes_of(usda(made, made_cameras(), names={"2": 'a "quoted" cup'})).decode()
+    text = bytes_of(usda(made, made_cameras(), names={"2": 'a "quoted" cup', "1": "a\x01b\\"})).decode()
     assert text.startswith("#usda 1.0\n") and text.count("ParticleField3DGaussianSplat") == 4
-    assert 'displayName = "a \\"quoted\\" cup"' in text
+    assert 'displayName = "a \\"quoted\\" cup"' in text and 'displayName = "a\\x01b\\\\"' in text
     prim = text.partition('"instance_0002"')[2]
     written = prim.partition("positions = [")[2].partition("]")[0]
     own = made.means[made.instance_id == 2]

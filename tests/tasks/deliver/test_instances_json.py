@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 from view_masks import as_fields
@@ -69,6 +70,17 @@ def test_where_there_are_gaussians_they_say_where_it_is():
     entry = instances_document([instance(7, [[0, 0, 0]])], scene, None)["instances"][0]
     assert entry["bbox"] == {"min": [1, 0, 0], "max": [3, 0, 0]} and entry["centroid"] == [2, 0, 0]
     assert entry["num_gaussians"] == 2 and entry["file"] == instance_file(7) == "instances/0007.ply"
+
+
+def test_gaussians_that_are_hardly_to_be_seen_do_not_widen_a_box_unless_all_are():
+    scene = gaussians([[1, 0, 0], [3, 0, 0], [80, 0, 0]], [7, 7, 7])
+    told = []
+    for opacities in ([0.9, 0.2, 0.1], [0.1, 0.1, 0.1]):
+        logits = np.log(np.array(opacities, np.float32) / (1 - np.array(opacities, np.float32)))
+        document = instances_document([instance(7, [[0, 0, 0]])], replace(scene, opacity_logits=logits), None)
+        told.append(document["instances"][0])
+    assert [entry["bbox"]["max"] for entry in told] == [[3, 0, 0], [80, 0, 0]]
+    assert [entry["centroid"] for entry in told] == [[28, 0, 0]] * 2
 
 
 def test_a_weak_instance_has_points_but_no_file():

@@ -19,8 +19,7 @@ SPACING = 0.03
 BOX = 2
 
 
-@pytest.fixture(scope="module")
-def seen():
+def look():
     """What the cameras see of the floor and the boxes, as points with true ids, and as Gaussians at these."""
     cameras = box_scene.cameras()
     places, ids = [], []
@@ -37,6 +36,11 @@ def seen():
     known = PointLabels(labels, ones, 3, none, none, none)
     measured = Measured(cameras, box_scene.depths(), PointCloud(points, colors, 1.0, SPACING), known)
     return measured, operations.begin(initialise(points, colors, labels, 1.0, opacity=0.9))
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return look()
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +116,18 @@ def test_what_was_hidden_inside_of_what_has_left_goes_when_its_hole_is_filled(se
     now = operations.joined([scene, hidden])
     after = fill(now, operations.remove(now, instances=(BOX,)), measured, instances=(BOX,), gone=(BOX,))
     assert after.filled.any() and not np.isin(after.means, places).all(axis=1).any()
+
+
+def test_of_things_far_apart_each_is_filled_with_the_surface_that_it_stood_on(monkeypatch):
+    table = [[-0.9, -0.7, 0.0], [-0.5, -0.3, 0.3]]
+    on_the_table, on_the_floor = [[-0.8, -0.6, 0.3], [-0.6, -0.4, 0.5]], [[0.5, 0.4, 0.0], [0.9, 0.8, 0.4]]
+    monkeypatch.setattr(box_scene, "BOXES", np.array([table, on_the_table, on_the_floor]))
+    measured, scene = look()
+    after = fill(scene, operations.remove(scene, instances=(2, 3)), measured, instances=(2, 3), gone=(2, 3))
+    new = after.means[after.filled > 0]
+    for low, high in (on_the_table, on_the_floor):
+        under = ((new[:, :2] > low[:2]) & (new[:, :2] < high[:2])).all(axis=1) & (np.abs(new[:, 2] - low[2]) < SPACING)
+        assert under.sum() > 0.5 * (high[0] - low[0]) * (high[1] - low[1]) / SPACING**2
 
 
 def test_where_nothing_is_left_nothing_is_filled(seen):

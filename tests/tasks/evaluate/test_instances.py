@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Hierarchy, LabelMap
+from ss_flow.tasks.artifacts import Frame, Hierarchy, LabelMap
 from ss_flow.tasks.evaluate.instances import evaluate_masks
+from ss_flow.tasks.geometry.images import encode_png
 
 
 def _maps(*views: list[list[int]]) -> tuple[LabelMap, ...]:
@@ -35,6 +36,18 @@ def test_mask_metrics_are_those_counted_by_hand() -> None:
     assert values["hungarian_miou"] == pytest.approx((3 / 4 + 2 / 3) / 3)
     assert values["over_segmentation"] == 0 and values["under_segmentation"] == pytest.approx(1 / 3)
     assert values["num_truth"] == 3 and values["num_predicted"] == 3
+
+
+@pytest.mark.parametrize("zero_is_void", [False, True])
+def test_pixels_that_a_views_valid_mask_excludes_count_on_neither_side(zero_is_void) -> None:
+    truth = _maps([[1, 1, 2, 2, 0, 0]], [[1, 1, 1, 2, 2, 0]])
+    predicted = _maps([[5, 5, 6, 6, 0, 0]], [[5, 5, 0, 5, 6, 7]])  # wrong where the second view is not valid
+    valid = encode_png(np.array([[255, 255, 0, 0, 255, 0]], np.uint8))
+    empty = np.zeros(0, np.uint8)
+    frames = (Frame("0000", 6, 1, empty, empty, 6, 1), Frame("0001", 6, 1, empty, valid, 6, 1))
+    values = evaluate_masks(predicted, truth, None, frames, zero_is_void=zero_is_void).values
+    assert values["miou"] == values["pq"] == 1 and values["num_predicted"] == 2
+    assert evaluate_masks(predicted, truth, zero_is_void=zero_is_void).values["miou"] < 1
 
 
 def test_predictions_on_void_count_neither_for_nor_against() -> None:

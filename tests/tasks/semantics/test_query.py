@@ -7,7 +7,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Descriptors, PartDescriptors
 from ss_flow.tasks.models.colour_words import TERMS
 from ss_flow.tasks.semantics import query as module
-from ss_flow.tasks.semantics.query import QueryParams, chosen, query, similarity, terms
+from ss_flow.tasks.semantics.query import QueryParams, Similarity, chosen, query, similarity, terms
 
 
 def descriptor(instance_id: int, embedding, encoder: str = "colour words") -> Descriptors:
@@ -61,6 +61,12 @@ def at_degrees(instance_id: int, angle: float, height: float = 0.0) -> Descripto
 def test_red_finds_the_red_objects_and_no_others():
     found = query(ROOM, text="the crimson thing")
     assert found.matches() == [4, 2] and found.accepted
+
+
+def test_what_matches_is_an_answer_though_another_object_that_the_text_does_not_fit_has_a_higher_score():
+    ids, scores, relevancies = np.array([6, 4], np.int32), np.float32([0.541, 0.53]), np.float32([0.26, 0.53])
+    found = chosen(Similarity("red and blue", "colour words", True, ids, scores, relevancies, 0 * ids))
+    assert found.instance_id.tolist() == [6, 4] and found.matches() == [4] and found.accepted
 
 
 def test_parts_are_ranked_each_by_itself():
