@@ -278,6 +278,16 @@ def transforms_of_a_panorama(root):
     return made.nerfstudio(root, camera_model="EQUIRECTANGULAR")
 
 
+@case("transforms.json", "has `is_fisheye` true and the camera_model OPENCV; take away the one that is wrong")
+def transforms_of_two_lenses(root):
+    return made.nerfstudio(root, camera_model="OPENCV", is_fisheye=True)
+
+
+@case("transforms.json", "has `k4`, which is read of a fisheye only")
+def transforms_with_a_coefficient_that_is_not_read(root):
+    return made.nerfstudio(root, k1=0.1, k4=0.01)
+
+
 @case("transforms.json", "none of them exists; the first is looked for at ")
 def listed_photos_missing(root):
     shutil.rmtree(made.nerfstudio(root) / "images")

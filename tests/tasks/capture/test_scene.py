@@ -91,6 +91,14 @@ def test_nerfstudio_cameras_look_the_other_way(tmp_path):
     assert scene.lenses[0].pinhole
 
 
+def test_instant_ngps_word_for_a_fisheye_means_the_same_as_nerfstudios(tmp_path):
+    bent = {"k1": 0.08, "k2": -0.02, "k3": 0.005, "k4": -0.001}
+    named = open_scene(made.nerfstudio(tmp_path / "named", camera_model="OPENCV_FISHEYE", **bent))
+    told = open_scene(made.nerfstudio(tmp_path / "told", is_fisheye=True, **bent))
+    assert told.lenses == named.lenses and told.lenses[0].fisheye
+    assert not open_scene(made.nerfstudio(tmp_path / "plain", is_fisheye=False)).lenses[0].fisheye
+
+
 def test_nerfstudio_without_depth_is_not_metric_and_may_be_named_by_its_file(tmp_path):
     made.nerfstudio(tmp_path)
     text = (tmp_path / "transforms.json").read_text().replace("depth_file_path", "unused")
