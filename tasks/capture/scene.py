@@ -159,6 +159,13 @@ def _open_loose(path: Path) -> SceneFiles:
     recordings = files_in(path, VIDEO_SUFFIXES | {".sens"})
     if photos:
         folder, stems = photos[0].parent, {photo.stem for photo in photos}
+        depths = [photo for photo in photos if _is_depth(photo)]
+        if 0 < len(depths) < len(photos):
+            raise InputError(
+                f"{folder} holds depth maps beside its photos, such as {depths[0].name}; lay them out as color/, depth/ "
+                "and pose/ with one stem a view, and intrinsic/intrinsic_color.txt (docs/rgbd.md), or move the depth "
+                "maps away to use photos alone."
+            )
         unread = [file for file in files_in(folder, UNREAD_SUFFIXES) if file.stem not in stems]
         called = {photo: photo.stem for photo in photos} | {file: file.name for file in unread}
         listed = files_in(folder, PHOTO_SUFFIXES | UNREAD_SUFFIXES)
@@ -199,6 +206,14 @@ def _one_of_each(photos: list[Path]) -> list[Path]:
     photos = [photo for photo in photos if photo.suffix.lower() not in PNM_SUFFIXES] or photos
     copied = {photo.stem for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES}
     return [photo for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES or photo.stem not in copied]
+
+
+def _is_depth(photo: Path) -> bool:
+    """Whether the header of a file is that of a PNG with 16 bits in one channel."""
+    if photo.suffix.lower() != ".png" or not photo.is_file():
+        return False
+    with photo.open("rb") as file:
+        return file.read(26)[24:] == bytes([16, 0])
 
 
 def _check_files(scene: SceneFiles) -> None:

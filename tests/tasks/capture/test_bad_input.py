@@ -101,6 +101,14 @@ def folder_of_two_folders_of_photos(root):
     return root
 
 
+@case("scene", "holds depth maps beside its photos, such as frame-000000.depth.png; lay them out as color/, depth/ and")
+def photos_and_depth_maps_in_one_folder(root):
+    for i in range(3):
+        made.write(root / f"frame-{i:06d}.color.png", made.photo(i))
+        made.write(root / f"frame-{i:06d}.depth.png", made.depth_image())
+    return root
+
+
 @case("scene", "its folder dense/ is a capture with poses, so give that.")
 def folder_of_a_workspace_among_others(root):
     made.colmap(root / "dense")
