@@ -91,11 +91,11 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
 
 
 def remarks(scene: SceneFiles, params: Params, networks: Networks) -> list[str]:
-    """What to say of a run that leaves something out only because this machine lacks what it takes."""
+    """What to say of a run that leaves something out for what this machine lacks, or how the capture lies there."""
     brings_masks = scene.has_masks or scene.hints is not None  # hints without a segmenter are refused
     weight_free = networks.segmenter is None and params.split.segmenter == "auto" and not brings_masks
     uncompared = compares_poses(scene, params.capture) and not has_pycolmap()
-    return [*[WEIGHT_FREE] * weight_free, *[UNCOMPARED] * uncompared]
+    return [*scene.remarks, *[WEIGHT_FREE] * weight_free, *[UNCOMPARED] * uncompared]
 
 
 def node_records(report: Report) -> list[dict[str, Any]]:

@@ -89,7 +89,17 @@ def open_scene(
         scene = replace(scene, valid=_some_by_name(scene.root / "valid", scene.names))
     if not scene.valid:
         scene = replace(scene, valid=(None,) * len(scene.names))
-    return scene
+    return replace(scene, remarks=_unused(scene)) if scene.kind == "photos" else scene
+
+
+def _unused(scene: SceneFiles) -> tuple[str, ...]:
+    """What to say of folders beside photos that hold images, too; copies scaled down (images_4) are no loss."""
+    used = {file.parent.resolve() for file in scene.files()} | {(scene.root / "held_out").resolve()}
+    beside = [f for f in sorted(scene.root.glob("*/")) if not f.name.startswith((".", "images_"))]
+    left = [f for f in beside if not any(place.is_relative_to(f.resolve()) for place in used)]
+    listed = ", ".join(f"{folder.name}/ ({number})" for folder in left if (number := len(files_in(folder))))
+    why = "photos are read of one folder, and depth where a layout gives its lens and unit (docs/captures.md)"
+    return (f"{scene.root} holds images that are not used, in {listed}: {why}.",) if listed else ()
 
 
 def _names_zero(file: Path) -> bool:
@@ -162,9 +172,9 @@ def _open_loose(path: Path) -> SceneFiles:
         depths = [photo for photo in photos if _is_depth(photo)]
         if 0 < len(depths) < len(photos):
             raise InputError(
-                f"{folder} holds depth maps beside its photos, such as {depths[0].name}; lay them out as color/, depth/ "
-                "and pose/ with one stem a view, and intrinsic/intrinsic_color.txt (docs/rgbd.md), or move the depth "
-                "maps away to use photos alone."
+                f"{folder} holds depth maps beside its photos, such as {depths[0].name}; lay them out as color/, "
+                "depth/ and pose/ with one stem a view, and intrinsic/intrinsic_color.txt (docs/rgbd.md), or move the "
+                "depth maps away to use photos alone."
             )
         unread = [file for file in files_in(folder, UNREAD_SUFFIXES) if file.stem not in stems]
         called = {photo: photo.stem for photo in photos} | {file: file.name for file in unread}

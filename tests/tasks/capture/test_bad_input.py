@@ -93,7 +93,8 @@ def folder_of_a_folder_of_photos(root):
 
 
 @case(
-    "scene", "(.bmp .heic .heif .jpeg .jpg .pgm .png .pnm .ppm .tif .tiff .webp) and no capture that is known; give a"
+    "scene",
+    "(.bmp .heic .heif .jfif .jpeg .jpg .pgm .png .pnm .ppm .tif .tiff .webp) and no capture that is known; give a",
 )
 def folder_of_two_folders_of_photos(root):
     made.photos(root / "walk")
