@@ -485,6 +485,14 @@ def test_photos_that_a_colmap_model_did_not_register_are_skipped_by_name(tmp_pat
     assert scene.skipped == tuple(made.NAMES[2:])
 
 
+def test_photos_of_a_folder_of_which_a_colmap_model_registered_none_are_skipped_by_name_too(tmp_path):
+    made.colmap(tmp_path)
+    for name in ("b/2", "b/3", "c/deep/4"):
+        made.write(tmp_path / f"images/{name}.png", made.photo())
+    scene = open_scene(tmp_path)
+    assert scene.names == made.NAMES and scene.skipped == ("b_2", "3", "4")
+
+
 def test_runs_of_a_file_are_recorded_under_it_and_those_of_a_folder_under_the_folder(tmp_path):
     video = made.video(tmp_path / "a.avi", count=4)
     assert open_scene(video).place == video
