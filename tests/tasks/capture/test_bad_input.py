@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_folders import ref, refs
+from PIL import Image
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
@@ -399,6 +400,14 @@ def depth_of_8_bits(root):
 @case("10.png", "3 channels")
 def depth_in_colour(root):
     made.write(made.nerfstudio(root) / "depth" / "10.png", made.photo())
+    return root
+
+
+@case("10.png", "has a palette; an image of one channel is expected, so save it as gray")
+def valid_mask_with_a_palette(root):
+    image = Image.fromarray(np.ones((24, 32), np.uint8))
+    image.putpalette(bytes(6))
+    image.save(made.scannet(root) / "valid" / "10.png")
     return root
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_folders import ref, refs
+from PIL import Image
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture import photo_files
@@ -394,6 +395,22 @@ def test_ready_masks_become_one_mask_an_id_at_the_frames_size(tmp_path):
     assert first.dense()[0, 6:, 8:].all() and first.dense()[0].sum() == 48
     assert first.dense()[1, :6, :8].all() and first.dense()[1].sum() == 48
     assert first.parent.tolist() == [-1, -1] and len(empty) == 0 and empty.dense().shape == (0, 12, 16)
+
+
+@pytest.mark.parametrize(("colours", "bits"), [(3, 2), (200, 8)])
+def test_ids_may_be_the_numbers_of_a_palettes_colours(tmp_path, colours, bits):
+    made.photos(tmp_path)
+    rng = np.random.default_rng(0)
+    ids = rng.integers(0, colours, (24, 32), dtype=np.uint8)
+    image = Image.fromarray(ids)
+    image.putpalette(rng.integers(0, 256, 3 * colours, dtype=np.uint8).tobytes())
+    (tmp_path / "instance").mkdir()
+    image.save(tmp_path / "instance/2.png", transparency=0)
+    assert (tmp_path / "instance/2.png").read_bytes()[24:26] == bytes([bits, 3])
+    scene = open_scene(tmp_path)
+    views = ingested(scene)
+    (found,) = ground_truth(views, made.cameras_of(views), names=scene.names, files=refs(scene.ground_truth))
+    np.testing.assert_array_equal(found.ids, ids)
 
 
 def test_masks_of_photos_lose_the_distortion_that_structure_from_motion_found(tmp_path):
