@@ -89,7 +89,7 @@ def inspect(data: bytes, where: str) -> Photo:
             return Photo(data, "heic", width, height, 1, focal)
     except (IndexError, struct.error, ValueError, EOFError) as error:
         raise InputError(f"{where} is cut short or damaged; a whole image file is expected.") from error
-    return Photo(data, "other", 0, 0, 1)
+    return Photo(data, "other", 0, 0, 1, _exif(data)[1])  # of a TIFF, which OpenCV turns upright by itself
 
 
 def header_size(path: Path) -> tuple[int, int]:

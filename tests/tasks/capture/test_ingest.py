@@ -375,6 +375,12 @@ def test_focal_length_is_read_of_exif_and_kept_with_the_frame(tmp_path, entries,
     assert frame.focal == focal
 
 
+def test_focal_length_of_a_tiff_is_read_too():
+    photo = photo_files.inspect(exif_of((0x920A, 5, 100)), "a.tif")
+    assert (photo.focal, photo.orientation) == (4.25, 1)
+    assert photo_files.inspect(b"BM", "a.bmp").focal == 0
+
+
 def test_focal_length_of_heic_is_read_too(tmp_path, monkeypatch):
     """As pi_heif gives EXIF; the files here have none."""
     found = SimpleNamespace(size=(32, 24), info={"exif": b"Exif\0\0" + exif_of((0xA405, 3, 13, 0))})
