@@ -136,7 +136,8 @@ def test_a_photo_is_not_turned_when_its_intrinsics_are_those_of_the_stored_one(t
     path.write_bytes(with_orientation(cv2.imencode(".jpg", made.photo())[1].tobytes(), 6))
     stored = frames(names=("a",), photos=(ref(path),), lenses=(Lens(32, 24, 30, 30, 16, 12),))[0]
     turned = frames(names=("a",), photos=(ref(path),), lenses=(Lens(24, 32, 30, 30, 12, 16),))[0]
-    assert (stored.width, stored.height) == (32, 24) and stored.encoded.tobytes() == path.read_bytes()
+    assert (stored.width, stored.height) == (32, 24)
+    assert cv2.imdecode(stored.encoded, cv2.IMREAD_COLOR).shape == (24, 32, 3)  # for programs that obey EXIF, too
     assert (turned.width, turned.height) == (24, 32)
 
 
