@@ -191,6 +191,8 @@ def _open_loose(path: Path) -> SceneFiles:
         raise InputError(f"{path} holds {len(recordings)} recordings; give the path of one of them.")
     if recordings:
         return _open_layout(recordings[0])
+    if (path / "color").is_dir() and (path / "depth").is_dir():
+        return open_scannet(path)  # which tells what is missing
     suffixes = " ".join(sorted(PHOTO_SUFFIXES))
     raise InputError(f"{path} holds no photo ({suffixes}) and no capture that is known; {_what_to_give(path)}.")
 
@@ -229,11 +231,12 @@ def _is_depth(photo: Path) -> bool:
 def _check_files(scene: SceneFiles) -> None:
     if scene.photos:
         by_name(scene.names, scene.photos)
-    listed = [*scene.photos, *(scene.depths or ())]
-    _check_exist(listed)
-    for file in listed:
-        if file.suffix.lower() not in PHOTO_SUFFIXES:
-            raise InputError(f"{file} is no image file by its name; JPEG, PNG or HEIC is expected.")
+    depths = scene.depths or ()
+    _check_exist([*scene.photos, *depths])
+    for files, expected in ((scene.photos, "JPEG, PNG or HEIC"), (depths, "PNG of 16 bits or TIFF of 32-bit floats")):
+        for file in files:
+            if file.suffix.lower() not in PHOTO_SUFFIXES:
+                raise InputError(f"{file} is no image file by its name; {expected} is expected.")
 
 
 def _check_exist(files: Sequence[Path]) -> None:

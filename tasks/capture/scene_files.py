@@ -221,6 +221,8 @@ def by_name(names: Sequence[str], paths: Sequence[Path]) -> dict[str, Path]:
     """
     found: dict[str, Path] = {}
     for name, path in zip(names, paths, strict=True):
+        if found.get(name) == path:
+            raise InputError(f"{path} is listed twice; every view needs a photo of its own.")
         if name in found:
             raise InputError(f"{found[name]} and {path} both belong to view {name}; every view needs its own stem.")
         found[name] = path

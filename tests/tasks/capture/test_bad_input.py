@@ -419,11 +419,32 @@ def depth_without_a_known_pixel(root):
     return root
 
 
-@case("depth", "the valid masks (0 = ignored) leave out every one")
+@case("depth", "valid masks (0 = ignored) or the photos' alpha channels leave out every one")
 def valid_masks_that_leave_out_everything(root):
     made.scannet(root)
     for name in made.NAMES:
         made.write(root / "valid" / f"{name}.png", np.zeros((24, 32), np.uint8))
+    return root
+
+
+@case("10.npy", "is no image file by its name; PNG of 16 bits or TIFF of 32-bit floats is expected")
+def depth_as_an_array_of_numpy(root):
+    (made.nerfstudio(root) / "depth" / "10.npy").write_bytes(b"")
+    edit_json(root, lambda d: d["frames"][1].update(depth_file_path="depth/10.npy"))
+    return root
+
+
+@case("intrinsic_color.txt", "is missing; the capture needs it")
+def frames_of_a_depth_sensor_without_their_lens(root):
+    made.scannet(root)
+    shutil.rmtree(root / "intrinsic")
+    shutil.rmtree(root / "pose")
+    return root
+
+
+@case("10.png", "is listed twice; every view needs a photo of its own")
+def a_photo_that_is_listed_twice(root):
+    edit_json(made.nerfstudio(root), lambda d: d["frames"].append(d["frames"][1]))
     return root
 
 
