@@ -95,7 +95,7 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
 
 
 def remarks(scene: SceneFiles, params: Params, networks: Networks) -> list[str]:
-    """What to say of a run beforehand: what it leaves out only because this machine lacks it, and what it takes for so.
+    """What to say of a run beforehand: how the capture lies there, and what is left out for what this machine lacks.
 
     params: with the turns that "auto" comes to.
     """
@@ -104,7 +104,7 @@ def remarks(scene: SceneFiles, params: Params, networks: Networks) -> list[str]:
     uncompared = compares_poses(scene, params.capture) and not has_pycolmap()
     seen = networks.encoder is not None or (networks.segmenter is not None and not scene.has_masks)
     lying = seen and scene.poses is not None and params.capture.turns in ("1", "3")
-    return [*[WEIGHT_FREE] * weight_free, *[UNCOMPARED] * uncompared, *[LYING] * lying]
+    return [*scene.remarks, *[WEIGHT_FREE] * weight_free, *[UNCOMPARED] * uncompared, *[LYING] * lying]
 
 
 def node_records(report: Report) -> list[dict[str, Any]]:

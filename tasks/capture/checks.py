@@ -48,6 +48,8 @@ _OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """Between a camera's axes in OpenGL and in OpenCV."""
 _MIRRORS = [np.diag(signs) for signs in ([1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, 1.0])]
 """Along y, z and x of the camera and of the world."""
+_FLAT, _TEXTURED = 1, 8
+"""Grey values with a standard deviation up to the former show nothing, and from the latter on something."""
 _SAME_PICTURE = 1.0
 """Mean difference of grey values, of 255, below which two photos are the same."""
 
@@ -81,6 +83,8 @@ def checks(
         if np.isfinite(differs):
             now.setdefault(row, []).append(differs)
             error[row] = np.median(now[row])
+        if _blank(views[row], views[other], scale):
+            likeness[row] = np.fmax(likeness[row], 0)
         alike = _alike(views[row], views[other], scale)
         if alike is not None:
             likeness[row] = np.fmax(likeness[row], alike[0])
@@ -180,9 +184,20 @@ def _alike(view: _View, other: _View, scale: float) -> tuple[float, float] | Non
     measured = other.depth[v, u]
     visible = (measured > 0) & (_difference(z, scale * measured) < _OCCLUDED)
     a, b = view.grey.ravel()[view.pixels[rows[visible]]], other.grey[v[visible], u[visible]]
-    if len(a) < _LEAST_PIXELS or a.std() <= 1 or b.std() <= 1:
+    if len(a) < _LEAST_PIXELS or a.std() <= _FLAT or b.std() <= _FLAT:
         return None
     return float(np.corrcoef(a, b)[0, 1]), float(np.median((b + 1) / (a + 1)))
+
+
+def _blank(view: _View, other: _View, scale: float) -> bool:
+    """Whether a view shows nothing at all where another one shows something; its own depth need not be known."""
+    if view.grey.std() > _FLAT:
+        return False
+    rows, u, v, z = pixels_in_view(other.points * scale, _from(other, view))
+    measured = view.depth[v, u]
+    met = (measured == 0) | (_difference(z, scale * measured) < _OCCLUDED)
+    shown = other.grey.ravel()[other.pixels[rows[met]]]
+    return len(shown) >= _LEAST_PIXELS and bool(shown.std() > _TEXTURED)
 
 
 def _from(view: _View, other: _View) -> Camera:

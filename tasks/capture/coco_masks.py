@@ -41,8 +41,8 @@ def coco_masks(
     regions, which stand for many objects at once, are left out. The masks come in canonical order; `predicted_iou` is
     what the file gives as `predicted_iou` or `score`, else 1.
 
-    Raises InputError when the file is not of this form, lists no view, or gives a mask that cannot be read or has not
-    its photo's size.
+    Raises InputError when the file is not of this form, lists no view or crowds only, or gives a mask that cannot be
+    read or has not its photo's size.
     """
     row = {name: i for i, name in enumerate(names)}
     images, annotations = _contents(file.path, row.keys())
@@ -102,6 +102,11 @@ def _contents(path: Path, names: Collection[str]) -> tuple[dict[str, dict[str, A
             crowds += 1
         else:
             annotations.setdefault(annotation["image_id"], []).append(named)
+    if crowds and not annotations:
+        raise InputError(
+            f"{path} has iscrowd = 1 in all its {crowds} annotations, and crowds are left out, since each stands for "
+            "many objects at once; where each is one object, as in CVAT's exports, set it to 0."
+        )
     if crowds:
         warn(f"{crowds} crowd regions of {path.name} are left out: each stands for many objects at once.")
     return images, annotations

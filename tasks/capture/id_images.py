@@ -59,7 +59,7 @@ def _id_images(
         ref = files[row[frame.name]]
         if ref is None:
             continue
-        ids = read_gray(ref.path)
+        ids = read_gray(ref.path, of_palette=True)
         if ids.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{ref.path} holds {ids.dtype} pixels; instance ids of 16 bits a pixel are expected.")
         height, width = ids.shape

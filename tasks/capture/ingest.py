@@ -125,7 +125,8 @@ def frame_of(
     if scale < 1:
         image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
         keep = averaged_valid(keep, w, h)
-    if turn or distorted or scale < 1 or photo.format not in ("jpeg", "png"):
+    # A photo that is to be read as it is stored must not tell other programs to turn it.
+    if photo.orientation != 1 or turn or distorted or scale < 1 or photo.format not in ("jpeg", "png"):
         if params.jpeg_quality:
             encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
         else:

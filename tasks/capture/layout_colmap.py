@@ -76,9 +76,13 @@ def open_colmap(root: Path) -> SceneFiles:
         if view.camera not in lenses:
             raise InputError(f"{folder} has no camera {view.camera}, which its image {view.file_name} refers to.")
     registered = set(photos)
-    unregistered = [p for place in sorted({p.parent for p in photos}) for p in files_in(place) if p not in registered]
+    # COLMAP looks for photos in all folders below `images/`; beside a model without one lie other things, too.
+    places = {p.parent for p in photos} | set((root / "images").glob("**/"))
+    unregistered = [p for place in sorted(places) for p in files_in(place) if p not in registered]
     everything = sorted([*photos, *unregistered], key=lambda p: natural_key(p.as_posix()))
     called = view_names(photos, unregistered)
+    taken = {called[p] for p in photos}
+    called |= {p: "_".join(p.relative_to(images).with_suffix("").parts) for p in unregistered if called[p] in taken}
     sparse = next((p for p in (folder / "points3D.bin", folder / "points3D.txt") if p.is_file()), None)
     return SceneFiles(
         kind="colmap",

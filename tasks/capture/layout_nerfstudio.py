@@ -157,10 +157,13 @@ def _listed(root: Path, name: str | None, path: Path) -> Path | None:
 
 
 def _lens(values: dict[str, Any], photo: Path, path: Path) -> Lens:
-    model = str(values.get("camera_model", "OPENCV")).upper()
+    bent = values.get("is_fisheye") is True  # as instant-ngp calls it, whose files name no model
+    model = str(values.get("camera_model", "OPENCV_FISHEYE" if bent else "OPENCV")).upper()
     fisheye = model == "OPENCV_FISHEYE"
     if not fisheye and model not in _PERSPECTIVE:
         raise InputError(f"{path} has cameras of model {model}; OPENCV, PINHOLE or OPENCV_FISHEYE is expected.")
+    if bent and not fisheye:
+        raise InputError(f"{path} has `is_fisheye` true and the camera_model {model}; take away the one that is wrong.")
 
     def number(key: str) -> float:
         return _number(values[key], key, path) if key in values else 0.0
@@ -179,6 +182,10 @@ def _lens(values: dict[str, Any], photo: Path, path: Path) -> Lens:
         raise InputError(f"{path} has no intrinsics; give fl_x, fl_y, cx, cy, w and h in pixels.")
     cx = number("cx") if "cx" in values else width / 2
     cy = number("cy") if "cy" in values else height / 2
+    if not fisheye and number("k4"):
+        raise InputError(
+            f"{path} has `k4`, which is read of a fisheye only; undistort the photos first, or set it to 0."
+        )
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     return check_lens(Lens(width, height, fx, fy, cx, cy, tuple(number(k) for k in keys), fisheye), str(path))
 

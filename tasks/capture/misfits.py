@@ -123,7 +123,7 @@ def _strange(found: CaptureChecks, strange: np.ndarray) -> Iterable[str]:
         yield (
             f"Photos that differ from what their neighbours show: {strange.sum()} of {len(found.names)}, "
             f"{first_of(np.array(found.names)[strange].tolist())} (correlation {found.likeness[worst]:.2f}, usually "
-            f"{np.nanmedian(found.likeness):.2f}); turned, or elsewhere?"
+            f"{np.nanmedian(found.likeness):.2f}); turned, elsewhere, or blank?"
         )
 
 

@@ -25,6 +25,7 @@ _EXIF_ORIENTATION, _EXIF_MORE = 0x0112, 0x8769
 _EXIF_FOCAL, _EXIF_FOCAL_35MM = 0x920A, 0xA405
 _TIFF_EXTRA, _TIFF_ALPHA = 0x0152, (1, 2)
 _PNG_WITH_ALPHA = (4, 6)
+_PNG_WITH_PALETTE = 3
 _LONG, _RATIONAL = 4, 5
 _DIM = 1 << 13
 """An eighth of the range of 16 bits; values of 12 bits in a file of 16 stay below a sixteenth."""
@@ -88,7 +89,7 @@ def inspect(data: bytes, where: str) -> Photo:
             return Photo(data, "heic", width, height, 1, focal)
     except (IndexError, struct.error, ValueError, EOFError) as error:
         raise InputError(f"{where} is cut short or damaged; a whole image file is expected.") from error
-    return Photo(data, "other", 0, 0, 1)
+    return Photo(data, "other", 0, 0, 1, _exif(data)[1])  # of a TIFF, which OpenCV turns upright by itself
 
 
 def header_size(path: Path) -> tuple[int, int]:
@@ -146,17 +147,31 @@ def pixels_of(photo: Photo, where: str) -> Pixels:
     return Pixels(image, opaque, dim)
 
 
-def read_gray(path: Path) -> np.ndarray:
+def read_gray(path: Path, *, of_palette: bool = False) -> np.ndarray:
     """[H, W] a one-channel image at its own depth: uint8, uint16 or float32.
 
+    of_palette: whether of a PNG with a palette the numbers of its colours are taken.
     Raises InputError when it is missing, damaged, or has several channels.
     """
     import cv2
 
-    image = decode(read_photo(path).data, str(path), cv2.IMREAD_UNCHANGED)
+    photo = read_photo(path)
+    if photo.format == "png" and photo.data[25] == _PNG_WITH_PALETTE and b"PLTE" in photo.data:
+        if not of_palette:
+            raise InputError(f"{path} has a palette; an image of one channel is expected, so save it as gray.")
+        return decode(_numbered(photo.data), str(path), cv2.IMREAD_UNCHANGED)[..., 0]
+    image = decode(photo.data, str(path), cv2.IMREAD_UNCHANGED)
     if image.ndim != 2:
         raise InputError(f"{path} has {image.shape[2]} channels; an image of one channel is expected.")
     return image
+
+
+def _numbered(png: bytes) -> bytes:
+    """A PNG with a palette in which each colour is the gray of its own number, since OpenCV shows colours only."""
+    start = png.index(b"PLTE")
+    end = start + 4 + struct.unpack_from(">I", png, start - 4)[0]
+    palette = b"PLTE" + bytes(i // 3 for i in range(end - start - 4))
+    return png[:start] + palette + struct.pack(">I", zlib.crc32(palette)) + png[end + 4 :]
 
 
 def _is_heic(data: bytes) -> bool:

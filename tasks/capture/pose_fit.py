@@ -29,6 +29,9 @@ _LEAST_PAIRS, _LEAST_MATCHES = 3, 15
 """With fewer pairs, of fewer matches each, photos tell nothing about poses."""
 _OCCLUDED = 0.25
 """Relative difference of depth beyond which something else stands in front."""
+_NEAR = 3
+"""Refined poses that leave more than so many times the distance from which poses are refined are wrong, too: it is half
+of that distance where refining succeeds, and forty times where photos and poses are of two captures in one."""
 _NOT_WORSE = 1.05
 """Depth that fits so much less well after refining is within the noise of the sample."""
 
@@ -121,7 +124,7 @@ def pose_fit(
 def better_poses(
     given: Cameras, refined: Cameras, before: PoseFit, after: PoseFit, *, params: PoseFitParams = PoseFitParams()
 ) -> Cameras:
-    """The refined cameras where photos fit clearly better and depth no worse under them, else the given ones.
+    """The refined cameras where photos fit them, clearly better, and depth no worse, else the given ones.
 
     before, after: how the given and the refined poses fit. Says which it is, and why.
     """
@@ -136,8 +139,15 @@ def better_poses(
     side = f"{1000 * after.distance:.2f} instead of {1000 * before.distance:.2f} thousandths of the photo's longer side"
     depth = f"; depth carried from view to view differs by {after.depth:.2%} instead of {before.depth:.2%}"
     figures = f"matched points lie {side} off their epipolar lines{depth if np.isfinite(after.depth) else ''} (medians)"
-    fits = after.distance <= (1 - params.gain) * before.distance and not after.depth > _NOT_WORSE * before.depth
-    if fits:
+    better = after.distance <= (1 - params.gain) * before.distance and not after.depth > _NOT_WORSE * before.depth
+    if after.distance > _NEAR * params.least_distance:
+        warn(
+            "The poses that came with this capture do not fit its photos, nor do refined ones, so the given ones are "
+            f"kept: {figures}. Are they several captures, each with a world of its own (give them one by one), is the "
+            "lens of another kind, such as a fisheye, or do poses belong to other photos?"
+        )
+        return given
+    if better:
         warn(
             f"The poses that came with this capture were not exact, so refined ones are used: {figures}. "
             "capture.refine_poses=never keeps the given ones."

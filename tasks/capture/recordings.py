@@ -6,6 +6,7 @@ import shlex
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +52,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
     """Sharp frames spread over a video, named `frame-000000` and on by their place in it.
 
     Sharpness is the variance of the Laplacian at a width of 320 pixels, compared within each stride, since it depends
-    on what is seen as much as on blur.
+    on what is seen as much as on blur. Pixels that are not square, as those of DV and AVCHD, are made so.
     Warns where fewer frames can be decoded than the video announces.
     Raises InputError when the video cannot be opened or shows nothing.
     """
@@ -67,6 +68,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
         )
     step = max(1, stride // max(1, params.candidates))
     reader = cv2.VideoCapture(where)
+    aspect = _pixel_aspect(reader)
     best: list[tuple[float, int, Frame]] = []
     window: tuple[float, int, np.ndarray] | None = None
     for i in range(total):
@@ -79,7 +81,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
                 if window is None or sharpness > window[0]:
                     window = (sharpness, i, image)
         if window is not None and (i % stride == stride - 1 or i == total - 1):
-            best.append((window[0], window[1], _encode(window[2], window[1], params)))
+            best.append((window[0], window[1], _encode(window[2], window[1], aspect, params)))
             window = None
         progress(i + 1, total)
     reader.release()
@@ -125,10 +127,21 @@ def _sharpness(image: UInt8) -> float:
     return float(cv2.Laplacian(small, cv2.CV_64F).var())
 
 
-def _encode(image: UInt8, index: int, params: VideoParams) -> Frame:
+def _pixel_aspect(reader: Any) -> float:
+    """How wide a pixel of a video is that is one unit high, once turned upright; 1 where the video does not say."""
     import cv2
 
-    height, width = image.shape[:2]
+    across, down = reader.get(cv2.CAP_PROP_SAR_NUM), reader.get(cv2.CAP_PROP_SAR_DEN)
+    aspect = float(across / down) if across > 0 and down > 0 else 1.0
+    return 1 / aspect if reader.get(cv2.CAP_PROP_ORIENTATION_META) % 180 else aspect
+
+
+def _encode(image: UInt8, index: int, aspect: float, params: VideoParams) -> Frame:
+    import cv2
+
+    height, width = image.shape[0], max(1, round(image.shape[1] * aspect))
+    if width != image.shape[1]:  # a lens with one focal length needs square pixels
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
     scale = min(1.0, params.max_side / max(width, height))
     w, h = max(1, round(width * scale)), max(1, round(height * scale))
     if scale < 1:

@@ -89,7 +89,17 @@ def open_scene(
         scene = replace(scene, valid=_some_by_name(scene.root / "valid", scene.names))
     if not scene.valid:
         scene = replace(scene, valid=(None,) * len(scene.names))
-    return scene
+    return replace(scene, remarks=_unused(scene)) if scene.kind == "photos" else scene
+
+
+def _unused(scene: SceneFiles) -> tuple[str, ...]:
+    """What to say of folders beside photos that hold images, too; copies scaled down (images_4) are no loss."""
+    used = {file.parent.resolve() for file in scene.files()} | {(scene.root / "held_out").resolve()}
+    beside = [f for f in sorted(scene.root.glob("*/")) if not f.name.startswith((".", "images_"))]
+    left = [f for f in beside if not any(place.is_relative_to(f.resolve()) for place in used)]
+    listed = ", ".join(f"{folder.name}/ ({number})" for folder in left if (number := len(files_in(folder))))
+    why = "photos are read of one folder, and depth where a layout gives its lens and unit (docs/captures.md)"
+    return (f"{scene.root} holds images that are not used, in {listed}: {why}.",) if listed else ()
 
 
 def _names_zero(file: Path) -> bool:
@@ -159,6 +169,13 @@ def _open_loose(path: Path) -> SceneFiles:
     recordings = files_in(path, VIDEO_SUFFIXES | {".sens"})
     if photos:
         folder, stems = photos[0].parent, {photo.stem for photo in photos}
+        depths = [photo for photo in photos if _is_depth(photo)]
+        if 0 < len(depths) < len(photos):
+            raise InputError(
+                f"{folder} holds depth maps beside its photos, such as {depths[0].name}; lay them out as color/, "
+                "depth/ and pose/ with one stem a view, and intrinsic/intrinsic_color.txt (docs/rgbd.md), or move the "
+                "depth maps away to use photos alone."
+            )
         unread = [file for file in files_in(folder, UNREAD_SUFFIXES) if file.stem not in stems]
         called = {photo: photo.stem for photo in photos} | {file: file.name for file in unread}
         listed = files_in(folder, PHOTO_SUFFIXES | UNREAD_SUFFIXES)
@@ -174,6 +191,8 @@ def _open_loose(path: Path) -> SceneFiles:
         raise InputError(f"{path} holds {len(recordings)} recordings; give the path of one of them.")
     if recordings:
         return _open_layout(recordings[0])
+    if (path / "color").is_dir() and (path / "depth").is_dir():
+        return open_scannet(path)  # which tells what is missing
     suffixes = " ".join(sorted(PHOTO_SUFFIXES))
     raise InputError(f"{path} holds no photo ({suffixes}) and no capture that is known; {_what_to_give(path)}.")
 
@@ -201,14 +220,23 @@ def _one_of_each(photos: list[Path]) -> list[Path]:
     return [photo for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES or photo.stem not in copied]
 
 
+def _is_depth(photo: Path) -> bool:
+    """Whether the header of a file is that of a PNG with 16 bits in one channel."""
+    if photo.suffix.lower() != ".png" or not photo.is_file():
+        return False
+    with photo.open("rb") as file:
+        return file.read(26)[24:] == bytes([16, 0])
+
+
 def _check_files(scene: SceneFiles) -> None:
     if scene.photos:
         by_name(scene.names, scene.photos)
-    listed = [*scene.photos, *(scene.depths or ())]
-    _check_exist(listed)
-    for file in listed:
-        if file.suffix.lower() not in PHOTO_SUFFIXES:
-            raise InputError(f"{file} is no image file by its name; JPEG, PNG or HEIC is expected.")
+    depths = scene.depths or ()
+    _check_exist([*scene.photos, *depths])
+    for files, expected in ((scene.photos, "JPEG, PNG or HEIC"), (depths, "PNG of 16 bits or TIFF of 32-bit floats")):
+        for file in files:
+            if file.suffix.lower() not in PHOTO_SUFFIXES:
+                raise InputError(f"{file} is no image file by its name; {expected} is expected.")
 
 
 def _check_exist(files: Sequence[Path]) -> None:

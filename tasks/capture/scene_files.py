@@ -21,8 +21,11 @@ from ss_flow.tasks.capture.lens import Lens
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
 PNM_SUFFIXES = frozenset({".pgm", ".ppm", ".pnm"})
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}) | HEIC_SUFFIXES | PNM_SUFFIXES
-UNREAD_SUFFIXES = frozenset({".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raw"})
+PHOTO_SUFFIXES = HEIC_SUFFIXES | PNM_SUFFIXES | {".jpg", ".jpeg", ".jfif", ".png", ".bmp", ".tif", ".tiff", ".webp"}
+UNREAD_SUFFIXES = frozenset(
+    {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gif", ".jp2", ".jxl", ".nef", ".orf", ".pef", ".raf", ".raw"}
+    | {".rw2", ".srw"}
+)
 """Photos of cameras and phones that are not read."""
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts", ".3gp"}
@@ -110,6 +113,8 @@ class SceneFiles:
     """Whether 0 in them means "not annotated"; otherwise it is background."""
     skipped: tuple[str, ...] = ()
     """Views of the capture that are left out, for lack of a photo that can be read, a pose or a depth map."""
+    remarks: tuple[str, ...] = ()
+    """What is to be said of other files that a run does not read."""
     all_names: tuple[str, ...] = ()
     """Names of all views, those left out at their places among the others; empty = `names`."""
 
@@ -216,6 +221,8 @@ def by_name(names: Sequence[str], paths: Sequence[Path]) -> dict[str, Path]:
     """
     found: dict[str, Path] = {}
     for name, path in zip(names, paths, strict=True):
+        if found.get(name) == path:
+            raise InputError(f"{path} is listed twice; every view needs a photo of its own.")
         if name in found:
             raise InputError(f"{found[name]} and {path} both belong to view {name}; every view needs its own stem.")
         found[name] = path

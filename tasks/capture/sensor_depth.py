@@ -155,8 +155,9 @@ def _check_known(maps: Sequence[DepthMap], measured: bool, where: str) -> None:
         return
     if len(empty) == len(maps) and measured:
         raise InputError(
-            f"the depth maps in {where} have no known pixel that counts: the valid masks (0 = ignored) leave out every "
-            "one, or none lies in the photo; give masks that are 0 only where a pixel is to be ignored."
+            f"the depth maps in {where} have no known pixel that counts: valid masks (0 = ignored) or the photos' "
+            "alpha channels leave out every one, or none lies in the photo; let both be 0 only where a pixel is to be "
+            "ignored."
         )
     if len(empty) == len(maps):
         raise InputError(

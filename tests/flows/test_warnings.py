@@ -63,6 +63,13 @@ def test_a_run_without_weights_says_in_one_line_what_it_is_worth_and_what_would_
     assert chosen.document()["warnings"] == given.document()["warnings"] == []
 
 
+def test_images_beside_photos_that_are_not_used_are_told_before_a_run(tmp_path):
+    made.photos(tmp_path / "walk")
+    made.photos(tmp_path / "walk/day2")
+    dry = ss_flow("run", tmp_path / "walk", "--cache", tmp_path / "store", "--dry-run")
+    assert dry.code == 0 and f"warning {tmp_path / 'walk'} holds images that are not used, in day2/ (3):" in dry.out
+
+
 def test_no_table_is_headed_that_has_no_rows(room, tmp_path):
     told = ss_flow("run", room, "--until", "cameras", "--cache", tmp_path / "store")
     assert told.code == 0 and "measured against" not in told.out

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_folders import ref, refs
+from PIL import Image
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
@@ -93,11 +94,20 @@ def folder_of_a_folder_of_photos(root):
 
 
 @case(
-    "scene", "(.bmp .heic .heif .jpeg .jpg .pgm .png .pnm .ppm .tif .tiff .webp) and no capture that is known; give a"
+    "scene",
+    "(.bmp .heic .heif .jfif .jpeg .jpg .pgm .png .pnm .ppm .tif .tiff .webp) and no capture that is known; give a",
 )
 def folder_of_two_folders_of_photos(root):
     made.photos(root / "walk")
     made.photos(root / "talk")
+    return root
+
+
+@case("scene", "holds depth maps beside its photos, such as frame-000000.depth.png; lay them out as color/, depth/ and")
+def photos_and_depth_maps_in_one_folder(root):
+    for i in range(3):
+        made.write(root / f"frame-{i:06d}.color.png", made.photo(i))
+        made.write(root / f"frame-{i:06d}.depth.png", made.depth_image())
     return root
 
 
@@ -278,6 +288,16 @@ def transforms_of_a_panorama(root):
     return made.nerfstudio(root, camera_model="EQUIRECTANGULAR")
 
 
+@case("transforms.json", "has `is_fisheye` true and the camera_model OPENCV; take away the one that is wrong")
+def transforms_of_two_lenses(root):
+    return made.nerfstudio(root, camera_model="OPENCV", is_fisheye=True)
+
+
+@case("transforms.json", "has `k4`, which is read of a fisheye only")
+def transforms_with_a_coefficient_that_is_not_read(root):
+    return made.nerfstudio(root, k1=0.1, k4=0.01)
+
+
 @case("transforms.json", "none of them exists; the first is looked for at ")
 def listed_photos_missing(root):
     shutil.rmtree(made.nerfstudio(root) / "images")
@@ -383,6 +403,14 @@ def depth_in_colour(root):
     return root
 
 
+@case("10.png", "has a palette; an image of one channel is expected, so save it as gray")
+def valid_mask_with_a_palette(root):
+    image = Image.fromarray(np.ones((24, 32), np.uint8))
+    image.putpalette(bytes(6))
+    image.save(made.scannet(root) / "valid" / "10.png")
+    return root
+
+
 @case("depth", "0 everywhere")
 def depth_without_a_known_pixel(root):
     made.nerfstudio(root)
@@ -391,11 +419,32 @@ def depth_without_a_known_pixel(root):
     return root
 
 
-@case("depth", "the valid masks (0 = ignored) leave out every one")
+@case("depth", "valid masks (0 = ignored) or the photos' alpha channels leave out every one")
 def valid_masks_that_leave_out_everything(root):
     made.scannet(root)
     for name in made.NAMES:
         made.write(root / "valid" / f"{name}.png", np.zeros((24, 32), np.uint8))
+    return root
+
+
+@case("10.npy", "is no image file by its name; PNG of 16 bits or TIFF of 32-bit floats is expected")
+def depth_as_an_array_of_numpy(root):
+    (made.nerfstudio(root) / "depth" / "10.npy").write_bytes(b"")
+    edit_json(root, lambda d: d["frames"][1].update(depth_file_path="depth/10.npy"))
+    return root
+
+
+@case("intrinsic_color.txt", "is missing; the capture needs it")
+def frames_of_a_depth_sensor_without_their_lens(root):
+    made.scannet(root)
+    shutil.rmtree(root / "intrinsic")
+    shutil.rmtree(root / "pose")
+    return root
+
+
+@case("10.png", "is listed twice; every view needs a photo of its own")
+def a_photo_that_is_listed_twice(root):
+    edit_json(made.nerfstudio(root), lambda d: d["frames"].append(d["frames"][1]))
     return root
 
 

@@ -197,6 +197,23 @@ def test_a_turned_photo_is_named(room: Room) -> None:
     )
 
 
+@pytest.mark.parametrize("known", [True, False], ids=["with its depth", "without its depth"])
+def test_a_photo_that_shows_nothing_is_named(room: Room, known: bool) -> None:
+    rgb, depth = room.rgb.copy(), room.depth.copy()
+    rgb[5] = 0
+    depth[5] *= known
+    (said,), found = _checked(room, rgb=rgb, depth=depth)
+    assert said.startswith("Photos that differ from what their neighbours show: 1 of 12, 0005 (correlation 0.00")
+    assert found.exposure == pytest.approx(np.ones(len(room)), abs=0.1)
+
+
+def test_of_a_plain_wall_close_before_a_camera_nothing_else_is_expected(room: Room) -> None:
+    rgb, depth = room.rgb.copy(), room.depth.copy()
+    rgb[5], depth[5] = 200, 0.3 * depth[5].min()
+    heard, _ = _checked(room, rgb=rgb, depth=depth)
+    assert not [said for said in heard if "neighbours show" in said]
+
+
 def test_rolling_exposure_is_told_with_its_factor(room: Room) -> None:
     factor = 1 + 0.3 * np.sin(np.arange(len(room)) / len(room) * 2 * np.pi)
     rgb = np.clip(0.7 * room.rgb * factor[:, None, None, None], 0, 255).astype(np.uint8)

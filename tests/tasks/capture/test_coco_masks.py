@@ -284,6 +284,7 @@ BAD = {
         one({"size": [HEIGHT, WIDTH], "counts": packed([WHOLE + 8, -8])}),
         "do not add up",
     ),
+    "crowds only": (one(iscrowd=1), "has iscrowd = 1 in all its 1 annotations, .* set it to 0"),
     "a score that is a word": (one(score="high"), "annotation 1 of .* has the score 'high'; a number is expected"),
     "a score that is NaN": (one(predicted_iou=float("nan")), "has the predicted_iou nan"),
 }

@@ -163,6 +163,13 @@ def test_refined_poses_are_used_where_photos_fit_clearly_better_and_depth_no_wor
     assert chosen is (refined if used else cameras)
 
 
+def test_refined_poses_that_fit_better_but_not_well_are_not_used(scene):
+    cameras = scene[0]
+    before, after = PoseFit(0.23472, 0.0933), PoseFit(0.03994, 0.0769)
+    with pytest.warns(UserWarning, match="do not fit its photos, nor do refined ones, so the given ones are kept"):
+        assert better_poses(cameras, jittered(cameras, 0.01, 0.1), before, after) is cameras
+
+
 def test_of_poses_that_could_not_be_refined_nothing_is_compared(scene):
     cameras, fit = scene[0], PoseFit(0.002, 0.005)
     with pytest.warns(UserWarning, match=r"may not be exact: matched points lie 2\.00 thousandths of") as said:

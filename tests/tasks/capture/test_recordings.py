@@ -1,3 +1,4 @@
+import struct
 import warnings
 
 import capture_folders as made
@@ -33,6 +34,25 @@ def test_video_frames_are_few_and_small_when_asked(tmp_path):
     frames = video_frames(video=ref(made.video(tmp_path / "a.avi")), params=VideoParams(max_frames=3, max_side=32))
     assert len(frames) == 3
     assert (frames[0].width, frames[0].height, frames[0].source_width) == (32, 24, 64)
+
+
+@pytest.mark.parametrize(("turned", "size"), [(False, (128, 48)), (True, (24, 64))])
+def test_pixels_of_a_video_that_are_not_square_are_made_so(tmp_path, turned, size):
+    file = tmp_path / "a.mp4"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"mp4v"), 10, (64, 48))
+    for i in range(4):
+        writer.write(made.photo(i, 64, 48))
+    writer.release()
+    data = bytearray(file.read_bytes())
+    at = data.index(b"tkhd") + 44  # where it says how to turn what is stored, and then how wide to show it
+    if turned:
+        data[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 48 << 16, 0, 1 << 30)
+    assert data[at + 36 : at + 40] == struct.pack(">I", 64 << 16)
+    data[at + 36 : at + 40] = struct.pack(">I", 128 << 16)
+    file.write_bytes(data)
+    frames = video_frames(video=ref(file), params=VideoParams(min_sharpness=0))
+    assert {(f.width, f.height, f.source_width, f.source_height) for f in frames} == {2 * size}
+    assert decode_rgb(frames[0]).shape[1::-1] == size
 
 
 def test_a_stride_that_gives_too_many_frames_is_widened_over_the_whole_video_with_a_word(tmp_path):

@@ -91,6 +91,14 @@ def test_nerfstudio_cameras_look_the_other_way(tmp_path):
     assert scene.lenses[0].pinhole
 
 
+def test_instant_ngps_word_for_a_fisheye_means_the_same_as_nerfstudios(tmp_path):
+    bent = {"k1": 0.08, "k2": -0.02, "k3": 0.005, "k4": -0.001}
+    named = open_scene(made.nerfstudio(tmp_path / "named", camera_model="OPENCV_FISHEYE", **bent))
+    told = open_scene(made.nerfstudio(tmp_path / "told", is_fisheye=True, **bent))
+    assert told.lenses == named.lenses and told.lenses[0].fisheye
+    assert not open_scene(made.nerfstudio(tmp_path / "plain", is_fisheye=False)).lenses[0].fisheye
+
+
 def test_nerfstudio_without_depth_is_not_metric_and_may_be_named_by_its_file(tmp_path):
     made.nerfstudio(tmp_path)
     text = (tmp_path / "transforms.json").read_text().replace("depth_file_path", "unused")
@@ -329,6 +337,35 @@ def test_a_raw_file_beside_its_photo_is_no_view_that_is_left_out(tmp_path):
     assert open_scene(tmp_path).skipped == ()
 
 
+@pytest.mark.parametrize("suffix", ["rw2", "orf", "jxl", "gif"])
+def test_photos_of_formats_that_are_not_read_are_left_out_by_name(tmp_path, suffix):
+    made.photos(tmp_path)
+    (tmp_path / f"12.{suffix}").write_bytes(b"")
+    assert open_scene(tmp_path).skipped == (f"12.{suffix}",)
+
+
+def test_jpeg_by_the_name_that_browsers_on_windows_give_it_is_a_photo(tmp_path):
+    made.photos(tmp_path)
+    (tmp_path / "10.jpg").rename(tmp_path / "10.jfif")
+    scene = open_scene(tmp_path)
+    assert scene.names == ("2", "10", "11")
+    assert len(ingest.frames(names=scene.names, photos=made.refs(scene.photos))) == 3
+
+
+@pytest.mark.parametrize("photos", [".", "images"])
+def test_folders_of_images_beside_photos_that_are_not_used_are_told(tmp_path, photos):
+    made.photos(tmp_path / photos)
+    for used in ("images_4", "valid", "held_out/images", "made"):
+        for i, name in enumerate(made.NAMES):
+            made.write(tmp_path / used / f"{name}.png", np.full((made.HEIGHT, made.WIDTH), i + 1, np.uint16))
+    masks = (tmp_path / "made").absolute()
+    assert open_scene(tmp_path, masks=masks).remarks == ()
+    made.photos(tmp_path / "day2")
+    made.write(tmp_path / "depth/2.png", made.depth_image())
+    (said,) = open_scene(tmp_path, masks=masks).remarks
+    assert said.startswith(f"{tmp_path} holds images that are not used, in day2/ (3), depth/ (1): ")
+
+
 @pytest.mark.parametrize("layout", ["photos", "scannet", "nerfstudio", "tum", "colmap"])
 def test_a_folder_gives_its_capture_its_whole_name(tmp_path, layout, monkeypatch):
     root = getattr(made, layout)(tmp_path / "room 2024.05.01")
@@ -446,6 +483,14 @@ def test_photos_that_a_colmap_model_did_not_register_are_skipped_by_name(tmp_pat
     scene = open_scene(made.colmap(tmp_path / "some", registered=2))
     assert scene.names == tuple(made.NAMES[:2])
     assert scene.skipped == tuple(made.NAMES[2:])
+
+
+def test_photos_of_a_folder_of_which_a_colmap_model_registered_none_are_skipped_by_name_too(tmp_path):
+    made.colmap(tmp_path)
+    for name in ("b/2", "b/3", "c/deep/4"):
+        made.write(tmp_path / f"images/{name}.png", made.photo())
+    scene = open_scene(tmp_path)
+    assert scene.names == made.NAMES and scene.skipped == ("b_2", "3", "4")
 
 
 def test_runs_of_a_file_are_recorded_under_it_and_those_of_a_folder_under_the_folder(tmp_path):
