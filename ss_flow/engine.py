@@ -128,10 +128,11 @@ def run_flows(
     with contextlib.ExitStack() as stack:
         claims = store.open_claims()
         stack.callback(claims.release_all)
-        run = _Run(requests, store, claims, recorded=recorded and not dry)
+        run = _Run(requests, store, claims)
         stack.callback(run.close)
         workers = open_executor(executor, jobs or usable_cores(), store, run.progressed)
         try:
+            run.begin(recorded=recorded and not dry)  # only now: a run that nobody can compute leaves no record
             room = workers.capacity or _this_machine(gpus)
             capacity = replace(room, cores=jobs or room.cores, memory_mb=memory_mb or room.memory_mb)
             if not dry:
@@ -189,40 +190,38 @@ def _stop(workers: Executor, run: _Run, *, patiently: bool) -> None:
 class _Run:
     """Several requests on their way; attempted again when results of earlier runs turn out to be damaged."""
 
-    def __init__(
-        self,
-        requests: Sequence[Request],
-        store: Store,
-        claims: Claims,
-        *,
-        recorded: bool,
-    ) -> None:
+    def __init__(self, requests: Sequence[Request], store: Store, claims: Claims) -> None:
         self._requests, self._store, self._claims = requests, store, claims
         self._logs: list[Log] = []
         self._healed: set[str] = set()
-        self._open = set(range(len(requests)))
+        self._open: set[int] = set()
         self._flows, self._targets = self._built()
         self.scheduler: Scheduler | None = None
         self._reported: dict[int, Report] = {}
         self._reporters: list[Reporter] = []
-        runs = store.runs
-        previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
-        self._previous = [previous[request.scene] for request in requests]
-        number = next_number(runs) if recorded else 0
-        for request in requests:
-            events = None
-            if recorded:
-                with writing(store.root):
-                    folder = start_run(runs, {"scene": request.scene, "number": number, **request.header}).folder
-                claims.take(RUN_CLAIM + folder.name)
-                events = folder / "events.jsonl"
-            self._logs.append(Log(events, store.root))
-            self._reporters.append(Reporters(self._logs[-1], request.reporter) if request.reporter else self._logs[-1])
-            self._reporters[-1].event("run started", scene=request.scene)
 
     @property
     def reports(self) -> list[Report]:
         return [self._reported[position] for position in range(len(self._requests))]
+
+    def begin(self, *, recorded: bool) -> None:
+        """Tell everyone that the run starts; recorded: and keep that among the store's runs."""
+        requests, runs = self._requests, self._store.runs
+        previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
+        self._previous = [previous[request.scene] for request in requests]
+        number = next_number(runs) if recorded else 0
+        for position, request in enumerate(requests):
+            events = None
+            if recorded:
+                asked = {"scene": request.scene, "number": number, "until": request.until, **request.header}
+                with writing(self._store.root):
+                    folder = start_run(runs, asked).folder
+                self._claims.take(RUN_CLAIM + folder.name)
+                events = folder / "events.jsonl"
+            self._logs.append(Log(events, self._store.root))
+            self._reporters.append(Reporters(self._logs[-1], request.reporter) if request.reporter else self._logs[-1])
+            self._open.add(position)
+            self._reporters[-1].event("run started", scene=request.scene)
 
     def _built(self) -> tuple[list[Flow], list[dict[str, Node]]]:
         """A flow for each request, and its outputs by name."""

@@ -46,7 +46,7 @@ class Run:
 
     folder: Path
     header: dict[str, Any]
-    """What was asked: at least "scene" and "started"."""
+    """What was asked: at least "scene" and "started"; "until", the output at which to stop, or None."""
 
     @property
     def scene(self) -> str:
@@ -73,6 +73,10 @@ class Run:
         """The digests of the flow's outputs by name; none for a run that has not ended."""
         ended = [event for event in self.events() if event["event"] == "run ended"]
         return dict(ended[-1].get("results", {})) if ended else {}
+
+    def is_whole(self) -> bool:
+        """Whether it came to results, and was asked for all of them."""
+        return self.header.get("until") is None and bool(self.results())
 
     def nodes(self) -> list[dict[str, Any]]:
         """The events of the nodes that have a result."""
