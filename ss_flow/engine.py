@@ -21,7 +21,7 @@ from ss_flow.executors import Executor, open_executor
 from ss_flow.graph import Flow, Node
 from ss_flow.keys import Value
 from ss_flow.resolution import Failure
-from ss_flow.runs import PreviousKeys, next_number, settled, start_run
+from ss_flow.runs import PreviousKeys, Run, latest_runs, settled, start_run
 from ss_flow.scheduler import Listening, Scheduler
 from ss_flow.task import Resources
 
@@ -206,16 +206,19 @@ class _Run:
 
     def begin(self, *, recorded: bool) -> None:
         """Tell everyone that the run starts; recorded: and keep that among the store's runs."""
-        requests, runs = self._requests, self._store.runs
-        previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
-        self._previous = [previous[request.scene] for request in requests]
-        number = next_number(runs) if recorded else 0
-        for position, request in enumerate(requests):
+        runs = list(latest_runs(self._store.runs))
+        number = runs[0].place[0] + 1 if runs else 1
+        of_scene: dict[str, list[Run]] = {request.scene: [] for request in self._requests}
+        for run in runs:
+            of_scene.get(run.scene, []).append(run)
+        previous = {scene: PreviousKeys(earlier) for scene, earlier in of_scene.items()}
+        self._previous = [previous[request.scene] for request in self._requests]
+        for position, request in enumerate(self._requests):
             events = None
             if recorded:
                 asked = {"scene": request.scene, "number": number, "until": request.until, **request.header}
                 with writing(self._store.root):
-                    folder = start_run(runs, asked).folder
+                    folder = start_run(self._store.runs, asked).folder
                 self._claims.take(RUN_CLAIM + folder.name)
                 events = folder / "events.jsonl"
             self._logs.append(Log(events, self._store.root))

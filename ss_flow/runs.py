@@ -128,7 +128,7 @@ def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def start_run(runs: Path, header: dict[str, Any]) -> Run:
-    """Open a run: its folder, with what was asked. header: with its "number" (`next_number`)."""
+    """Open a run: its folder, with what was asked. header: with its "number", one more than the latest run's."""
     name = "".join(c if c.isalnum() else "-" for c in Path(header["scene"]).name)
     name = name.encode()[:NAME_BYTES].decode(errors="ignore")  # never in the middle of a character
     folder = runs / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}-{uuid.uuid4().hex[:6]}"
@@ -136,12 +136,6 @@ def start_run(runs: Path, header: dict[str, Any]) -> Run:
     header = header | {"started": time.time()}
     write_atomically(folder / "run.json", json.dumps(header, indent=1))
     return Run(folder, header)
-
-
-def next_number(runs: Path) -> int:
-    """The number of a run that starts now: one more than the highest."""
-    latest = next(latest_runs(runs), None)
-    return latest.place[0] + 1 if latest else 1
 
 
 def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
@@ -164,10 +158,9 @@ class PreviousKeys:
     survives an interrupted run. Read when first asked: most runs find everything.
     """
 
-    def __init__(self, runs: Path, scene: str, before: Run | None = None) -> None:
-        """before: only runs that started earlier."""
-        earlier = (run for run in latest_runs(runs, scene) if before is None or run.place < before.place)
-        self._latest = list(itertools.islice(earlier, RUNS_BACK))
+    def __init__(self, runs: Iterable[Run]) -> None:
+        """runs: of the scene, the latest first."""
+        self._latest = list(itertools.islice(runs, RUNS_BACK))
 
     def __call__(self, label: str) -> Sequence[str]:
         return self._keys.get(label, ())

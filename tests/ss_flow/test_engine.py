@@ -19,7 +19,7 @@ from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
 from ss_flow.closure import Closure, closure_of
-from ss_flow.engine import run_flow
+from ss_flow.engine import Request, run_flow, run_flows
 from ss_flow.events import Reporter
 from ss_flow.explain import first_difference
 from ss_flow.graph import INDEX, Flow, each, expand, gather, labelled, otherwise, pick, stored
@@ -522,6 +522,16 @@ def test_runs_of_a_store_without_numbers_are_in_the_order_of_their_times_and_bef
         (folder / "run.json").write_text(json.dumps({"scene": "toy", "started": started * 1e10}))
     run(store, toy.flow)
     assert [one.folder.name for one in latest_runs(store.runs)][1:] == ["3", "2", "1"]
+
+
+def test_the_records_of_earlier_runs_are_read_once_for_all_flows(store, monkeypatch):
+    requests = [Request(toy.flow, scene) for scene in ("one", "two", "three")]
+    run_flows(requests, store)
+    read, of_path = [], Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda path, **how: read.append(path.name) or of_path(path, **how))
+    run_flows(requests, store)
+    assert read.count("run.json") == 3
+    assert [one.place[0] for one in latest_runs(store.runs)] == [2, 2, 2, 1, 1, 1]
 
 
 def test_a_damaged_event_log_keeps_no_later_run_from_its_work(store):
