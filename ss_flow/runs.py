@@ -7,8 +7,6 @@ that a killed run is known up to its last step).
 from __future__ import annotations
 
 import contextlib
-import functools
-import itertools
 import json
 import time
 import uuid
@@ -23,8 +21,6 @@ if TYPE_CHECKING:
     import networkx as nx
 
 DONE = ("hit", "finished")
-RUNS_BACK = 5
-"""How many runs `why` looks back."""
 NAME_BYTES = 100
 """How much of a scene's name the name of a run's folder takes: file systems allow 255 bytes in all."""
 ENDS = (*DONE, "failed", "skipped", "would run")
@@ -155,22 +151,18 @@ class PreviousKeys:
     """The keys under which the latest of the runs so far of a scene found the results of each label, in their order.
 
     Several calls may share a label. A label that the latest run never reached counts with the run before, so that `why`
-    survives an interrupted run. Read when first asked: most runs find everything.
+    survives runs that stopped early. A run is read when its turn comes: most runs find everything.
     """
 
     def __init__(self, runs: Iterable[Run]) -> None:
         """runs: of the scene, the latest first."""
-        self._latest = list(itertools.islice(runs, RUNS_BACK))
+        self._unread = iter(runs)
+        self._keys: dict[str, list[str]] = {}
 
     def __call__(self, label: str) -> Sequence[str]:
-        return self._keys.get(label, ())
-
-    @functools.cached_property
-    def _keys(self) -> dict[str, list[str]]:
-        keys: dict[str, list[str]] = {}
-        for run in self._latest:
+        while label not in self._keys and (run := next(self._unread, None)) is not None:
             found: dict[str, list[str]] = {}
             for event in run.nodes():
                 found.setdefault(event["label"], []).append(event["key"])
-            keys = found | keys
-        return keys
+            self._keys = found | self._keys
+        return self._keys.get(label, ())

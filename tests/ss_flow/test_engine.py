@@ -323,6 +323,14 @@ def test_why_names_the_first_changed_part_and_runs_are_kept_in_order(store):
     assert next(latest.events())["event"] == "run started"
 
 
+def test_why_looks_back_past_any_number_of_runs_that_did_not_reach_the_step(store):
+    run(store, toy.flow)
+    for _ in range(8):
+        run(store, toy.flow, until="squares")
+    report = run(store, lambda: toy.flow(limit=5.0))
+    assert next(n["why"] for n in report.nodes if n["label"].endswith("clip[n2]")) == "parameter limit 100.0 -> 5.0"
+
+
 def why_total(report) -> str:
     return next(n["why"] for n in report.nodes if n["label"] == "ss_flow_toy.total")
 
