@@ -69,6 +69,13 @@ def test_results_that_are_found_again_after_damage_are_not_told_of_again():
     assert seen.lines() == ["done half 1 of 1", "again an object is damaged"]
 
 
+def test_that_another_process_computes_a_step_is_told_once():
+    seen = Seen()
+    for item in "01":
+        seen.log.event("waiting", label=f"half[{item}]", step="half", of=2, because="another process is computing it")
+    assert seen.lines() == ["waits half[0]: another process is computing it"]
+
+
 def test_a_step_of_many_short_nodes_says_how_far_it_is():
     seen = Seen(every=0.1)
     for item in "0123456789":
