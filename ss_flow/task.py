@@ -33,7 +33,7 @@ class Resources:
 
     cores: int = 1
     most_cores: int = 1
-    """Cores that it can make use of; it gets more than `cores` where nothing else waits for them."""
+    """Cores that it can make use of; it gets more than `cores` where fewer calls are ready than there are free ones."""
     memory_mb: int = 0
     gpus: float = 0
     """Share of a GPU that it takes where there is one; where there is none, it does without."""

@@ -21,12 +21,14 @@ from ss_flow.cache.store import Store
 from ss_flow.closure import Closure, closure_of
 from ss_flow.engine import Request, run_flow, run_flows
 from ss_flow.events import Reporter
+from ss_flow.execute import Invocation
 from ss_flow.explain import first_difference
 from ss_flow.graph import INDEX, Flow, each, expand, gather, labelled, otherwise, pick, stored
+from ss_flow.jobs import Job, Tokens
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.telemetry import trace
 
 
@@ -215,6 +217,20 @@ def test_a_task_that_aborts_fails_alone_and_says_how(store):
     report = run(store, lambda: {"end": toy.abort(toy.source(values=(1.0,))[0])})
     assert isinstance(report.values["end"], Failure)
     assert "SIGABRT" in str(report.values["end"].error)
+
+
+@pytest.mark.parametrize(
+    ("ready", "shares"), [(1, [8]), (2, [4, 4]), (3, [2, 3, 3]), (5, [1, 1, 2, 2, 2]), (8, [1] * 8)]
+)
+def test_jobs_that_are_ready_at_once_share_the_cores_fairly(ready, shares):
+    tokens = Tokens(Resources(cores=8, memory_mb=1000))
+    wanted = Resources(cores=1, most_cores=8, memory_mb=1)
+    given = []
+    for place in range(ready):
+        job = Job(Invocation(str(place), "", "", {}, {}, {}, wanted, False, ""), [], "", (0, 0))
+        tokens.take(job, waiting=ready - 1 - place)
+        given.append(job.invocation.resources.cores)
+    assert given == shares
 
 
 def test_the_last_task_that_waits_gets_the_cores_that_nobody_wants(store):
