@@ -493,4 +493,3 @@ def test_the_event_log_names_the_store_when_the_disk_is_full(store):
     log = Log(Path("/dev/full"), store.root)
     with pytest.raises(StoreFailure, match=f"store {store.root} cannot be written: No space left"):
         log.event("started", label="x")
-    log._stream.raw.close()  # what could not be written is not tried again
