@@ -316,8 +316,11 @@ class Store:
 
     def put_part(self, name: str, part: Any) -> None:
         """Keep what a digest in the components of actions stands for, once for all of them; plain data."""
-        if not self._part_path(name).exists():
-            self._write(self._part_path(name), json.dumps(part, separators=(",", ":")))
+        path, text = self._part_path(name), json.dumps(part, separators=(",", ":"))
+        with contextlib.suppress(OSError):
+            if path.stat().st_size == len(text):  # a power cut may have left it empty
+                return
+        self._write(path, text)
 
     def part(self, name: str) -> Any:
         """What a digest in the components of an action stands for; None when not known."""

@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import digest
-from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
+from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure, writing
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import GRACE_SECONDS, Action, Store
@@ -316,6 +316,13 @@ def test_an_object_that_cannot_be_read_now_stays_and_the_store_says_why_in_one_s
     assert Store(store.root).get(output).ids.trace() == 3
 
 
+def test_a_part_that_a_power_cut_left_empty_is_written_again(store):
+    store.put_part("0a", ["one", "two"])
+    (store.root / "parts" / "0a.json").write_bytes(b"")
+    store.put_part("0a", ["one", "two"])
+    assert store.part("0a") == ["one", "two"]
+
+
 def test_files_that_lie_about_in_a_store_are_no_hindrance(store):
     output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
     for folder in ("objects", "actions"):
@@ -398,6 +405,12 @@ def test_an_action_that_is_not_of_its_key_or_not_json_is_none(store):
         assert store.action(action.key) is None
     path.write_text(good)
     assert store.action(action.key) == action
+
+
+def test_a_store_that_can_open_no_file_to_write_says_what_is_wanted(store):
+    with pytest.raises(StoreFailure, match=r"Too many open files.* when more files may be open \(`ulimit -n`"):
+        with writing(store.root):
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
 def test_a_store_that_cannot_be_written_says_so_in_one_sentence(store, monkeypatch):
