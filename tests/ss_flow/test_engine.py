@@ -91,6 +91,11 @@ def test_each_hands_out_positions(store):
     assert [value(store, digest) for digest in report.values["clipped"]] == [0.0, 1.0]
 
 
+def test_positions_alone_have_no_length_and_are_refused_at_the_call(store):
+    with pytest.raises(TypeError, match="INDEX alone says no length"):
+        run(store, lambda: {"all": each(INDEX, build=lambda i: toy.number(i))})
+
+
 def test_an_item_that_is_lost_while_a_sequence_is_read_is_computed_again(store):
     first = run(store, lambda: {"xs": toy.source(values=(1.0, 2.0, 3.0))})
     path = store.object_path(first.values["xs"][1])
