@@ -130,7 +130,7 @@ def start_run(runs: Path, header: dict[str, Any]) -> Run:
     folder = runs / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}-{uuid.uuid4().hex[:6]}"
     folder.mkdir(parents=True)
     header = header | {"started": time.time()}
-    write_atomically(folder / "run.json", json.dumps(header, indent=1))
+    write_atomically(folder / "run.json", json.dumps(header, indent=1), synced=False)  # a sweep has thousands
     return Run(folder, header)
 
 

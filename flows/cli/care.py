@@ -116,7 +116,7 @@ class Wanted:
         unknown = {name for name in living if name.startswith(RUN_CLAIM)}
         for run in latest_runs(self._store.runs):
             claim = RUN_CLAIM + run.folder.name
-            whole = self._keep is None or run.is_whole()  # others do not count beside it, or failures would drive out the last results
+            whole = self._keep is None or run.is_whole()  # failures must not drive out the last results
             later[run.scene, whole] += 1
             rank = later[run.scene, whole]
             if "sweep" in run.header:  # of a scene, a sweep counts as one

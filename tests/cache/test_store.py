@@ -192,6 +192,14 @@ def test_a_file_may_have_the_longest_name_that_file_systems_take(tmp_path, name)
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "content"}
 
 
+@pytest.mark.parametrize("synced", [True, False])
+def test_a_file_is_synced_where_nothing_makes_it_again(tmp_path, monkeypatch, synced):
+    calls = []
+    monkeypatch.setattr(os, "fsync", calls.append)
+    write_atomically(tmp_path / "a", "content", synced=synced)
+    assert (tmp_path / "a").read_text() == "content" and len(calls) == synced
+
+
 def test_what_killed_writers_left_beside_a_file_is_taken_away_by_age_and_nothing_else_is(tmp_path):
     left, young = (tmp_path / f".a[1].ply.{digit * 32}" for digit in "0f")
     others = [tmp_path / name for name in (".a[1].ply.0123", f".a1.ply.{'0' * 32}", f".b.a[1].ply.{'0' * 32}")]
@@ -408,9 +416,9 @@ def test_an_action_that_is_not_of_its_key_or_not_json_is_none(store):
 
 
 def test_a_store_that_can_open_no_file_to_write_says_what_is_wanted(store):
-    with pytest.raises(StoreFailure, match=r"Too many open files.* when more files may be open \(`ulimit -n`"):
-        with writing(store.root):
-            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+    said = r"Too many open files.* when more files may be open \(`ulimit -n`"
+    with pytest.raises(StoreFailure, match=said), writing(store.root):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
 def test_a_store_that_cannot_be_written_says_so_in_one_sentence(store, monkeypatch):
