@@ -57,7 +57,7 @@ class Reporters(Reporter):
             reporter.close()
 
 
-class Log(Reporter):
+class Record(Reporter):
     """Keeps what nodes came to, and appends every event to a file, one JSON document a line, complete or absent.
 
     Hits come in great numbers: they are written together, with whatever comes next or before a pause.

@@ -27,7 +27,7 @@ from ss_flow.explain import changed_items, part_of, since_last
 from ss_flow.graph import Call, Flow, Node, Stored
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.kept_closures import kept_closure
-from ss_flow.keys import Components, Keys, Value
+from ss_flow.keys import Components, Keys, Value, digests_of
 from ss_flow.resolution import Failure, NotRun, Resolution
 from ss_flow.task import Resources
 
@@ -140,7 +140,7 @@ class Scheduler:
 
     def _take(self, node: Stored) -> None:
         """No action of this run leads to these objects, so the record of the run says that they are needed."""
-        digests = [node.value] if isinstance(node.value, str) else list(node.value)
+        digests = digests_of(node.value)
         self._store.use(digests)
         self._reporter(node).event("taken", label=node.label, outputs=digests)
 

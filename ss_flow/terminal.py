@@ -234,7 +234,7 @@ def _clock(seconds: float) -> str:
     return str(timedelta(seconds=round(seconds)))
 
 
-class Log(_Steps):
+class Lines(_Steps):
     """Plain lines, for a file or a pipe: one a step, and now and then one for what runs for long, steps of many nodes
     and single nodes.
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from ss_flow.engine import run_flow
 from ss_flow.graph import each
-from ss_flow.terminal import Log, Terminal
+from ss_flow.terminal import Lines, Terminal
 
 
 class Seen:
@@ -20,7 +20,7 @@ class Seen:
 
     def __init__(self, **options: float) -> None:
         self._stream = io.StringIO()
-        self.log = Log(Console(file=self._stream, width=200), **options)
+        self.log = Lines(Console(file=self._stream, width=200), **options)
 
     def lines(self) -> list[str]:
         """What it said, without times, with single spaces."""
