@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -37,10 +38,13 @@ def writing(root: Path) -> Iterator[None]:
     except StoreFailure:
         raise
     except OSError as error:
-        reason = (error.strerror or str(error)) if (root / "tmp").is_dir() else "it has vanished"
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            reason, want = error.strerror, "more files may be open (`ulimit -n` tells how many may)"
+        else:
+            reason = (error.strerror or str(error)) if (root / "tmp").is_dir() else "it has vanished"
+            want = "there is room (`ss-flow cache gc` makes some) and permission"
         raise StoreFailure(
-            f"the store {root} cannot be written: {reason}. What was finished is kept: when there is room "
-            "(`ss-flow cache gc` makes some) and permission, run again to go on."
+            f"the store {root} cannot be written: {reason}. What was finished is kept: when {want}, run again to go on."
         ) from error
 
 

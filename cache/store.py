@@ -14,8 +14,9 @@ Notes
 *Crash.* An object or an action appears by one rename of something complete; what a killed process leaves is in tmp/,
 and is never read. The action comes after all of its objects.
 
-*Power cut, failing disk, foreign hands.* Nothing is synced; everything is checked when it is read: an object whose
-content is not what its name says is taken out, and its maker runs again.
+*Power cut, failing disk, foreign hands.* What can be made again is not synced (pins and checkpoints are), but checked
+when it is read: an object whose content is not what its name says is taken out, and its maker runs again; a part that
+is not what its name says counts as unknown until the next call that depends on it is computed.
 
 *Another version.* An object whose type has got or lost fields since, or is not to be found here, is whole: it stays,
 and OtherVersion is raised. No key of this version leads to it, since the definitions of types are code that keys depend
@@ -56,8 +57,8 @@ from ss_flow.cache.plain_json import reader
 from ss_flow.cache.recent import Recent
 
 MEMORY_BYTES = min(1 << 30, psutil.virtual_memory().total // 16)
-"""How much of what was read lately a process keeps in memory: photos and depth maps of hundreds of views, at which each
-instance looks again, but no more than a small machine can spare."""
+"""About how much of what was read lately a process keeps in memory: photos and depth maps of hundreds of views, at
+which each instance looks again, but no more than a small machine can spare."""
 GRACE_SECONDS = 3600.0
 """What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
 
@@ -316,8 +317,11 @@ class Store:
 
     def put_part(self, name: str, part: Any) -> None:
         """Keep what a digest in the components of actions stands for, once for all of them; plain data."""
-        if not self._part_path(name).exists():
-            self._write(self._part_path(name), json.dumps(part, separators=(",", ":")))
+        path, text = self._part_path(name), json.dumps(part, separators=(",", ":"))
+        with contextlib.suppress(OSError):
+            if path.stat().st_size == len(text):  # a power cut may have left it empty
+                return
+        self._write(path, text)
 
     def part(self, name: str) -> Any:
         """What a digest in the components of an action stands for; None when not known."""

@@ -16,12 +16,12 @@ from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure, writing
 from ss_flow.cache.store import Store
 from ss_flow.control_groups import within_limit, within_quota
 from ss_flow.errors import InputError
-from ss_flow.events import Log, Reporter, Reporters
+from ss_flow.events import Record, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
 from ss_flow.graph import Flow, Node
-from ss_flow.keys import Value
+from ss_flow.keys import Value, digests_of
 from ss_flow.resolution import Failure
-from ss_flow.runs import PreviousKeys, next_number, settled, start_run
+from ss_flow.runs import PreviousKeys, Run, latest_runs, settled, start_run
 from ss_flow.scheduler import Listening, Scheduler
 from ss_flow.task import Resources
 
@@ -118,9 +118,10 @@ def run_flows(
     will use, None = one where the driver shows any.
     recorded: whether the run is kept among the store's runs; a question about a result need not be.
 
-    Raises InputError for a negative number, KeyError when `until` names no output, StoreFailure when the store cannot
-    be used, ExecutorLost when whoever ran the calls is gone, and KeyboardInterrupt when interrupted: what runs is then
-    told to stop at its next sign of progress, and waited for; a second interrupt does not wait.
+    Raises InputError for a negative number, or an executor that is unknown, not installed or does not answer, TypeError
+    when a flow returns anything but its own nodes by name, KeyError when `until` names no output, StoreFailure when the
+    store cannot be used, ExecutorLost when whoever ran the calls is gone, and KeyboardInterrupt when interrupted: what
+    runs is then told to stop at its next sign of progress, and waited for; a second interrupt does not wait.
     """
     for name, number in (("jobs", jobs), ("memory_mb", memory_mb), ("gpus", gpus or 0)):
         if number < 0:
@@ -128,10 +129,11 @@ def run_flows(
     with contextlib.ExitStack() as stack:
         claims = store.open_claims()
         stack.callback(claims.release_all)
-        run = _Run(requests, store, claims, recorded=recorded and not dry)
+        run = _Run(requests, store, claims)
         stack.callback(run.close)
         workers = open_executor(executor, jobs or usable_cores(), store, run.progressed)
         try:
+            run.begin(recorded=recorded and not dry)  # only now: a run that nobody can compute leaves no record
             room = workers.capacity or _this_machine(gpus)
             capacity = replace(room, cores=jobs or room.cores, memory_mb=memory_mb or room.memory_mb)
             if not dry:
@@ -167,10 +169,6 @@ def _checked(outputs: Any, flow: Flow) -> dict[str, Node]:
     return dict(outputs)
 
 
-def _digests(value: Value) -> list[str]:
-    return [value] if isinstance(value, str) else list(value)
-
-
 def _stop(workers: Executor, run: _Run, *, patiently: bool) -> None:
     """Let what runs finish or keep what it has; at the next interrupt do not wait."""
     workers.cancel()
@@ -186,90 +184,104 @@ def _stop(workers: Executor, run: _Run, *, patiently: bool) -> None:
             workers.kill()
 
 
+class _Part:
+    """One request of a run: its flow, who hears of it, and what it came to."""
+
+    def __init__(self, request: Request, store: Store) -> None:
+        self.request = request
+        self.record = Record(None, store.root)
+        self.reporter = Reporter()
+        self.previous = PreviousKeys(())
+        self.is_open = False
+        """Whether it has begun, and not ended."""
+        self.report: Report | None = None
+        self.build()
+
+    def build(self) -> None:
+        """Make its flow, and the outputs by name that are asked for."""
+        self.flow = Flow(self.request.scene)
+        with self.flow.building():
+            outputs = _checked(self.request.build(), self.flow)
+        until = self.request.until
+        self.targets = {until: outputs[until]} if until else outputs
+
+    def begin(self, record: Record, previous: PreviousKeys) -> None:
+        self.record, self.previous = record, previous
+        self.reporter = Reporters(record, self.request.reporter) if self.request.reporter else record
+        self.is_open = True
+        self.reporter.event("run started", scene=self.request.scene)
+
+
 class _Run:
     """Several requests on their way; attempted again when results of earlier runs turn out to be damaged."""
 
-    def __init__(
-        self,
-        requests: Sequence[Request],
-        store: Store,
-        claims: Claims,
-        *,
-        recorded: bool,
-    ) -> None:
-        self._requests, self._store, self._claims = requests, store, claims
-        self._logs: list[Log] = []
+    def __init__(self, requests: Sequence[Request], store: Store, claims: Claims) -> None:
+        self._store, self._claims = store, claims
+        self._parts = [_Part(request, store) for request in requests]
         self._healed: set[str] = set()
-        self._open = set(range(len(requests)))
-        self._flows, self._targets = self._built()
         self.scheduler: Scheduler | None = None
-        self._reported: dict[int, Report] = {}
-        self._reporters: list[Reporter] = []
-        runs = store.runs
-        previous = {scene: PreviousKeys(runs, scene) for scene in {request.scene for request in requests}}
-        self._previous = [previous[request.scene] for request in requests]
-        number = next_number(runs) if recorded else 0
-        for request in requests:
-            events = None
-            if recorded:
-                with writing(store.root):
-                    folder = start_run(runs, {"scene": request.scene, "number": number, **request.header}).folder
-                claims.take(RUN_CLAIM + folder.name)
-                events = folder / "events.jsonl"
-            self._logs.append(Log(events, store.root))
-            self._reporters.append(Reporters(self._logs[-1], request.reporter) if request.reporter else self._logs[-1])
-            self._reporters[-1].event("run started", scene=request.scene)
 
     @property
     def reports(self) -> list[Report]:
-        return [self._reported[position] for position in range(len(self._requests))]
+        return [part.report for part in self._parts if part.report is not None]
 
-    def _built(self) -> tuple[list[Flow], list[dict[str, Node]]]:
-        """A flow for each request, and its outputs by name."""
-        flows = [Flow(request.scene) for request in self._requests]
-        targets: list[dict[str, Node]] = []
-        for flow, request in zip(flows, self._requests, strict=True):
-            with flow.building():
-                outputs = _checked(request.build(), flow)
-            targets.append({request.until: outputs[request.until]} if request.until else outputs)
-        return flows, targets
+    def begin(self, *, recorded: bool) -> None:
+        """Tell everyone that the run starts; recorded: and keep that among the store's runs."""
+        runs = list(latest_runs(self._store.runs))
+        number = runs[0].place[0] + 1 if runs else 1
+        of_scene: dict[str, list[Run]] = {part.request.scene: [] for part in self._parts}
+        for run in runs:
+            of_scene.get(run.scene, []).append(run)
+        previous = {scene: PreviousKeys(earlier) for scene, earlier in of_scene.items()}
+        for part in self._parts:
+            record = self._started(part.request, number) if recorded else part.record
+            part.begin(record, previous[part.request.scene])
+
+    def _started(self, request: Request, number: int) -> Record:
+        """The record of a run that starts now; the claim says that it lives."""
+        asked = {"scene": request.scene, "number": number, "until": request.until, **request.header}
+        with writing(self._store.root):
+            folder = start_run(self._store.runs, asked).folder
+        self._claims.take(RUN_CLAIM + folder.name)
+        return Record(folder / "events.jsonl", self._store.root)
 
     def attempt(self, workers: Executor, capacity: Resources, *, memory_is_strict: bool, dry: bool) -> bool:
         """Run to the end; False when something must be made again first."""
         if self.scheduler is not None:
-            self._flows, self._targets = self._built()
-        flows, targets = self._flows, self._targets
-        listening = {f: Listening(r, p) for f, r, p in zip(flows, self._reporters, self._previous, strict=True)}
+            for part in self._parts:
+                part.build()
+        parts = {part.flow: part for part in self._parts}
+        listening = {flow: Listening(part.reporter, part.previous) for flow, part in parts.items()}
         scheduler = Scheduler(
             self._store, self._claims, workers, capacity, listening, memory_is_strict=memory_is_strict, dry=dry
         )
         self.scheduler = scheduler
-        self._open = set(range(len(flows)))
         damaged: list[Gone] = []
 
         def ended(flow: Flow) -> None:
-            position = flows.index(flow)
-            values = {name: scheduler.value(node) for name, node in targets[position].items()}
+            part = parts[flow]
+            values = {name: scheduler.value(node) for name, node in part.targets.items()}
             failures = scheduler.failures[flow]
-            results = {name: _digests(value) for name, value in values.items() if not isinstance(value, Failure)}
-            self._reporters[position].event("run ended", failed=len(failures), results=results)
-            report = Report(values, settled(self._logs[position].ended), failures)
-            self._open.discard(position)
-            if position not in self._reported:
+            results = {name: digests_of(value) for name, value in values.items() if not isinstance(value, Failure)}
+            part.reporter.event("run ended", failed=len(failures), results=results)
+            report = Report(values, settled(part.record.ended), failures)
+            part.is_open = False
+            if part.report is None:
                 try:
-                    self._requests[position].done(report)
+                    part.request.done(report)
                 except Gone as gone:  # the other flows go on
                     damaged.append(gone)
                     return
-            self._reported[position] = report
+            part.report = report
 
         try:
-            scheduler.run({f: list(t.values()) for f, t in zip(flows, targets, strict=True)}, ended)
+            scheduler.run({flow: list(part.targets.values()) for flow, part in parts.items()}, ended)
         except Gone as gone:
             scheduler.drain()
             damaged.append(gone)
         for one in {one.digest: one for one in damaged}.values():
-            self._open = set(range(len(flows)))
+            for part in self._parts:
+                part.is_open = True
             self._heal(one)
             self.tell("restarted", because=str(one))
         return not damaged
@@ -277,7 +289,7 @@ class _Run:
     def _heal(self, gone: Gone) -> None:
         """Have something made again. Raises StoreFailure when it was made again before, or nothing here makes it."""
         # Counted by what made it: results that differ from time to time would otherwise never be the same one.
-        made = (event for log in self._logs for event in log.ended if "outputs" in event)
+        made = (event for part in self._parts for event in part.record.ended if "outputs" in event)
         maker = next((e for e in made if gone.digest in e["outputs"]), None)
         name = f"{maker['key']}.{maker['outputs'].index(gone.digest)}" if maker else gone.digest
         if name in self._healed:
@@ -297,14 +309,15 @@ class _Run:
         if self.scheduler is not None:
             self.tell("stopping", running=self.scheduler.running())
             self.scheduler.drain()
-        for position in self._open:
-            self._reporters[position].event("run ended", interrupted=True)
+        for part in self._parts:
+            if part.is_open:
+                part.reporter.event("run ended", interrupted=True)
 
     def tell(self, kind: str, **details: Any) -> None:
-        for reporter in self._reporters:
-            reporter.event(kind, **details)
+        for part in self._parts:
+            part.reporter.event(kind, **details)
 
     def close(self) -> None:
-        for reporter in self._reporters:
+        for part in self._parts:
             with contextlib.suppress(OSError):
-                reporter.close()
+                part.reporter.close()

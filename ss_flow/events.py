@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from ss_flow.cache.errors import writing
 from ss_flow.cache.plain_json import as_json
@@ -28,7 +28,7 @@ class Reporter:
         """A running node is so far; called from any thread."""
 
     def pause(self) -> None:
-        """Nothing happens until some step ends."""
+        """Something was told since the last time, and nothing more happens for a while."""
 
     def close(self) -> None:
         """The run is over."""
@@ -57,7 +57,7 @@ class Reporters(Reporter):
             reporter.close()
 
 
-class Log(Reporter):
+class Record(Reporter):
     """Keeps what nodes came to, and appends every event to a file, one JSON document a line, complete or absent.
 
     Hits come in great numbers: they are written together, with whatever comes next or before a pause.
@@ -67,28 +67,24 @@ class Log(Reporter):
     def __init__(self, path: Path | None, store: Path) -> None:
         self.ended: list[dict[str, Any]] = []
         """The events that say what a node came to, with their times."""
-        self._store = store
+        self._path, self._store = path, store
         self._held_back: list[dict[str, Any]] = []
-        self._stream: IO[bytes] | None = path.open("ab", buffering=1 << 16) if path else None
 
     def event(self, kind: str, **details: Any) -> None:
         told = {"time": round(time.time(), 3), "event": kind, **details}
         if kind in ENDS:
             self.ended.append(told)
-        if self._stream is not None:
+        if self._path is not None:
             self._held_back.append(told)
             if kind != "hit":
                 self.pause()
 
     def pause(self) -> None:
-        if self._stream is not None and self._held_back:
-            with writing(self._store):
-                self._stream.write(b"\n".join([*map(as_json, self._held_back), b""]))
-                self._stream.flush()
+        if self._path is not None and self._held_back:
+            # Opened each time: a sweep has thousands of flows, and a process may hold a few hundred files open.
+            with writing(self._store), self._path.open("ab") as stream:
+                stream.write(b"\n".join([*map(as_json, self._held_back), b""]))
             self._held_back.clear()
 
     def close(self) -> None:
-        if self._stream is not None:
-            self.pause()
-            with writing(self._store):
-                self._stream.close()
+        self.pause()

@@ -279,12 +279,14 @@ def each(
 ) -> Any:
     """Apply `build` to every item of one list, or of several lists of equal length side by side.
 
-    lists: nodes that stand for lists, or INDEX. build: takes one node of every list, and the position of the item for
-    INDEX; returns a node. names: what to call the items (say, the frames' names). on_error: with "skip", an item that
-    fails is left out, and the run is degraded. Returns a node that stands for the list of the results.
+    lists: nodes that stand for lists, one at least, or INDEX. build: takes one node of every list, and the position of
+    the item for INDEX; returns a node. names: what to call the items (say, the frames' names). on_error: with "skip",
+    an item that fails is left out, and the run is degraded. Returns a node that stands for the list of the results.
     """
     flow = _building()
     sources = [source for source in lists if source is not INDEX]
+    if not sources:
+        raise TypeError("each needs a list to go through; INDEX alone says no length")
 
     def build_list(*lengths: int) -> Node:
         if len(set(lengths)) != 1:

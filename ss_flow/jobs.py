@@ -50,12 +50,14 @@ class Tokens:
         )
 
     def take(self, job: Job, *, waiting: int) -> None:
-        """Start a job; where no other job waits, it gets the spare cores too, up to its `most_cores`."""
+        """Start a job. Of the cores that are free it gets a fair share, up to its `most_cores`.
+
+        waiting: how many other jobs are ready, with which it shares.
+        """
         wanted = job.invocation.resources
-        if wanted.most_cores > wanted.cores and waiting == 0:
-            spare = int(self._capacity.cores - self._held["cores"])
-            granted = max(wanted.cores, min(wanted.most_cores, spare))
-            job.invocation = replace(job.invocation, resources=replace(wanted, cores=granted))
+        share = int(self._capacity.cores - self._held["cores"]) // (waiting + 1)
+        cores = max(wanted.cores, min(wanted.most_cores, share))
+        job.invocation = replace(job.invocation, resources=replace(wanted, cores=cores))
         self._running[job.key] = job
         for kind in KINDS:
             self._held[kind] += self._counted(job.invocation.resources, kind)

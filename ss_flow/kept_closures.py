@@ -42,7 +42,7 @@ def kept_closure(function: Callable[..., Any], folder: Path) -> Closure:
     content = {**_SIGNS, **vars(found), "modules": sorted(found.modules)}
     text = json.dumps(content, separators=(",", ":"))
     with contextlib.suppress(OSError):
-        write_atomically(file, f"{_digest(text)}\n{text}")
+        write_atomically(file, f"{_digest(text)}\n{text}", synced=False)
     return found
 
 

@@ -7,8 +7,6 @@ that a killed run is known up to its last step).
 from __future__ import annotations
 
 import contextlib
-import functools
-import itertools
 import json
 import time
 import uuid
@@ -23,8 +21,6 @@ if TYPE_CHECKING:
     import networkx as nx
 
 DONE = ("hit", "finished")
-RUNS_BACK = 5
-"""How many runs `why` looks back."""
 NAME_BYTES = 100
 """How much of a scene's name the name of a run's folder takes: file systems allow 255 bytes in all."""
 ENDS = (*DONE, "failed", "skipped", "would run")
@@ -46,7 +42,7 @@ class Run:
 
     folder: Path
     header: dict[str, Any]
-    """What was asked: at least "scene" and "started"."""
+    """What was asked: at least "scene" and "started"; "until", the output at which to stop, or None."""
 
     @property
     def scene(self) -> str:
@@ -73,6 +69,10 @@ class Run:
         """The digests of the flow's outputs by name; none for a run that has not ended."""
         ended = [event for event in self.events() if event["event"] == "run ended"]
         return dict(ended[-1].get("results", {})) if ended else {}
+
+    def is_whole(self) -> bool:
+        """Whether it came to results, and was asked for all of them."""
+        return self.header.get("until") is None and bool(self.results())
 
     def nodes(self) -> list[dict[str, Any]]:
         """The events of the nodes that have a result."""
@@ -124,20 +124,14 @@ def settled(events: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def start_run(runs: Path, header: dict[str, Any]) -> Run:
-    """Open a run: its folder, with what was asked. header: with its "number" (`next_number`)."""
+    """Open a run: its folder, with what was asked. header: with its "number", one more than the latest run's."""
     name = "".join(c if c.isalnum() else "-" for c in Path(header["scene"]).name)
     name = name.encode()[:NAME_BYTES].decode(errors="ignore")  # never in the middle of a character
     folder = runs / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}-{uuid.uuid4().hex[:6]}"
     folder.mkdir(parents=True)
     header = header | {"started": time.time()}
-    write_atomically(folder / "run.json", json.dumps(header, indent=1))
+    write_atomically(folder / "run.json", json.dumps(header, indent=1), synced=False)  # a sweep has thousands
     return Run(folder, header)
-
-
-def next_number(runs: Path) -> int:
-    """The number of a run that starts now: one more than the highest."""
-    latest = next(latest_runs(runs), None)
-    return latest.place[0] + 1 if latest else 1
 
 
 def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
@@ -157,23 +151,18 @@ class PreviousKeys:
     """The keys under which the latest of the runs so far of a scene found the results of each label, in their order.
 
     Several calls may share a label. A label that the latest run never reached counts with the run before, so that `why`
-    survives an interrupted run. Read when first asked: most runs find everything.
+    survives runs that stopped early. A run is read when its turn comes: most runs find everything.
     """
 
-    def __init__(self, runs: Path, scene: str, before: Run | None = None) -> None:
-        """before: only runs that started earlier."""
-        earlier = (run for run in latest_runs(runs, scene) if before is None or run.place < before.place)
-        self._latest = list(itertools.islice(earlier, RUNS_BACK))
+    def __init__(self, runs: Iterable[Run]) -> None:
+        """runs: of the scene, the latest first."""
+        self._unread = iter(runs)
+        self._keys: dict[str, list[str]] = {}
 
     def __call__(self, label: str) -> Sequence[str]:
-        return self._keys.get(label, ())
-
-    @functools.cached_property
-    def _keys(self) -> dict[str, list[str]]:
-        keys: dict[str, list[str]] = {}
-        for run in self._latest:
+        while label not in self._keys and (run := next(self._unread, None)) is not None:
             found: dict[str, list[str]] = {}
             for event in run.nodes():
                 found.setdefault(event["label"], []).append(event["key"])
-            keys = found | keys
-        return keys
+            self._keys = found | self._keys
+        return self._keys.get(label, ())

@@ -27,7 +27,7 @@ from ss_flow.explain import changed_items, part_of, since_last
 from ss_flow.graph import Call, Flow, Node, Stored
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.kept_closures import kept_closure
-from ss_flow.keys import Components, Keys, Value
+from ss_flow.keys import Components, Keys, Value, digests_of
 from ss_flow.resolution import Failure, NotRun, Resolution
 from ss_flow.task import Resources
 
@@ -78,6 +78,8 @@ class Scheduler:
         self._queue = Queue()
         self._claimed_elsewhere: dict[str, Job] = {}
         self._running: dict[Future[Action], Job] = {}
+        self._told: set[Reporter] = set()
+        """Who was told something since the last pause."""
         self.failures: dict[Flow, list[Failure]] = {flow: [] for flow in flows}
         """Nodes that failed of themselves, in order."""
 
@@ -138,9 +140,9 @@ class Scheduler:
 
     def _take(self, node: Stored) -> None:
         """No action of this run leads to these objects, so the record of the run says that they are needed."""
-        digests = [node.value] if isinstance(node.value, str) else list(node.value)
+        digests = digests_of(node.value)
         self._store.use(digests)
-        self._flows[node.flow].reporter.event("taken", label=node.label, outputs=digests)
+        self._reporter(node).event("taken", label=node.label, outputs=digests)
 
     def _call(self, node: Call) -> None:
         """A call whose inputs are known is a hit, or a job."""
@@ -219,8 +221,9 @@ class Scheduler:
 
     def _collect(self) -> None:
         """Wait for something to happen, and settle it."""
-        for listening in self._flows.values():
-            listening.reporter.pause()
+        for reporter in self._told:
+            reporter.pause()
+        self._told.clear()
         timeout = POLL_SECONDS if self._claimed_elsewhere else None
         if self._running:
             done, _ = wait(self._running, timeout=timeout, return_when=FIRST_COMPLETED)
@@ -269,7 +272,7 @@ class Scheduler:
         }
         if kind == "finished":
             details["why"] = why
-        self._flows[node.flow].reporter.event(kind, **details)
+        self._reporter(node).event(kind, **details)
         self._graph.settle(node, action.outputs if action.is_list else action.outputs[0])
 
     def _fail_node(self, node: Node, failure: Failure) -> None:
@@ -289,7 +292,13 @@ class Scheduler:
             self._graph.settle(node, failure)
 
     def _tell(self, kind: str, node: Node, **details: Any) -> None:
-        self._flows[node.flow].reporter.event(kind, **self._about(node), **details)
+        self._reporter(node).event(kind, **self._about(node), **details)
+
+    def _reporter(self, node: Node) -> Reporter:
+        """Who is to be told of a node, and of the next pause."""
+        reporter = self._flows[node.flow].reporter
+        self._told.add(reporter)
+        return reporter
 
     def _about(self, node: Node) -> dict[str, Any]:
         known = self._graph.known_calls[node.flow]

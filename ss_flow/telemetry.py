@@ -20,7 +20,7 @@ def trace(run: Run) -> dict[str, Any]:
     last event.
     """
     events = list(run.events())
-    begun = {event["label"]: event["time"] for event in events if event["event"] == "started"}
+    begun = {event.get("key"): event["time"] for event in events if event["event"] == "started"}
     nodes = settled(events)
     computed = [node for node in nodes if node["event"] in ("finished", "failed")]
     failed = sum(node["event"] == "failed" for node in computed)
@@ -54,7 +54,7 @@ def trace(run: Run) -> dict[str, Any]:
     }
 
 
-def _span(node: Mapping[str, Any], trace_id: str, parent: str, begun: Mapping[str, float]) -> dict[str, Any]:
+def _span(node: Mapping[str, Any], trace_id: str, parent: str, begun: Mapping[str | None, float]) -> dict[str, Any]:
     failed = node["event"] == "failed"
     known = {
         "ss_flow.step": node["step"],
@@ -70,7 +70,7 @@ def _span(node: Mapping[str, Any], trace_id: str, parent: str, begun: Mapping[st
         "parentSpanId": parent,
         "name": node["label"],
         "kind": INTERNAL,
-        "startTimeUnixNano": _nanoseconds(begun.get(node["label"], node["time"])),
+        "startTimeUnixNano": _nanoseconds(begun.get(node["key"], node["time"])),
         "endTimeUnixNano": _nanoseconds(node["time"]),
         "attributes": _attributes({name: value for name, value in known.items() if value is not None}),
         "status": {"code": ERROR, "message": node["error"]} if failed else {"code": OK},

@@ -28,11 +28,13 @@ _ENDED = ("hit", "finished", "failed", "skipped")
 
 
 class Messages(Reporter):
-    """Says what has to be known at once: warnings, failures, second tries, and that the run stops."""
+    """Says what has to be known at once: warnings, failures, second tries, that the run stops, and that it waits for
+    another process, once a step."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._warned: set[str] = set()
+        self._waited: set[str] = set()
 
     def event(self, kind: str, **details: Any) -> None:
         label = details.get("label", "")
@@ -44,6 +46,10 @@ class Messages(Reporter):
             self.say("red", "failed", f"{label}: {details['error']}")
         elif kind in ("retried", "restarted"):
             self.say("yellow", "again", f"{f'{label}: ' if label else ''}{details['because']}")
+        elif kind == "waiting":
+            if details["step"] not in self._waited:
+                self.say("cyan", "waits", f"{label}: {details['because']}")
+            self._waited.add(details["step"])
         elif kind == "stopping" and details["running"]:
             words = f"waiting for what runs ({len(details['running'])}) to finish, or to keep what it has"
             self.say("yellow", "stopping", f"{words}; Ctrl-C again stops at once")
@@ -228,7 +234,7 @@ def _clock(seconds: float) -> str:
     return str(timedelta(seconds=round(seconds)))
 
 
-class Log(_Steps):
+class Lines(_Steps):
     """Plain lines, for a file or a pipe: one a step, and now and then one for what runs for long, steps of many nodes
     and single nodes.
 

@@ -43,7 +43,7 @@ class CacheCollect:
 
     keep_runs: OptionalCount = None
     """Keep only the latest so many runs, and sweeps, of each scene, and delete the records of older ones; all, when
-    left out."""
+    left out. Runs that came to no result, or stopped early (--until), count by themselves."""
     max_size: OptionalText = None
     """Delete results until they take no more room than this (500MB, 20GB, 1.5TiB), least recently used first; what is
     pinned or belongs to a living run stays."""
@@ -111,15 +111,16 @@ class Wanted:
         for pinned in read_pins(self._store):
             roots.held.update(pinned.keys)
             roots.objects.update(pinned.objects)
-        later: Counter[str] = Counter()
-        sweeps: dict[str, set[str]] = defaultdict(set)
+        later: Counter[tuple[str, bool]] = Counter()
+        sweeps: dict[tuple[str, bool], set[str]] = defaultdict(set)
         unknown = {name for name in living if name.startswith(RUN_CLAIM)}
         for run in latest_runs(self._store.runs):
             claim = RUN_CLAIM + run.folder.name
-            later[run.scene] += 1
-            rank = later[run.scene]
+            whole = self._keep is None or run.is_whole()  # failures must not drive out the last results
+            later[run.scene, whole] += 1
+            rank = later[run.scene, whole]
             if "sweep" in run.header:  # of a scene, a sweep counts as one
-                others = sweeps[scene_of(run.header)]
+                others = sweeps[scene_of(run.header), whole]
                 others.add(run.header.get("asked", ""))
                 rank = max(rank, len(others))
             if claim in living:

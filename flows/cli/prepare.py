@@ -265,7 +265,7 @@ class Prefixed(Reporter):
 @contextlib.contextmanager
 def display(out: Console) -> Iterator[Reporter]:
     """A live display on a terminal, gone at the end; plain lines elsewhere."""
-    from ss_flow.terminal import Log, Terminal
+    from ss_flow.terminal import Lines, Terminal
 
-    with contextlib.closing(Terminal(out) if out.is_terminal else Log(out)) as screen:
+    with contextlib.closing(Terminal(out) if out.is_terminal else Lines(out)) as screen:
         yield screen

@@ -14,7 +14,7 @@ from ss_flow.errors import InputError
 from ss_flow.explain import part_of, since_last
 from ss_flow.flows.cli.context import PositionalPath, StoreOptions, console
 from ss_flow.flows.cli.inspect import named, runs_to_ask
-from ss_flow.runs import DONE, PreviousKeys, Run
+from ss_flow.runs import DONE, PreviousKeys, Run, latest_runs
 from ss_flow.sweep import scene_of
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -73,7 +73,8 @@ class Reasons:
 
     def __init__(self, store: Store, run: Run) -> None:
         self._store = store
-        self._known = PreviousKeys(store.runs, scene_of(run.header), before=run)
+        of_scene = latest_runs(store.runs, scene_of(run.header))
+        self._known = PreviousKeys(one for one in of_scene if one.place < run.place)
 
     def __call__(self, node: dict[str, Any]) -> str:
         if "why" in node or node["event"] not in DONE:

@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 from ss_flow.cache import codec
 from ss_flow.cache.canonical import digest
-from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure
+from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure, writing
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import GRACE_SECONDS, Action, Store
@@ -192,6 +192,14 @@ def test_a_file_may_have_the_longest_name_that_file_systems_take(tmp_path, name)
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "content"}
 
 
+@pytest.mark.parametrize("synced", [True, False])
+def test_a_file_is_synced_where_nothing_makes_it_again(tmp_path, monkeypatch, synced):
+    calls = []
+    monkeypatch.setattr(os, "fsync", calls.append)
+    write_atomically(tmp_path / "a", "content", synced=synced)
+    assert (tmp_path / "a").read_text() == "content" and len(calls) == synced
+
+
 def test_what_killed_writers_left_beside_a_file_is_taken_away_by_age_and_nothing_else_is(tmp_path):
     left, young = (tmp_path / f".a[1].ply.{digit * 32}" for digit in "0f")
     others = [tmp_path / name for name in (".a[1].ply.0123", f".a1.ply.{'0' * 32}", f".b.a[1].ply.{'0' * 32}")]
@@ -316,6 +324,13 @@ def test_an_object_that_cannot_be_read_now_stays_and_the_store_says_why_in_one_s
     assert Store(store.root).get(output).ids.trace() == 3
 
 
+def test_a_part_that_a_power_cut_left_empty_is_written_again(store):
+    store.put_part("0a", ["one", "two"])
+    (store.root / "parts" / "0a.json").write_bytes(b"")
+    store.put_part("0a", ["one", "two"])
+    assert store.part("0a") == ["one", "two"]
+
+
 def test_files_that_lie_about_in_a_store_are_no_hindrance(store):
     output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
     for folder in ("objects", "actions"):
@@ -398,6 +413,12 @@ def test_an_action_that_is_not_of_its_key_or_not_json_is_none(store):
         assert store.action(action.key) is None
     path.write_text(good)
     assert store.action(action.key) == action
+
+
+def test_a_store_that_can_open_no_file_to_write_says_what_is_wanted(store):
+    said = r"Too many open files.* when more files may be open \(`ulimit -n`"
+    with pytest.raises(StoreFailure, match=said), writing(store.root):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
 def test_a_store_that_cannot_be_written_says_so_in_one_sentence(store, monkeypatch):

@@ -91,6 +91,18 @@ def test_of_the_sweeps_of_a_scene_the_latest_are_kept_as_of_its_runs(tmp_path):
     assert sorted(run.scene for run in latest_runs(store.runs)) == ["one", "one [limit=3.0]", "one [limit=4.0]"]
 
 
+def test_runs_that_came_to_no_result_or_stopped_early_drive_out_no_whole_one(tmp_path):
+    store = Store(tmp_path / "store")
+    whole = run_flow(toy.flow, store, scene="one")
+    for limit in (1.0, 2.0):
+        run_flow(lambda limit=limit: toy.flow(limit=limit), store, scene="one", until="squares")
+        run_flow(lambda limit=limit: {"half": toy.half(toy.source(values=(-limit,))[0])}, store, scene="one")
+    age_all(store.root)
+    assert removed(gc(store.root, "--keep-runs", "1"))["records of runs"] == 3
+    assert [run.is_whole() for run in latest_runs(store.runs)] == [False, True]
+    assert set(entries(store.root)[1]) >= {*whole.all("squares"), whole.one("total")}
+
+
 def test_nothing_young_goes_and_a_dry_run_changes_nothing(warm):
     before = bytes_of(warm.store)
     assert removed(gc(warm.store, "--keep-runs", "0", "--max-size", "0", "--older-than", "0s")) == {}

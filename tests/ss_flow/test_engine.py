@@ -19,14 +19,16 @@ from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.store import Store
 from ss_flow.closure import Closure, closure_of
-from ss_flow.engine import run_flow
+from ss_flow.engine import Request, run_flow, run_flows
 from ss_flow.events import Reporter
+from ss_flow.execute import Invocation
 from ss_flow.explain import first_difference, nearest
 from ss_flow.graph import INDEX, Flow, each, expand, gather, labelled, otherwise, pick, stored
+from ss_flow.jobs import Job, Tokens
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
 from ss_flow.runs import latest_runs
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.telemetry import trace
 
 
@@ -97,6 +99,11 @@ def test_each_hands_out_positions(store):
 
     report = run(store, flow)
     assert [value(store, digest) for digest in report.values["clipped"]] == [0.0, 1.0]
+
+
+def test_positions_alone_have_no_length_and_are_refused_at_the_call(store):
+    with pytest.raises(TypeError, match="INDEX alone says no length"):
+        run(store, lambda: {"all": each(INDEX, build=lambda i: toy.number(i))})
 
 
 def test_an_item_that_is_lost_while_a_sequence_is_read_is_computed_again(store):
@@ -239,6 +246,20 @@ def test_a_task_that_aborts_fails_alone_and_says_how(store):
     assert "SIGABRT" in str(report.values["end"].error)
 
 
+@pytest.mark.parametrize(
+    ("ready", "shares"), [(1, [8]), (2, [4, 4]), (3, [2, 3, 3]), (5, [1, 1, 2, 2, 2]), (8, [1] * 8)]
+)
+def test_jobs_that_are_ready_at_once_share_the_cores_fairly(ready, shares):
+    tokens = Tokens(Resources(cores=8, memory_mb=1000))
+    wanted = Resources(cores=1, most_cores=8, memory_mb=1)
+    given = []
+    for place in range(ready):
+        job = Job(Invocation(str(place), "", "", {}, {}, {}, wanted, False, ""), [], "", (0, 0))
+        tokens.take(job, waiting=ready - 1 - place)
+        given.append(job.invocation.resources.cores)
+    assert given == shares
+
+
 def test_the_last_task_that_waits_gets_the_cores_that_nobody_wants(store):
     def flow():
         one, two, three = (toy.source(values=(v,))[0] for v in (1.0, 2.0, 3.0))
@@ -343,6 +364,14 @@ def test_why_names_the_first_changed_part_and_runs_are_kept_in_order(store):
     assert why["ss_flow_toy.total"] == "input xs changed (1 of 3 items: n2)"
     latest = next(latest_runs(store.root / "roots" / "runs", "toy"))
     assert next(latest.events())["event"] == "run started"
+
+
+def test_why_looks_back_past_any_number_of_runs_that_did_not_reach_the_step(store):
+    run(store, toy.flow)
+    for _ in range(8):
+        run(store, toy.flow, until="squares")
+    report = run(store, lambda: toy.flow(limit=5.0))
+    assert next(n["why"] for n in report.nodes if n["label"].endswith("clip[n2]")) == "parameter limit 100.0 -> 5.0"
 
 
 def why_total(report) -> str:
@@ -544,6 +573,16 @@ def test_runs_of_a_store_without_numbers_are_in_the_order_of_their_times_and_bef
         (folder / "run.json").write_text(json.dumps({"scene": "toy", "started": started * 1e10}))
     run(store, toy.flow)
     assert [one.folder.name for one in latest_runs(store.runs)][1:] == ["3", "2", "1"]
+
+
+def test_the_records_of_earlier_runs_are_read_once_for_all_flows(store, monkeypatch):
+    requests = [Request(toy.flow, scene) for scene in ("one", "two", "three")]
+    run_flows(requests, store)
+    read, of_path = [], Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda path, **how: read.append(path.name) or of_path(path, **how))
+    run_flows(requests, store)
+    assert read.count("run.json") == 3
+    assert [one.place[0] for one in latest_runs(store.runs)] == [2, 2, 2, 1, 1, 1]
 
 
 def test_a_damaged_event_log_keeps_no_later_run_from_its_work(store):
@@ -855,11 +894,6 @@ def test_a_task_names_its_arguments_one_by_one():
     for function in (several, only, more):
         with pytest.raises(TypeError, match="the task t must name its arguments one by one"):
             task(name="t")(function)
-
-
-def test_the_distributions_that_a_task_uses_are_a_tuple_and_no_text():
-    with pytest.raises(TypeError, match=r'uses=\("open3d",\)'):
-        task(uses="open3d")
 
 
 def test_a_task_that_another_process_would_not_find_is_refused(store):

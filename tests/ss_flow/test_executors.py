@@ -480,6 +480,12 @@ def test_an_unknown_executor_is_refused(store, name):
         open_executor(name, 1, store, print)
 
 
+def test_a_run_that_is_refused_its_executor_leaves_no_record_and_no_claim(store):
+    with pytest.raises(InputError, match="is unknown"):
+        run_flow(toy.flow, store, scene="toy", executor="thread")
+    assert list(store.runs.iterdir()) == list((store.root / "claims").iterdir()) == []
+
+
 PROGRAM = """
 import sys
 sys.path.insert(0, {support!r})

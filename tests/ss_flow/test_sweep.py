@@ -144,6 +144,23 @@ def test_a_variant_is_compared_with_its_scene_and_recorded_apart_from_it(store):
     assert [run.header["sweep"] for run in latest_runs(runs, "toy [limit=5.0]")] == [{"limit": "5.0"}]
 
 
+def test_a_flow_of_which_nothing_is_told_is_not_told_of_pauses(store):
+    class Count(Reporter):
+        def __init__(self):
+            self.pauses = 0
+
+        def pause(self):
+            self.pauses += 1
+
+    def slowly():
+        values = toy.source(values=(2.0,))
+        return {"last": toy.square(toy.square(toy.square(values[0])))}
+
+    first, second = Count(), Count()
+    run_flows([Request(slowly, "one", reporter=first), Request(lambda: {}, "two", reporter=second)], store)
+    assert first.pauses >= 4 and second.pauses == 0
+
+
 def test_several_parameters_may_go_together(store):
     rows = sweep(toy.flow, zipped({"limit": [1.0, 2.0], "values": [(1.0,), (3.0,)]}), store, scene="growth")
     assert [total(store, row) for row in rows] == [1.0, 2.0]

@@ -5,7 +5,7 @@ import json
 import ss_flow_toy as toy
 
 from ss_flow.engine import run_flow
-from ss_flow.graph import each
+from ss_flow.graph import each, gather
 from ss_flow.runs import latest_runs
 from ss_flow.telemetry import trace
 
@@ -39,6 +39,22 @@ def test_a_run_is_one_trace_with_a_span_for_every_computed_step(store):
     assert failed["status"] == {"code": 2, "message": "ValueError: negative"}
     assert attributes(whole)["ss_flow.computed"] == "2"
     assert attributes(rest[0])["ss_flow.why"] == "computed for the first time for this scene"
+
+
+def test_of_calls_that_share_a_label_each_span_begins_when_its_own_call_did(store):
+    def build():
+        values = toy.source(values=(1.0, 2.0))
+        first = toy.square(values[0])
+        return {"all": gather([first, toy.shifted_total(toy.Pair(values[1], [values[0]]), first, by=1.0)])}
+
+    run_flow(build, store, scene="toy")
+    run = next(latest_runs(store.runs))
+    events = [{**event, "label": "one"} if "label" in event else event for event in run.events()]
+    for place, event in enumerate(events):
+        event["time"] = 1000.0 + place
+    (run.folder / "events.jsonl").write_text("".join(f"{json.dumps(event)}\n" for event in events))
+    took = [int(span["endTimeUnixNano"]) - int(span["startTimeUnixNano"]) for span in spans_of(store)[1:]]
+    assert took == [10**9] * 3
 
 
 def test_what_was_reused_is_counted_and_has_no_span(store):

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from ss_flow.engine import run_flow
 from ss_flow.graph import each
-from ss_flow.terminal import Log, Terminal
+from ss_flow.terminal import Lines, Terminal
 
 
 class Seen:
@@ -20,7 +20,7 @@ class Seen:
 
     def __init__(self, **options: float) -> None:
         self._stream = io.StringIO()
-        self.log = Log(Console(file=self._stream, width=200), **options)
+        self.log = Lines(Console(file=self._stream, width=200), **options)
 
     def lines(self) -> list[str]:
         """What it said, without times, with single spaces."""
@@ -67,6 +67,13 @@ def test_results_that_are_found_again_after_damage_are_not_told_of_again():
     seen.log.event("hit", label="half", step="half", of=1)
     seen.log.pause()
     assert seen.lines() == ["done half 1 of 1", "again an object is damaged"]
+
+
+def test_that_another_process_computes_a_step_is_told_once():
+    seen = Seen()
+    for item in "01":
+        seen.log.event("waiting", label=f"half[{item}]", step="half", of=2, because="another process is computing it")
+    assert seen.lines() == ["waits half[0]: another process is computing it"]
 
 
 def test_a_step_of_many_short_nodes_says_how_far_it_is():
