@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import threading
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,11 @@ EMPTY = np.zeros(0, np.uint8)
 
 def names(folder):
     return sorted(path.name for path in folder.iterdir())
+
+
+def fill(folder, name):
+    with replacing(folder) as filling:
+        (filling / name).touch()
 
 
 def test_what_was_filled_appears_under_the_name_and_nothing_beside_it(tmp_path):
@@ -125,6 +131,21 @@ def test_what_another_one_has_moved_away_is_left_to_it(tmp_path):
         with replacing(tmp_path / "out"):
             pass
         assert filling.with_suffix(".old.partial").is_dir()
+
+
+def test_who_begins_takes_nothing_of_one_that_begins_beside_it(tmp_path, monkeypatch):
+    make, beside = Path.mkdir, threading.Thread(target=fill, args=(tmp_path / "out", "b"))
+
+    def made(path, *arguments, **options):
+        make(path, *arguments, **options)
+        if path.name.endswith(".partial") and beside.ident is None:
+            beside.start()
+            beside.join(0.2)  # it waits; else it would have ended long before
+
+    monkeypatch.setattr(Path, "mkdir", made)
+    fill(tmp_path / "out", "a")
+    beside.join()
+    assert names(tmp_path) == ["out"] and len(names(tmp_path / "out")) == 1
 
 
 def test_a_relative_name_is_taken_from_where_one_is(tmp_path, monkeypatch):
