@@ -39,6 +39,26 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def write_checked(path: Path, text: str) -> None:
+    """Write what can be learnt again, so that `read_checked` notices damage; no error where it cannot be written."""
+    with contextlib.suppress(OSError):
+        if path.parent.is_dir():  # else that of a store which was moved away would be there again
+            write_atomically(path, f"{_digest(text)}\n{text}")
+
+
+def read_checked(path: Path) -> str | None:
+    """What `write_checked` wrote; None where there is none, it is damaged, or not ours to read."""
+    try:
+        stated, _, text = path.read_text(encoding="utf-8").partition("\n")
+    except (OSError, ValueError):
+        return None
+    return text if stated == _digest(text) else None
+
+
+def _digest(text: str) -> str:
+    return hashlib.blake2b(text.encode(), digest_size=32).hexdigest()
+
+
 def hidden(name: str) -> str:
     """What the names begin with of things that will take the place of a file or a folder of this name."""
     whole = os.fsencode(name)

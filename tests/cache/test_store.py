@@ -234,6 +234,43 @@ def test_a_damaged_table_of_files_is_learnt_again(tmp_path):
         assert FileDigests(tmp_path / "files.json")(photo) == right
 
 
+def test_a_table_of_files_that_cannot_be_read_or_written_is_learnt_again_and_nothing_fails(tmp_path, monkeypatch):
+    photo = tmp_path / "photo"
+    photo.write_text("one")
+    with FileDigests(tmp_path / "files.json") as first:
+        right = first(photo)
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "read_text", refuse)
+        patched.setattr(os, "fsync", refuse)
+        with FileDigests(tmp_path / "files.json") as digests:
+            assert digests._known == {} and digests(photo) == right
+    assert FileDigests(tmp_path / "files.json")._known == first._known
+
+
+def test_a_store_that_was_moved_away_is_not_there_again_for_what_was_learnt_of_files(tmp_path):
+    photo = tmp_path / "photo"
+    photo.write_text("one")
+    with FileDigests(tmp_path / "moved" / "files.json") as digests:
+        digests(photo)
+    assert not (tmp_path / "moved").exists()
+
+
+def test_files_of_folders_that_are_gone_are_forgotten_and_what_was_checked_is_not(tmp_path):
+    files = [tmp_path / name / "photo" for name in ("here", "gone")]
+    with FileDigests(tmp_path / "files.json") as digests:
+        for file in files:
+            file.parent.mkdir()
+            file.write_text("one")
+            digests(file)
+        digests.once(lambda subject: None, None, ["of a model"])
+        shutil.rmtree(files[1].parent)
+    assert list(FileDigests(tmp_path / "files.json")._known) == [str(files[0]), "checked of a model"]
+
+
 def test_a_damaged_object_is_taken_out_and_never_served(store):
     output = store.put(LabelMap("x", np.eye(64, dtype=np.uint16)))
     files = {f: f.read_bytes() for f in store.object_path(output).rglob("*") if f.is_file()}
