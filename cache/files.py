@@ -24,14 +24,15 @@ _NAME_BYTES = 200
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file so that a reader, and a crash, sees the old content or the new, never a part.
 
-    What was written beside it by a process that was killed is taken away by a later call.
+    What was written beside it by a process that was killed is taken away by a later call. In a text, what is no UTF-8
+    of a file's name is written as an escape, such as \\udcff.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _tidy(path)
     temporary = path.parent / f"{hidden(path.name)}.{uuid.uuid4().hex}"
     try:
         with temporary.open("wb") as stream:
-            stream.write(content.encode() if isinstance(content, str) else content)
+            stream.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
             stream.flush()
             os.fsync(stream.fileno())
         temporary.replace(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import capture_folders as made
@@ -160,6 +161,17 @@ def test_the_report_names_the_scene_and_stands_alone(tiny):
     assert "room" in html
     assert "data:image/" in html
     assert 'src="http' not in html and 'href="http' not in html
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
+def test_a_capture_whose_path_is_no_text_is_delivered_and_edited(warm, tmp_path):
+    scene = shutil.copytree(warm.scene, tmp_path / "sc\udcff")
+    called = run_tiny(scene, warm.store, out=warm.out)
+    assert called.code == 0 and called.document()["scene"] == str(scene)
+    (tmp_path / "script.json").write_text('{"operations": [{"op": "remove", "instances": [1]}]}')
+    assert ss_flow("edit", warm.out, tmp_path / "script.json", "--out", tmp_path / "edited").code == 0
+    for out in (warm.out, tmp_path / "edited"):
+        assert "sc\\udcff" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_photos_that_are_scaled_down_on_the_way_in_give_masks_of_their_own_size(tiny, tmp_path):
