@@ -16,8 +16,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.files import AT_WORK_SECONDS, hidden
-from ss_flow.errors import InputError
+from ss_flow.errors import InputError, OutputFailure
 from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_pixels import on_photo, photo_pixels
@@ -82,12 +83,28 @@ def _check_nearest(what: Path, places: Iterable[Path], instead: str = "name anot
 
 
 @contextmanager
+def writing_output(place: Path) -> Iterator[None]:
+    """Within this, an OSError becomes the OutputFailure of this place; not one that says already what to do."""
+    try:
+        yield
+    except (StoreFailure, OutputFailure):
+        raise
+    except OSError as error:
+        raise OutputFailure(
+            f"the output {place} cannot be written: {error.strerror or error}; what was computed is kept, run again "
+            "when there is room and permission."
+        ) from error
+
+
+@contextmanager
 def replacing(folder: Path, keep: Callable[[Path], None] = lambda filling: None) -> Iterator[Path]:
     """Yield a folder to fill, beside `folder`; when all went well it takes `folder`'s place.
 
     Of a symbolic link it is the place that it leads to: the link stays.
 
     keep: called with what was filled, just before that takes the place of `folder`, which stays the same meanwhile.
+
+    Raises OutputFailure for every OSError, also one that is raised while the folder is filled.
 
     Notes
     -----
@@ -99,11 +116,12 @@ def replacing(folder: Path, keep: Callable[[Path], None] = lambda filling: None)
     *Several at once*, on one machine, fill a folder each, which they hold locked; the last to end stays. They begin and
     end one after the other, while they hold the folder above locked.
     """
-    folder = Path(os.path.realpath(folder))
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    filling = folder.parent / f"{hidden(folder.name)}.{uuid.uuid4().hex[:8]}.partial"
-    old = filling.with_suffix(".old.partial")
     with contextlib.ExitStack() as stack:
+        stack.enter_context(writing_output(folder))
+        folder = Path(os.path.realpath(folder))
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        filling = folder.parent / f"{hidden(folder.name)}.{uuid.uuid4().hex[:8]}.partial"
+        old = filling.with_suffix(".old.partial")
         with _locked(folder.parent):
             _tidy(folder)
             filling.mkdir()

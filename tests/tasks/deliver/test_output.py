@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.files import hidden
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, LabelMap
@@ -52,6 +53,11 @@ def test_when_filling_fails_the_old_content_stays(tmp_path):
         raise OSError("disk full")
     assert (tmp_path / "out/a").read_text() == "old"
     assert names(tmp_path) == ["out"]
+
+
+def test_a_store_that_fails_while_an_output_is_filled_is_told_as_such(tmp_path):
+    with pytest.raises(StoreFailure, match=r"^the store fails$"), replacing(tmp_path / "out"):
+        raise StoreFailure("the store fails")
 
 
 def test_what_a_killed_run_left_is_taken_away_and_the_neighbours_are_not(tmp_path):
