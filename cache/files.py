@@ -7,6 +7,8 @@ import hashlib
 import os
 import re
 import shutil
+import stat
+import struct
 import time
 import uuid
 from pathlib import Path
@@ -17,6 +19,7 @@ AT_WORK_SECONDS = 3600.0
 """For so long after its last change an unfinished file, or folder, counts as being written."""
 UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}")
 """What `write_atomically` calls files that are not yet whole."""
+_ACL_VERSION, _ACL_USER, _ACL_GROUP, _ACL_OTHER = 2, 0x01, 0x04, 0x20
 _NAME_BYTES = 200
 """How much of a name goes into a hidden one: file systems allow 255 bytes in all."""
 
@@ -75,6 +78,16 @@ def _tidy(path: Path) -> None:
         for left in filter(lambda entry: unfinished.fullmatch(entry.name), entries(str(path.parent))):
             if left.stat(follow_symlinks=False).st_mtime < time.time() - AT_WORK_SECONDS:
                 os.unlink(left.path)
+
+
+def share(folder: Path, mode: int) -> None:
+    """Give the group what it has by `mode` in a folder of this user's, and in all that anybody makes there from now on,
+    whatever umask they have; where the file system has POSIX access control lists."""
+    bits = ((_ACL_USER, mode >> 6), (_ACL_GROUP, mode >> 3), (_ACL_OTHER, mode))
+    entries = b"".join(struct.pack("<HHI", tag, one & 7, 0xFFFFFFFF) for tag, one in bits)
+    with contextlib.suppress(OSError, AttributeError):  # of another user, or not on Linux
+        folder.chmod(stat.S_IMODE(folder.stat().st_mode) | mode & stat.S_IRWXG)
+        os.setxattr(folder, "system.posix_acl_default", struct.pack("<I", _ACL_VERSION) + entries, os.XATTR_CREATE)
 
 
 def rename_folder(source: Path, target: Path) -> None:

@@ -170,6 +170,46 @@ def test_what_a_killed_writer_left_is_swept_by_age(store):
     assert mine.exists() and not left.exists()
 
 
+def test_a_store_of_a_group_stays_the_groups_though_a_user_has_a_private_umask(tmp_path):
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store").chmod(0o2770)
+    before = os.umask(0o077)
+    try:
+        store = Store(tmp_path / "store")
+        if not hasattr(os, "getxattr") or "system.posix_acl_default" not in os.listxattr(store.root):
+            pytest.skip("a file system without access control lists")
+        store.record(
+            Action("ab" * 32, "toy", (store.put(LabelMap("x", np.ones((2, 2), np.uint16))),), False, {}, 0.0, 0.0)
+        )
+        store.checkpoint("k").parent.mkdir()
+        write_atomically(store.runs / "run" / "run.json", "{}")
+        assert store.open_claims().take("k")
+    finally:
+        os.umask(before)
+    made = list(store.root.rglob("*"))
+    assert {"zarr.json", f"{'ab' * 32}.json", "checkpoints", "run.json", "k"} <= {path.name for path in made}
+    assert [p for p in made if p.stat().st_mode & 0o070 != (0o070 if p.is_dir() else 0o060)] == []
+
+
+def test_a_store_of_ones_own_stays_private(tmp_path):
+    before = os.umask(0o077)
+    try:
+        store = Store(tmp_path / "store")
+        store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    finally:
+        os.umask(before)
+    assert [path for path in store.root.rglob("*") if path.stat().st_mode & 0o077] == []
+
+
+def test_a_file_that_another_user_keeps_private_is_named_with_what_to_do(store, monkeypatch):
+    def refuse(path, *_):
+        raise PermissionError(errno.EACCES, "Permission denied", path)
+
+    monkeypatch.setattr(os, "utime", refuse)
+    with pytest.raises(StoreFailure, match=rf"Permission denied for {store.root}/objects/.*`chmod -R g\+rwX`"):
+        store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+
+
 def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     target = tmp_path / "x.json"
     write_atomically(target, "old")
