@@ -31,6 +31,8 @@ from ss_flow.cache.errors import writing
 
 HEARTBEAT_SECONDS = 5.0
 EXPIRY_SECONDS = 60.0
+RELEASE_SECONDS = 2.0
+"""For so long the end of a run waits for its claims to be given back."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,15 @@ class Claims:
                 return
 
     def release_all(self) -> None:
-        """Give every claim back, and stop the heartbeat."""
+        """Give every claim back, and stop the heartbeat. Of those that take long nobody waits for the end: without the
+        heartbeat they run out."""
         self._stop.set()
+        # In a thread of its own: while a server is asked that does not answer, no Ctrl-C ends the waiting.
+        releasing = threading.Thread(target=self._release_held, name="releasing", daemon=True)
+        releasing.start()
+        releasing.join(RELEASE_SECONDS)
+
+    def _release_held(self) -> None:
         for key in list(self._held):
             with contextlib.suppress(OSError):
                 self.release(key)

@@ -41,7 +41,7 @@ def writing(root: Path) -> Iterator[None]:
         if error.errno in (errno.EMFILE, errno.ENFILE):
             reason, want = error.strerror, "more files may be open (`ulimit -n` tells how many may)"
         else:
-            reason = (error.strerror or str(error)) if (root / "tmp").is_dir() else "it has vanished"
+            reason = _reason(error) if (root / "tmp").is_dir() else "it has vanished"
             want = "there is room (`ss-flow cache gc` makes some) and permission"
         raise StoreFailure(
             f"the store {root} cannot be written: {reason}. What was finished is kept: when {want}, run again to go on."
@@ -56,4 +56,12 @@ def reading(root: Path) -> Iterator[None]:
     except StoreFailure:
         raise
     except OSError as error:
-        raise StoreFailure(f"the store {root} cannot be read: {error.strerror or error}; nothing was lost.") from error
+        raise StoreFailure(f"the store {root} cannot be read: {_reason(error)}; nothing was lost.") from error
+
+
+def _reason(error: OSError) -> str:
+    """Why, in words; of what another user keeps from this one, which file, and what to do."""
+    words, file = error.strerror or str(error), error.filename2 or error.filename
+    if isinstance(error, PermissionError) and file is not None:
+        return f"{words} for {file}, whose owner can allow it with `chmod -R g+rwX` (docs/clusters.md)"
+    return words

@@ -4,21 +4,23 @@ Notes
 -----
 *Concurrent writers.* Each saves the whole table by rename; what the table that was replaced knew besides is read again.
 
-*A damaged table* is noticed by its own digest, and the files are read again.
+*A damaged table* is noticed by its own digest, and the files are read again; as they are when the table cannot be read
+or written: no command ends because of it.
 
 *A file changed within the clock's resolution, at equal size*, is missed; `verify=True` reads every file again.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from ss_flow.cache.canonical import digest, digest_file
-from ss_flow.cache.files import stamp, write_atomically
+from ss_flow.cache.canonical import digest_file
+from ss_flow.cache.files import read_checked, stamp, write_checked
 
 T = TypeVar("T")
 
@@ -30,7 +32,7 @@ class FileDigests:
         self._table = table
         self._verify = verify
         self._changed = False
-        self._known: dict[str, list[object]] = _read(table)
+        self._known: dict[str, list[object]] = json.loads(read_checked(table) or "{}")
 
     def __enter__(self) -> FileDigests:
         return self
@@ -60,16 +62,10 @@ class FileDigests:
             self._changed = True
 
     def save(self) -> None:
-        """Write the table, if anything was learnt."""
+        """Write the table, if anything was learnt, without the files of folders that are gone."""
         if self._changed:
-            write_atomically(self._table, json.dumps({"digest": digest(self._known), "files": self._known}))
+            # Folders, not files: on a network's disk it would take long to ask for hundreds of thousands.
+            there = functools.cache(os.path.isdir)
+            known = {name: of for name, of in self._known.items() if not of or there(os.path.dirname(name))}
+            write_checked(self._table, json.dumps(known))
             self._changed = False
-
-
-def _read(table: Path) -> dict[str, list[object]]:
-    try:
-        content = json.loads(table.read_bytes())
-        known: dict[str, list[object]] = content["files"]
-        return known if digest(known) == content["digest"] else {}
-    except (FileNotFoundError, ValueError, TypeError, KeyError):
-        return {}

@@ -7,6 +7,8 @@ import hashlib
 import os
 import re
 import shutil
+import stat
+import struct
 import time
 import uuid
 from pathlib import Path
@@ -17,6 +19,7 @@ AT_WORK_SECONDS = 3600.0
 """For so long after its last change an unfinished file, or folder, counts as being written."""
 UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}")
 """What `write_atomically` calls files that are not yet whole."""
+_ACL_VERSION, _ACL_USER, _ACL_GROUP, _ACL_OTHER = 2, 0x01, 0x04, 0x20
 _NAME_BYTES = 200
 """How much of a name goes into a hidden one: file systems allow 255 bytes in all."""
 
@@ -25,20 +28,41 @@ def write_atomically(path: Path, content: str | bytes, *, synced: bool = True) -
     """Write a file so that a reader, and a crash, sees the old content or the new, never a part.
 
     synced: also after a power cut, which takes milliseconds; for what nothing makes again.
-    What was written beside it by a process that was killed is taken away by a later call.
+    What was written beside it by a process that was killed is taken away by a later call. In a text, what is no UTF-8
+    of a file's name is written as an escape, such as \\udcff.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _tidy(path)
     temporary = path.parent / f"{hidden(path.name)}.{uuid.uuid4().hex}"
     try:
         with temporary.open("wb") as stream:
-            stream.write(content.encode() if isinstance(content, str) else content)
+            stream.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
             if synced:
                 stream.flush()
                 os.fsync(stream.fileno())
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_checked(path: Path, text: str) -> None:
+    """Write what can be learnt again, so that `read_checked` notices damage; no error where it cannot be written."""
+    with contextlib.suppress(OSError):
+        if path.parent.is_dir():  # else that of a store which was moved away would be there again
+            write_atomically(path, f"{_digest(text)}\n{text}", synced=False)
+
+
+def read_checked(path: Path) -> str | None:
+    """What `write_checked` wrote; None where there is none, it is damaged, or not ours to read."""
+    try:
+        stated, _, text = path.read_text(encoding="utf-8").partition("\n")
+    except (OSError, ValueError):
+        return None
+    return text if stated == _digest(text) else None
+
+
+def _digest(text: str) -> str:
+    return hashlib.blake2b(text.encode(), digest_size=32).hexdigest()
 
 
 def hidden(name: str) -> str:
@@ -56,6 +80,16 @@ def _tidy(path: Path) -> None:
         for left in filter(lambda entry: unfinished.fullmatch(entry.name), entries(str(path.parent))):
             if left.stat(follow_symlinks=False).st_mtime < time.time() - AT_WORK_SECONDS:
                 os.unlink(left.path)
+
+
+def share(folder: Path, mode: int) -> None:
+    """Give the group what it has by `mode` in a folder of this user's, and in all that anybody makes there from now on,
+    whatever umask they have; where the file system has POSIX access control lists."""
+    bits = ((_ACL_USER, mode >> 6), (_ACL_GROUP, mode >> 3), (_ACL_OTHER, mode))
+    entries = b"".join(struct.pack("<HHI", tag, one & 7, 0xFFFFFFFF) for tag, one in bits)
+    with contextlib.suppress(OSError, AttributeError):  # of another user, or not on Linux
+        folder.chmod(stat.S_IMODE(folder.stat().st_mode) | mode & stat.S_IRWXG)
+        os.setxattr(folder, "system.posix_acl_default", struct.pack("<I", _ACL_VERSION) + entries, os.XATTR_CREATE)
 
 
 def rename_folder(source: Path, target: Path) -> None:

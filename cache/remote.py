@@ -129,6 +129,7 @@ class RemoteStore(Store):
         def fetch(name: str) -> None:
             target = place / name
             with writing(self.root):
+                place.mkdir(exist_ok=True)  # not those above: a folder that was moved away would be there again
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with target.open("wb") as stream:
                     stream.writelines(self._bucket.blocks(f"{folder}/{name}"))

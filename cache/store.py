@@ -39,6 +39,7 @@ import math
 import os
 import re
 import socket
+import stat
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
@@ -52,7 +53,7 @@ from ss_flow.cache import codec
 from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, reading, writing
-from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder
+from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder, share
 from ss_flow.cache.plain_json import reader
 from ss_flow.cache.recent import Recent
 
@@ -114,8 +115,12 @@ class Store:
         self._recent = Recent(memory_bytes)
         self._actions = f"{root}/actions"
         self._objects = f"{root}/objects"
-        for name in ("objects", "actions", "parts", "claims", "roots/runs", "roots/pins", "tmp"):
-            (root / name).mkdir(parents=True, exist_ok=True)
+        folders = [root / name for name in ("objects", "actions", "parts", "claims", "roots/runs", "roots/pins", "tmp")]
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+        if (mode := root.stat().st_mode) & (stat.S_ISGID | stat.S_IWGRP):  # a group's: see docs/clusters.md
+            for folder in (root, root / "roots", *folders):
+                share(folder, mode)
 
     def object_path(self, object_digest: str) -> Path:
         return self.root / "objects" / object_digest[:2] / object_digest

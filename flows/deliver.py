@@ -23,7 +23,7 @@ from ss_flow.tasks.artifacts import Cameras, Frame
 from ss_flow.tasks.capture.colmap import has_pycolmap
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import SceneFiles
-from ss_flow.tasks.deliver.output import RUN_FILE, write_masks, write_scene
+from ss_flow.tasks.deliver.output import RUN_FILE, write_masks, write_scene, writing_output
 from ss_flow.tasks.deliver.places import RESULT, replacing_own, sizes
 from ss_flow.tasks.deliver.ply import write_cloud
 
@@ -145,7 +145,8 @@ def deliver(folder: Path, store: Store, document: dict[str, Any], scene: SceneFi
     document["content"] = digest(asked | shown)
     if known := _delivered(folder, document["content"]):
         document |= known
-        write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
+        with writing_output(folder):
+            write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
         return
     with replacing_own(folder, RESULT) as filling:
         write_all(filling, store, document, scene, undistorted=undistorted)

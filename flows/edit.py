@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.cache.canonical import digest
+from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
@@ -139,7 +140,7 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
     with replacing_own(out, RESULT) as filling:
         write_scene(filling, scene, instances)
         html = report_html(document, pictures=made.all("report_pictures"), instances=instances)
-        (filling / "report.html").write_text(html, encoding="utf-8")
+        write_atomically(filling / "report.html", html)
         document["files"] = sizes(filling)
         document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")

@@ -7,3 +7,7 @@ class InputError(Exception):
 
 class ExecutorLost(RuntimeError):
     """Whoever runs the calls is gone, or must not run them, and the run ends; says why, and what to do."""
+
+
+class OutputFailure(OSError):
+    """What a user is to get cannot be written; says why, and what to do."""

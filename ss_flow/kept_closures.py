@@ -8,7 +8,8 @@ Notes
 -----
 *Concurrent writers.* Each writes whole files by rename, the same bytes from the same sources.
 
-*Damage* is noticed by the digest in the first line. *A full disk*: what cannot be kept is worked out again.
+*Damage* is noticed by the digest in the first line. *A full disk, a store that was moved away*: what cannot be kept is
+worked out again.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any
 from blake3 import blake3
 
 from ss_flow import closure, code_text, sources
-from ss_flow.cache.files import write_atomically
+from ss_flow.cache.files import read_checked, write_checked
 from ss_flow.closure import Closure, closure_of, reading
 from ss_flow.sources import source_digest
 
@@ -42,17 +43,14 @@ def kept_closure(function: Callable[..., Any], folder: Path) -> Closure:
     content = {**_SIGNS, **vars(found), "modules": sorted(found.modules)}
     text = json.dumps(content, separators=(",", ":"))
     with contextlib.suppress(OSError):
-        write_atomically(file, f"{_digest(text)}\n{text}", synced=False)
+        folder.mkdir(exist_ok=True)
+        write_checked(file, text)
     return found
 
 
 def _read(file: Path) -> Closure | None:
     """The closure in a file, if it still holds."""
-    try:
-        stated, _, text = file.read_text(encoding="utf-8").partition("\n")
-    except (OSError, ValueError):
-        return None
-    if stated != _digest(text):
+    if (text := read_checked(file)) is None:
         return None
     content = json.loads(text)
     if any(content[name] != value for name, value in _SIGNS.items()):
@@ -60,7 +58,3 @@ def _read(file: Path) -> Closure | None:
     if any(source_digest(name) != known for name, known in content["sources"].items()):
         return None
     return Closure(content["definitions"], frozenset(content["modules"]), content["sources"])
-
-
-def _digest(text: str) -> str:
-    return blake3(text.encode()).hexdigest()

@@ -102,7 +102,7 @@ def save_checkpoint(arrays: Mapping[str, NDArray[Any]]) -> None:
     if path is None:
         return
     with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(exist_ok=True)  # not those above: a store that was moved away would be there again
         with unfinished(path).open("wb") as stream:
             np.savez(stream, **arrays)  # type: ignore[arg-type]
             stream.flush()

@@ -24,7 +24,7 @@ from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
-from ss_flow.errors import InputError
+from ss_flow.errors import InputError, OutputFailure
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import console, file_digests
 from ss_flow.flows.cli.prepare import (
@@ -45,7 +45,7 @@ from ss_flow.flows.params import Params
 from ss_flow.sweep import rows_of
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import capture_name, named_after
-from ss_flow.tasks.deliver.output import check_writable
+from ss_flow.tasks.deliver.output import check_writable, writing_output
 from ss_flow.tasks.deliver.places import RESULT, check_outside, check_replaceable
 
 BATCH_FILE = "batch.json"
@@ -173,7 +173,8 @@ class _Book:
         self._tell.print(f"[{COLOURS[row['status']]}]{row['status']}[/] {words}")
 
     def _write(self) -> None:
-        write_atomically(self._file, json.dumps(self.rows, indent=1))
+        with writing_output(self._file):
+            write_atomically(self._file, json.dumps(self.rows, indent=1))
 
 
 class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
@@ -258,7 +259,7 @@ def _row(
 
 
 def _in_words(error: BaseException) -> str:
-    return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    return str(error) if isinstance(error, InputError | OutputFailure) else f"{type(error).__name__}: {error}"
 
 
 def _found(patterns: Sequence[str], list_file: Path | None) -> list[Path]:

@@ -24,7 +24,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 from ss_flow.cache.errors import Gone, StoreFailure  # noqa: E402
-from ss_flow.errors import ExecutorLost, InputError  # noqa: E402
+from ss_flow.errors import ExecutorLost, InputError, OutputFailure  # noqa: E402
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -52,7 +52,7 @@ def main(arguments: list[str]) -> int:
     except Gone as error:
         _complain(f"{error}; run the scene again, which computes it anew.")
         return FAILED
-    except (StoreFailure, ExecutorLost) as error:
+    except (StoreFailure, OutputFailure, ExecutorLost) as error:
         _complain(str(error))
         return FAILED
     except BrokenPipeError:
@@ -63,7 +63,7 @@ def main(arguments: list[str]) -> int:
     except Exception as error:
         if os.environ.get("SS_FLOW_DEBUG"):
             raise
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             _complain(
                 f"the output cannot be written: {error.strerror}; what was computed is kept, run again with room."
             )

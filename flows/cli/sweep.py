@@ -42,7 +42,7 @@ from ss_flow.runs import DONE
 from ss_flow.sweep import MOST_ROWS, Row, grid, in_words, recorded_as, rows_of, values_of, zipped
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
-from ss_flow.tasks.deliver.output import check_writable
+from ss_flow.tasks.deliver.output import check_writable, writing_output
 from ss_flow.tasks.deliver.places import check_outside
 
 
@@ -147,7 +147,8 @@ class Sweep:
             tell_rows(documents, tell)
         if options.target and not names_of([options.target]):
             tell.print(escape(f"--until {options.until} gives no figures; these steps do: {', '.join(NAMES)}"))
-        written = write_files(out, documents, zipped=self.zipped)
+        with writing_output(out):
+            written = write_files(out, documents, zipped=self.zipped)
         tell.print(escape(f"see {out}: {', '.join(written)}"))
         statuses = {document["status"] for document in documents}
         return STATUS_EXIT[statuses.pop()] if len(statuses) == 1 else STATUS_EXIT["degraded"]

@@ -172,7 +172,7 @@ class Corrections:
         """Write the file, whole or not at all. Raises InputError when it cannot be written."""
         text = json.dumps(self.document(), indent=1, ensure_ascii=False)
         try:
-            write_atomically(self.file, (text + "\n").encode())
+            write_atomically(self.file, text + "\n")
         except OSError as error:
             raise InputError(f"{self.file.name} cannot be written: {error.strerror}.") from None
         self._saved = list(self.picks)

@@ -222,4 +222,4 @@ def read_operations(file: Path) -> list[Operation]:
 
 def write_script(file: Path, script: Mapping[str, Any]) -> None:
     """Write an edit script, whole or not at all."""
-    write_atomically(file, (json.dumps(script, indent=1, ensure_ascii=False) + "\n").encode())
+    write_atomically(file, json.dumps(script, indent=1, ensure_ascii=False) + "\n")

@@ -10,14 +10,15 @@ import re
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.files import AT_WORK_SECONDS, hidden
-from ss_flow.errors import InputError
+from ss_flow.errors import InputError, OutputFailure
 from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_pixels import on_photo, photo_pixels
@@ -82,10 +83,28 @@ def _check_nearest(what: Path, places: Iterable[Path], instead: str = "name anot
 
 
 @contextmanager
-def replacing(folder: Path) -> Iterator[Path]:
+def writing_output(place: Path) -> Iterator[None]:
+    """Within this, an OSError becomes the OutputFailure of this place; not one that says already what to do."""
+    try:
+        yield
+    except (StoreFailure, OutputFailure):
+        raise
+    except OSError as error:
+        raise OutputFailure(
+            f"the output {place} cannot be written: {error.strerror or error}; what was computed is kept, run again "
+            "when there is room and permission."
+        ) from error
+
+
+@contextmanager
+def replacing(folder: Path, keep: Callable[[Path], None] = lambda filling: None) -> Iterator[Path]:
     """Yield a folder to fill, beside `folder`; when all went well it takes `folder`'s place.
 
     Of a symbolic link it is the place that it leads to: the link stays.
+
+    keep: called with what was filled, just before that takes the place of `folder`, which stays the same meanwhile.
+
+    Raises OutputFailure for every OSError, also one that is raised while the folder is filled.
 
     Notes
     -----
@@ -94,31 +113,44 @@ def replacing(folder: Path) -> Iterator[Path]:
     *Crash.* The unfinished folder, whose name begins with a dot, may remain, and the old content beside it under such a
     name; the next call puts the old content back where there is none, and takes away the rest.
 
-    *Several at once*, on one machine, fill a folder each, which they hold locked; the last to end stays.
+    *Several at once*, on one machine, fill a folder each, which they hold locked; the last to end stays. They begin and
+    end one after the other, while they hold the folder above locked.
     """
-    folder = Path(os.path.realpath(folder))
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    _tidy(folder)
-    filling = folder.parent / f"{hidden(folder.name)}.{uuid.uuid4().hex[:8]}.partial"
-    filling.mkdir()
-    lock = os.open(filling, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield filling
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(writing_output(folder))
+        folder = Path(os.path.realpath(folder))
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        filling = folder.parent / f"{hidden(folder.name)}.{uuid.uuid4().hex[:8]}.partial"
         old = filling.with_suffix(".old.partial")
-        try:
-            with contextlib.suppress(FileNotFoundError):
-                folder.rename(old)
-            filling.rename(folder)
-        except BaseException:  # Ctrl-C, too
-            if old.exists() and not folder.exists():
-                old.rename(folder)
-            raise
+        with _locked(folder.parent):
+            _tidy(folder)
+            filling.mkdir()
+            stack.callback(shutil.rmtree, filling, ignore_errors=True)
+            stack.enter_context(_locked(filling))
+        yield filling
+        with _locked(folder.parent):
+            keep(filling)
+            try:
+                with contextlib.suppress(FileNotFoundError):
+                    folder.rename(old)
+                filling.rename(folder)
+            except BaseException:  # Ctrl-C, too
+                if old.exists() and not folder.exists():
+                    old.rename(folder)
+                raise
         shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Within this, nobody else on this machine holds the folder locked; where the file system has locks."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
     finally:
-        shutil.rmtree(filling, ignore_errors=True)
-        os.close(lock)
+        os.close(handle)
 
 
 def _tidy(folder: Path) -> None:

@@ -68,8 +68,8 @@ def replacing_own(folder: Path, kind: Written) -> Iterator[Path]:
 
     Raises InputError where something of the same name was filled in; all of the folder stays as it was then.
     """
-    with replacing(folder) as filling:
-        yield filling
+
+    def keep(filling: Path) -> None:
         for name in others(folder, kind):
             if os.path.lexists(filling / name):
                 raise InputError(
@@ -81,6 +81,9 @@ def replacing_own(folder: Path, kind: Written) -> Iterator[Path]:
                 os.link(folder / name, filling / name, follow_symlinks=False)
             except OSError:  # a disk that knows no second names
                 shutil.copy2(folder / name, filling / name, follow_symlinks=False)
+
+    with replacing(folder, keep) as filling:
+        yield filling
 
 
 def sizes(folder: Path) -> dict[str, int]:

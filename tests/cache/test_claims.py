@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -32,6 +33,16 @@ def test_a_claim_that_is_touched_while_it_is_released_is_released_all_the_same(s
     assert claims.take("k")
     claims.release("k")
     assert list((store.root / "claims").iterdir()) == []
+
+
+def test_the_end_does_not_wait_for_a_server_that_does_not_answer(claims, monkeypatch):
+    answers, waited_in_vain = threading.Event(), []
+    assert claims.take("a") and claims.take("b")
+    monkeypatch.setattr(module, "RELEASE_SECONDS", 0.01)
+    monkeypatch.setattr(Folder, "look", lambda *_: waited_in_vain.append(not answers.wait(2)))
+    claims.release_all()
+    answers.set()
+    assert True not in waited_in_vain
 
 
 def test_one_of_two_gets_a_key_and_the_other_after_its_release(store, claims):

@@ -338,6 +338,14 @@ def test_a_full_disk_here_names_the_folder_and_leaves_nothing(here, there, monke
     assert not there.object_path(object_digest).exists()
 
 
+def test_a_folder_here_that_was_moved_away_is_not_there_again(here, there):
+    object_digest = here.put(label_map())
+    there.root.rename(there.root.with_name("moved"))
+    with pytest.raises(StoreFailure, match=rf"{there.root} cannot be written: it has vanished"):
+        there.get(object_digest)
+    assert not there.root.exists()
+
+
 def test_an_object_that_the_bucket_lost_is_restored_from_here_when_it_is_whole(here, there, bucket):
     whole, damaged = here.put(label_map()), here.put(label_map(8))
     (here.object_path(damaged) / "ids" / MANIFEST).write_text("{}")

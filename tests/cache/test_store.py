@@ -170,6 +170,46 @@ def test_what_a_killed_writer_left_is_swept_by_age(store):
     assert mine.exists() and not left.exists()
 
 
+def test_a_store_of_a_group_stays_the_groups_though_a_user_has_a_private_umask(tmp_path):
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store").chmod(0o2770)
+    before = os.umask(0o077)
+    try:
+        store = Store(tmp_path / "store")
+        if not hasattr(os, "getxattr") or "system.posix_acl_default" not in os.listxattr(store.root):
+            pytest.skip("a file system without access control lists")
+        store.record(
+            Action("ab" * 32, "toy", (store.put(LabelMap("x", np.ones((2, 2), np.uint16))),), False, {}, 0.0, 0.0)
+        )
+        store.checkpoint("k").parent.mkdir()
+        write_atomically(store.runs / "run" / "run.json", "{}")
+        assert store.open_claims().take("k")
+    finally:
+        os.umask(before)
+    made = list(store.root.rglob("*"))
+    assert {"zarr.json", f"{'ab' * 32}.json", "checkpoints", "run.json", "k"} <= {path.name for path in made}
+    assert [p for p in made if p.stat().st_mode & 0o070 != (0o070 if p.is_dir() else 0o060)] == []
+
+
+def test_a_store_of_ones_own_stays_private(tmp_path):
+    before = os.umask(0o077)
+    try:
+        store = Store(tmp_path / "store")
+        store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+    finally:
+        os.umask(before)
+    assert [path for path in store.root.rglob("*") if path.stat().st_mode & 0o077] == []
+
+
+def test_a_file_that_another_user_keeps_private_is_named_with_what_to_do(store, monkeypatch):
+    def refuse(path, *_):
+        raise PermissionError(errno.EACCES, "Permission denied", path)
+
+    monkeypatch.setattr(os, "utime", refuse)
+    with pytest.raises(StoreFailure, match=rf"Permission denied for {store.root}/objects/.*`chmod -R g\+rwX`"):
+        store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
+
+
 def test_a_file_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     target = tmp_path / "x.json"
     write_atomically(target, "old")
@@ -240,6 +280,43 @@ def test_a_damaged_table_of_files_is_learnt_again(tmp_path):
     for bad in ("{", "[]", good.replace(right[:8], "0" * 8), good[:-9]):
         (tmp_path / "files.json").write_text(bad)
         assert FileDigests(tmp_path / "files.json")(photo) == right
+
+
+def test_a_table_of_files_that_cannot_be_read_or_written_is_learnt_again_and_nothing_fails(tmp_path, monkeypatch):
+    photo = tmp_path / "photo"
+    photo.write_text("one")
+    with FileDigests(tmp_path / "files.json") as first:
+        right = first(photo)
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "read_text", refuse)
+        patched.setattr(os, "fsync", refuse)
+        with FileDigests(tmp_path / "files.json") as digests:
+            assert digests._known == {} and digests(photo) == right
+    assert FileDigests(tmp_path / "files.json")._known == first._known
+
+
+def test_a_store_that_was_moved_away_is_not_there_again_for_what_was_learnt_of_files(tmp_path):
+    photo = tmp_path / "photo"
+    photo.write_text("one")
+    with FileDigests(tmp_path / "moved" / "files.json") as digests:
+        digests(photo)
+    assert not (tmp_path / "moved").exists()
+
+
+def test_files_of_folders_that_are_gone_are_forgotten_and_what_was_checked_is_not(tmp_path):
+    files = [tmp_path / name / "photo" for name in ("here", "gone")]
+    with FileDigests(tmp_path / "files.json") as digests:
+        for file in files:
+            file.parent.mkdir()
+            file.write_text("one")
+            digests(file)
+        digests.once(lambda subject: None, None, ["of a model"])
+        shutil.rmtree(files[1].parent)
+    assert list(FileDigests(tmp_path / "files.json")._known) == [str(files[0]), "checked of a model"]
 
 
 def test_a_damaged_object_is_taken_out_and_never_served(store):

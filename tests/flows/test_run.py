@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import capture_folders as made
@@ -17,6 +20,7 @@ from ss_flow.cache.store import Store
 from ss_flow.flows.cli import run as run_module
 from ss_flow.flows.generated import RoomParams
 from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.deliver import ply
 from ss_flow.tasks.gaussians.read_ply import read_columns
 from ss_flow.tasks.splat import reconstruct as reconstruct_module
 
@@ -160,6 +164,17 @@ def test_the_report_names_the_scene_and_stands_alone(tiny):
     assert "room" in html
     assert "data:image/" in html
     assert 'src="http' not in html and 'href="http' not in html
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
+def test_a_capture_whose_path_is_no_text_is_delivered_and_edited(warm, tmp_path):
+    scene = shutil.copytree(warm.scene, tmp_path / "sc\udcff")
+    called = run_tiny(scene, warm.store, out=warm.out)
+    assert called.code == 0 and called.document()["scene"] == str(scene)
+    (tmp_path / "script.json").write_text('{"operations": [{"op": "remove", "instances": [1]}]}')
+    assert ss_flow("edit", warm.out, tmp_path / "script.json", "--out", tmp_path / "edited").code == 0
+    for out in (warm.out, tmp_path / "edited"):
+        assert "sc\\udcff" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_photos_that_are_scaled_down_on_the_way_in_give_masks_of_their_own_size(tiny, tmp_path):
@@ -327,6 +342,18 @@ def test_when_a_step_that_all_need_fails_the_run_fails_and_the_earlier_result_st
     assert "failed splat.assemble: ArithmeticError: nothing fits" in called.err
     assert "Traceback" not in called.err
     assert {path.name: path.read_bytes() for path in warm.out.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EFBIG, errno.ENOENT])
+def test_a_disk_that_does_not_take_the_output_gets_one_sentence_and_leaves_no_part(number, warm, tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number), "scene.ply")
+
+    monkeypatch.setattr(ply, "write_gaussians", refuse)
+    called = run_tiny(warm.scene, warm.store, out=tmp_path / "new/out")
+    told = f"the output {tmp_path / 'new/out'} cannot be written: {os.strerror(number)}; what was computed is kept"
+    assert called.code == 1 and called.out == "" and not list((tmp_path / "new").iterdir())
+    assert told in called.err and called.err.count("ss-flow:") == 1
 
 
 def test_photos_whose_names_look_like_markup_are_told_as_they_are(room, tmp_path):

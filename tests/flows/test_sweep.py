@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -15,7 +17,7 @@ from ss_flow.cache.store import Store
 from ss_flow.events import Reporter
 from ss_flow.flows import paper
 from ss_flow.flows.cli import sweep as sweep_module
-from ss_flow.flows.cli import sweep_plot
+from ss_flow.flows.cli import sweep_plot, sweep_report
 from ss_flow.flows.measures import HEADLINE, NAMES, measures, names_of
 from ss_flow.tasks.split import propagate as propagate_module
 
@@ -167,6 +169,15 @@ def test_the_records_of_a_sweep_leave_those_of_the_scene_alone(warm, tmp_path):
     name = f"{warm.scene} [split.propagate.tau_label=0.9]"
     told = ss_flow("why", "propagate", name, "--cache", warm.store)
     assert told.out == "split.propagate: parameter tau_label 0.7 -> 0.9\n", told.err
+
+
+def test_a_disk_that_does_not_take_the_files_of_a_sweep_gets_one_sentence(warm, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+
+    monkeypatch.setattr(sweep_report, "write_atomically", refuse)
+    called = sweep_tiny(warm, "--set", "tau_label=0.7,0.8", "--until", "propagate", out=tmp_path / "swept")
+    assert called.code == 1 and f"the output {tmp_path / 'swept'} cannot be written: File too large;" in called.err
 
 
 def test_a_variant_that_fails_is_told_of_and_the_others_are_measured(warm, tmp_path, monkeypatch):

@@ -27,6 +27,7 @@ from ss_flow.graph import INDEX, Flow, each, expand, gather, labelled, otherwise
 from ss_flow.jobs import Job, Tokens
 from ss_flow.keys import Keys
 from ss_flow.resolution import Failure
+from ss_flow.running import Surroundings, running, save_checkpoint
 from ss_flow.runs import latest_runs
 from ss_flow.task import Resources, task
 from ss_flow.telemetry import trace
@@ -300,6 +301,12 @@ def test_a_damaged_checkpoint_is_as_good_as_none(store, tmp_path):
     kept.write_bytes(bytes(content))
     falls_at.unlink()
     assert value(store, run(store, flow).values["start"]) == 0
+
+
+def test_a_store_that_was_moved_away_is_not_there_again_for_a_checkpoint(tmp_path):
+    with running(Surroundings(checkpoint=tmp_path / "moved" / "checkpoints" / "kept.npz")):
+        save_checkpoint({"x": np.ones(2)})
+    assert not (tmp_path / "moved").exists()
 
 
 def test_the_same_key_is_computed_once_for_all_its_nodes(store):

@@ -137,3 +137,8 @@ def test_a_damaged_file_is_not_believed(probe, walks, damage):
 def test_a_folder_that_cannot_be_written_does_not_matter(probe, walks):
     probe.folder.write_text("a file")
     assert kept_closure(probe(), probe.folder) == closure_of(probe())
+
+
+def test_a_store_that_was_moved_away_is_not_there_again_for_what_could_be_kept(probe, tmp_path):
+    assert kept_closure(probe(), tmp_path / "moved" / "closures") == closure_of(probe())
+    assert not (tmp_path / "moved").exists()

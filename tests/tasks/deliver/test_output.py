@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import threading
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.files import hidden
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Frame, LabelMap
@@ -20,6 +22,11 @@ EMPTY = np.zeros(0, np.uint8)
 
 def names(folder):
     return sorted(path.name for path in folder.iterdir())
+
+
+def fill(folder, name):
+    with replacing(folder) as filling:
+        (filling / name).touch()
 
 
 def test_what_was_filled_appears_under_the_name_and_nothing_beside_it(tmp_path):
@@ -46,6 +53,11 @@ def test_when_filling_fails_the_old_content_stays(tmp_path):
         raise OSError("disk full")
     assert (tmp_path / "out/a").read_text() == "old"
     assert names(tmp_path) == ["out"]
+
+
+def test_a_store_that_fails_while_an_output_is_filled_is_told_as_such(tmp_path):
+    with pytest.raises(StoreFailure, match=r"^the store fails$"), replacing(tmp_path / "out"):
+        raise StoreFailure("the store fails")
 
 
 def test_what_a_killed_run_left_is_taken_away_and_the_neighbours_are_not(tmp_path):
@@ -125,6 +137,21 @@ def test_what_another_one_has_moved_away_is_left_to_it(tmp_path):
         with replacing(tmp_path / "out"):
             pass
         assert filling.with_suffix(".old.partial").is_dir()
+
+
+def test_who_begins_takes_nothing_of_one_that_begins_beside_it(tmp_path, monkeypatch):
+    make, beside = Path.mkdir, threading.Thread(target=fill, args=(tmp_path / "out", "b"))
+
+    def made(path, *arguments, **options):
+        make(path, *arguments, **options)
+        if path.name.endswith(".partial") and beside.ident is None:
+            beside.start()
+            beside.join(0.2)  # it waits; else it would have ended long before
+
+    monkeypatch.setattr(Path, "mkdir", made)
+    fill(tmp_path / "out", "a")
+    beside.join()
+    assert names(tmp_path) == ["out"] and len(names(tmp_path / "out")) == 1
 
 
 def test_a_relative_name_is_taken_from_where_one_is(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -140,3 +141,28 @@ def test_a_folder_that_is_the_store_or_lies_in_it_or_holds_it_is_refused(there, 
         with pytest.raises(InputError, match=r"a holds the store .*store, which would be lost"):
             check_replaceable(tmp_path / "a", RESULT, str(store))
     check_replaceable(tmp_path / "a/storehouse", RESULT, store)
+
+
+def test_of_several_runs_that_end_at_once_none_fails_and_what_a_user_put_there_stays(tmp_path, monkeypatch):
+    folder, rename, failed = result(tmp_path / "out", "scene.ply"), Path.rename, []
+    put(folder / "notes.txt")
+
+    def deliver():
+        try:
+            with replacing_own(folder, RESULT) as filling:
+                result(filling, "scene.ply")
+        except OSError as error:
+            failed.append(error)
+
+    beside = threading.Thread(target=deliver)
+
+    def renamed(path, target):
+        rename(path, target)
+        if path == folder and beside.ident is None:
+            beside.start()
+            beside.join(0.2)  # it waits; else it would have ended long before
+
+    monkeypatch.setattr(Path, "rename", renamed)
+    deliver()
+    beside.join()
+    assert failed == [] and os.listdir(tmp_path) == ["out"] and (folder / "notes.txt").read_text() == "mine"
