@@ -137,9 +137,9 @@ class _Call:
                 f"{', '.join(self._known)}{_hint(name, self._known) or '.'}"
             )
 
-    def instance(self, field: str = "instance") -> int:
-        """The one instance that the field names."""
-        return self.take(field, Field("it must name an instance by id or by name", self._one))
+    def instance(self) -> int:
+        """The one instance that the field `instance` names."""
+        return self.take("instance", Field("it must name an instance by id or by name", self._one))
 
     def instances(self, *, background: bool = False, least: int = 1) -> tuple[int, ...]:
         """The instances that the field `instances` names, each once, in its order."""

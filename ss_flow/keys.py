@@ -29,6 +29,7 @@ Value = tuple[str, ...] | str
 
 
 def digests_of(value: Value) -> list[str]:
+    """The digests of an input, of one artifact too."""
     return [value] if isinstance(value, str) else list(value)
 
 

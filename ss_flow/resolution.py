@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ss_flow.graph import Call, Expand, Flow, Gather, Item, Node, Otherwise, Pick, Stored
-from ss_flow.keys import Value
+from ss_flow.keys import Value, digests_of
 
 
 @dataclass(frozen=True)
@@ -242,4 +242,4 @@ class Resolution:
 
 def _flattened(values: Iterable[Any]) -> tuple[str, ...]:
     """Digests of single artifacts and of lists, as one list."""
-    return tuple(d for value in values for d in ((value,) if isinstance(value, str) else value))
+    return tuple(d for value in values for d in digests_of(value))

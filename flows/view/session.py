@@ -88,14 +88,6 @@ class Session:
         """The scene as it is now."""
         return self._states[self._place]
 
-    @property
-    def can_undo(self) -> bool:
-        return self._place > 0
-
-    @property
-    def can_redo(self) -> bool:
-        return self._place + 1 < len(self._states)
-
     def do(self, *operations: Operation) -> None:
         """Do operations, which are undone as one. Raises InputError when one is refused; then none is done."""
         state = self.state

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import tempfile
 import time
 from contextlib import nullcontext
@@ -27,12 +28,15 @@ from typing import Any
 import cv2
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from generated_desk import generate_desk
+
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import file_digests
 from ss_flow.flows.cli.prepare import RunOptions, prepare
-from ss_flow.flows.generated import RoomParams, generate, generate_desk, write_scene
+from ss_flow.flows.generated import RoomParams, generate, write_scene
 from ss_flow.flows.generated.sensor import sensed
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import Frame, LabelMap

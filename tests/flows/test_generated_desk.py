@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from generated_desk import generate_desk
 
-from ss_flow.flows.generated import Room, generate_desk, write_scene
+from ss_flow.flows.generated import Room, write_scene
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 
 
