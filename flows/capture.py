@@ -145,16 +145,16 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         colours=evened,
         checks=checks(frames, cameras, depths, params=params.checks),
         given=given,
-        turns=int(turned(scene, params).turns),
+        turns=turned(scene, params).turns or 0,
     )
 
 
 def turned(scene: SceneFiles, params: CaptureParams) -> CaptureParams:
-    """With the turns that "auto" comes to. Photos without poses stand upright, turned as their EXIF says."""
-    if params.turns != "auto":
+    """With the turns that are to be told from the poses. Photos without poses stand upright, as their EXIF turns them."""
+    if params.turns is not None:
         return params
     known = scene.world_to_camera
-    return replace(params, turns="0" if known is None else str(quarter_turns(known)))
+    return replace(params, turns=0 if known is None else quarter_turns(known))
 
 
 def _placed(

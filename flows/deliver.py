@@ -97,13 +97,13 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
 def remarks(scene: SceneFiles, params: Params, networks: Networks) -> list[str]:
     """What to say of a run beforehand: how the capture lies there, and what is left out for what this machine lacks.
 
-    params: with the turns that "auto" comes to.
+    params: with the turns that were told from the poses.
     """
     brings_masks = scene.has_masks or scene.hints is not None  # hints without a segmenter are refused
     weight_free = networks.segmenter is None and params.split.segmenter == "auto" and not brings_masks
     uncompared = compares_poses(scene, params.capture) and not has_pycolmap()
     seen = networks.encoder is not None or (networks.segmenter is not None and not scene.has_masks)
-    lying = seen and scene.poses is not None and params.capture.turns in ("1", "3")
+    lying = seen and scene.poses is not None and params.capture.turns in (1, 3)
     return [*scene.remarks, *[WEIGHT_FREE] * weight_free, *[UNCOMPARED] * uncompared, *[LYING] * lying]
 
 

@@ -20,7 +20,7 @@ from ss_flow.tasks.capture.registration import RegistrationParams
 from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.capture.stereo import StereoParams
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.ranges import Count, Fraction, NonNegative, QuarterTurns
 from ss_flow.tasks.semantics.dense_describe import DenseDescribeParams
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams
@@ -59,9 +59,10 @@ class CaptureParams:
     refine_poses: Literal["auto", "always", "never"] = "auto"
     """Whether poses that come with the capture are first refined by bundle adjustment; "auto" does so where photos do
     not fit the given ones, and uses what it finds where photos then fit better and measured depth no worse."""
-    turns: Literal["auto", "0", "1", "2", "3"] = "auto"
+    turns: QuarterTurns | None = None
     """Quarter turns, counterclockwise, by which the segmenter and the encoder see the photos turned, since they know
-    things as they stand; "auto" turns photos that by the given poses lie on their side. Nothing else is turned."""
+    things as they stand; none = photos that lie on their side by the given poses stand upright. Nothing else is
+    turned."""
     monodepth: str = "auto"
     """The network for depth=mono: a name of the catalogue, or "auto"."""
     ingest: IngestParams = field(default_factory=IngestParams)

@@ -38,5 +38,6 @@ Count = Annotated[int, Range(1, float("inf"))]
 Natural = Annotated[int, Range(0, float("inf"))]
 """A whole number, or none."""
 JpegQuality = Annotated[int, Range(0, 100)]
+QuarterTurns = Annotated[int, Range(0, 3)]
 HarmonicsDegree = Annotated[int, Range(0, 3)]
 """Degree of the spherical harmonics of a colour."""

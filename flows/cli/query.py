@@ -89,7 +89,7 @@ class Query:
             descriptors = nodes["describe"]
             if self.parts:
                 describing = settings.recorded(DescribeParams(), document["params"], "semantics.describe")
-                turns = int(document["params"].get("capture.turns", 0))
+                turns = document["params"].get("capture.turns") or 0
                 known["parts"], descriptors = described_parts(nodes, encoder, describing, turns)
             found = query(descriptors, text=self.text, params=params, encoder=encoder, background=self.background)
             return {"query": found, **known}

@@ -84,7 +84,7 @@ def _camera(path: Path) -> tuple[Lens, Pose]:
     lacking = [key for key in needed if not isinstance(values, dict) or not is_number(values.get(key))]
     if lacking:
         raise InputError(f"{path} has no number `{lacking[0]}`; a camera as Polycam exports it is expected.")
-    size, numbers = (int(values["width"]), int(values["height"])), [float(values[key]) for key in needed[2:6]]
     camera_to_world = np.array([[values[key] for key in row] for row in entries] + [[0, 0, 0, 1]], np.float64)
-    lens = check_lens(Lens(*size, *numbers), str(path))
+    fx, fy, cx, cy = (float(values[key]) for key in needed[2:6])
+    lens = check_lens(Lens(int(values["width"]), int(values["height"]), fx, fy, cx, cy), str(path))
     return lens, rigid_inverse(camera_to_world @ _OPENGL_TO_OPENCV, str(path))

@@ -75,8 +75,9 @@ def _poses(path: Path) -> Float64:
 def _camera(root: Path) -> tuple[Lens, float]:
     path = next((p for p in (root / "cam_params.json", root.parent / "cam_params.json") if p.is_file()), None)
     document = {"camera": _LENS} if path is None else read_json(path)
-    values = document.get("camera") if isinstance(document, dict) else None
-    lacking = [key for key in _LENS if not isinstance(values, dict) or not is_number(values.get(key))]
+    camera = document.get("camera") if isinstance(document, dict) else None
+    values = camera if isinstance(camera, dict) else {}
+    lacking = [key for key in _LENS if not is_number(values.get(key))]
     if lacking or not values["scale"] > 0:
         raise InputError(
             f"{path} has no `camera` with a number `{(*lacking, 'scale')[0]}`; w, h, fx, fy, cx, cy in pixels and the "

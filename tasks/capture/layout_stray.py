@@ -37,7 +37,7 @@ def open_stray(root: Path) -> SceneFiles:
     """
     track = root / "odometry.csv"
     rows = _rows(track)
-    width, height, length = _video(root / "rgb.mp4")
+    size, length = _video(root / "rgb.mp4")
     common = None if all(key in rows[0] for key in _LENS) else _camera_matrix(root / "camera_matrix.csv")
     depths, confidences = by_stem(files_in(root / "depth")), by_stem(files_in(root / "confidence"))
     stems = [f"{int(_number(row, 'frame', track)):06d}" for row in rows]
@@ -46,7 +46,7 @@ def open_stray(root: Path) -> SceneFiles:
     if not kept:
         raise InputError(f"{root / 'depth'} holds no depth map of a frame that {track.name} lists; 000000.png is one.")
     lenses, poses = upright(
-        [check_lens(Lens(width, height, *_lens(rows[i], common, track)), str(track)) for i in kept],
+        [_lens(rows[i], common, size, track) for i in kept],
         [_pose(rows[i], track) for i in kept],
     )
     return SceneFiles(
@@ -121,8 +121,9 @@ def _pose(row: dict[str, str], path: Path) -> Pose:
     return rigid_inverse(matrix, where)
 
 
-def _lens(row: dict[str, str], common: tuple[float, ...] | None, path: Path) -> tuple[float, ...]:
-    return common or tuple(_number(row, key, path) for key in _LENS)
+def _lens(row: dict[str, str], common: tuple[float, ...] | None, size: tuple[int, int], path: Path) -> Lens:
+    fx, fy, cx, cy = common or (_number(row, key, path) for key in _LENS)
+    return check_lens(Lens(*size, fx, fy, cx, cy), str(path))
 
 
 def _camera_matrix(path: Path) -> tuple[float, ...]:
@@ -134,7 +135,7 @@ def _camera_matrix(path: Path) -> tuple[float, ...]:
     return tuple(float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
 
 
-def _video(path: Path) -> tuple[int, int, int]:
+def _video(path: Path) -> tuple[tuple[int, int], int]:
     """Width and height of the stored frames, and how many there are."""
     import cv2
 
@@ -145,4 +146,4 @@ def _video(path: Path) -> tuple[int, int, int]:
     reader.release()
     if min(*found, length) <= 0:
         raise InputError(f"{path} cannot be opened as a video: it is cut short or damaged; copy the recording again.")
-    return found[0], found[1], length
+    return (found[0], found[1]), length

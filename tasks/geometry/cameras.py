@@ -88,7 +88,8 @@ def up_of(poses: Float64 | Sequence[Float64]) -> Float64:
     pictures' upper borders point all ways, as in photos straight down on a table from all its sides, up is where they
     look away from; where they look all ways, too, the first one says what is up.
     """
-    right, down, forward = np.asarray(poses)[:, :3, :3].mean(axis=0)
+    poses = np.asarray(poses)
+    right, down, forward = poses[:, :3, :3].mean(axis=0)
     down = {0: down, 1: -right, 3: right}[quarter_turns(poses)]
     for away in (down, forward):
         length = float(np.linalg.norm(away))

@@ -157,11 +157,12 @@ class PromptedImage:
 
     def _turned(self, points: Float32 | Float64) -> Float32 | Float64:
         """Where points of the image lie in it once it is turned."""
-        sides = self._embedding.height, self._embedding.width
-        for turn in range(self._embedding.turns):
-            width = sides[(self._embedding.turns - 1 - turn) % 2]
-            points = np.stack([points[:, 1], width - points[:, 0]], axis=1)
-        return points
+        seen = self._embedding
+        if not seen.turns:
+            return points
+        x, y = points.T
+        places = {1: (y, seen.height - x), 2: (seen.width - x, seen.height - y), 3: (seen.width - y, x)}[seen.turns]
+        return np.stack(places, axis=1)
 
     def _decode(self, points: Float32 | Float64, labels: Int32) -> tuple[Float32, Float32]:
         places = np.asarray(points, np.float64) * self._embedding.scale
