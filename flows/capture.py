@@ -150,7 +150,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
 
 
 def turned(scene: SceneFiles, params: CaptureParams) -> CaptureParams:
-    """With the turns that are to be told from the poses. Photos without poses stand upright, as their EXIF turns them."""
+    """With the turns that the poses tell. Photos without poses stand upright, as their EXIF turns them."""
     if params.turns is not None:
         return params
     known = scene.world_to_camera

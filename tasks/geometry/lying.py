@@ -28,14 +28,11 @@ def quarter_turns(poses: Float64) -> int:
 
     poses: [K, 4, 4] world to camera. Photos that are upside down are not found out: they may as well look up.
     """
-    from scipy.spatial.transform import Rotation
-
     axes = np.asarray(poses)[:: max(1, -(-len(poses) // _SAMPLE)), :3, :3]
     i, j = np.triu_indices(len(axes), 1)
     if not len(i):
         return 0
-    turns = Rotation.from_matrix(np.einsum("kji,kjl->kil", axes[j], axes[i])).as_rotvec()
-    strength, lines = np.linalg.eigh(turns.T @ turns / len(turns))
+    strength, lines = np.linalg.eigh(_turned_about(np.einsum("kji,kjl->kil", axes[j], axes[i])))
     if strength[2] < _TURNED**2 or strength[2] < _CLEAR * strength[1]:
         return 0
     across, along, ahead = (axes @ lines[:, 2]).T
@@ -47,3 +44,15 @@ def quarter_turns(poses: Float64) -> int:
         return 0
     # Up lies against the line where the photos look along it.
     return 1 if across.mean() * down < 0 else 3
+
+
+def _turned_about(rotations: Float64) -> Float64:
+    """[3, 3] whose product with a line from both sides is the mean square, in radians, of the turns about that line.
+
+    rotations: [M, 3, 3]. One by an angle t about a line a is, but for a part that is odd, cos t + (1 - cos t) a a^T.
+    """
+    cosine = np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1)
+    angle = np.arccos(cosine)
+    weight = np.divide(angle**2, 1 - cosine, out=np.full(len(angle), 2.0), where=cosine < 1)
+    even = (rotations + rotations.transpose(0, 2, 1)) / 2 - cosine[:, None, None] * np.eye(3)
+    return np.asarray((weight[:, None, None] * even).mean(axis=0))

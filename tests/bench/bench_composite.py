@@ -1,7 +1,7 @@
 """How many things are exactly one instance: Split with a segmenter's masks on generated rooms of composite things.
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
-                                          [--gripper | --sensor | --desk] [--store DIR] [--look DIR]
+                                          [--gripper | --sensor | --desk] [--lying] [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
 whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
@@ -9,7 +9,8 @@ a tenth), mIoU, PQ, over- and under-segmentation, in per cent; the predicted ids
 each thing its best IoU, and of how many predicted ids each covers at least a tenth of it. With --store, rooms and
 results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
 shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
-of small things on a table, in few near views of a depth sensor.
+of small things on a table, in few near views of a depth sensor. With --lying, photos lie on their side, as a phone
+stores them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -79,6 +81,27 @@ def desk_of(seed: int, place: Path) -> Path:
     return folder
 
 
+def lying(upright: Path) -> Path:
+    """A capture whose photos, and all else, lie on their right side."""
+    folder = upright.with_name(f"{upright.name}-lying")
+    if folder.exists():
+        return folder
+    shutil.copytree(upright, folder)
+    for file in (*folder.rglob("*.jpg"), *folder.rglob("*.png")):
+        cv2.imwrite(str(file), np.ascontiguousarray(np.rot90(_ids(file), -1)), [cv2.IMWRITE_JPEG_QUALITY, 98])
+    for file in folder.glob("pose/*.txt"):
+        pose = np.loadtxt(file)
+        pose[:3, :2] = np.column_stack([-pose[:3, 1], pose[:3, 0]])
+        np.savetxt(file, pose)
+    for file in folder.glob("intrinsic/*.txt"):
+        matrix = np.loadtxt(file)
+        (fx, _, cx), (_, fy, cy) = matrix[:2, :3]
+        width = _ids(next((folder / file.stem.removeprefix("intrinsic_")).iterdir())).shape[1]
+        matrix[:2, :3] = (fy, 0, width - 1 - cy), (0, fx, cx)
+        np.savetxt(file, matrix)
+    return folder
+
+
 def outcome(folder: Path, params: Params, store: Store) -> Outcome:
     """Run Split on a capture and read what came of it."""
     prepared = prepare(open_scene(folder), params, RunOptions(), file_digests(store))
@@ -132,6 +155,7 @@ def main() -> None:
     scene.add_argument("--gripper", action="store_true", help="with a gripper before the lens")
     scene.add_argument("--sensor", action="store_true", help="with the depth of a depth camera")
     scene.add_argument("--desk", action="store_true", help="desks instead of rooms")
+    parser.add_argument("--lying", action="store_true", help="photos that lie on their side")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
     args = parser.parse_args()
@@ -140,6 +164,7 @@ def main() -> None:
         for seed in args.seeds:
             room = replace(ROOM, seed=seed, gripper=args.gripper)
             folder = desk_of(seed, Path(kept)) if args.desk else folder_of(room, Path(kept), args.sensor)
+            folder = lying(folder) if args.lying else folder
             found = outcome(folder, params, Store(Path(kept)))
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]
