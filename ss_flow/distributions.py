@@ -27,6 +27,14 @@ def is_distributed(module: str) -> bool:
     return bool(found) and not any('"editable": true' in (one.read_text("direct_url.json") or "") for one in found)
 
 
+def version(distribution: str) -> str:
+    """The version of an installed distribution."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return ABSENT
+
+
 @functools.cache
 def _distributions() -> dict[str, list[importlib.metadata.Distribution]]:
     """Distributions by top-level module; of one that is installed twice, both, the one that is imported first.

@@ -50,12 +50,12 @@ def test_of_distributions_that_hold_the_same_module_all_are_told(installed):
 def test_of_a_distribution_that_is_installed_twice_the_one_that_is_imported_counts(installed):
     installed("pictures", "1.0", "pix")
     installed("pictures", "2.0", "pix")
-    assert distributions.versions_of("pix") == {"pictures": "2.0"}
-    assert importlib.metadata.version("pictures") == "2.0"
+    assert distributions.versions_of("pix") == {"pictures": "2.0"} == {"pictures": distributions.version("pictures")}
 
 
 def test_a_module_of_no_distribution_is_absent_under_its_own_name():
     assert distributions.versions_of("no_such_module") == {"no_such_module": "absent"}
+    assert distributions.version("no-such-distribution") == "absent"
 
 
 def test_the_version_of_an_editable_installation_tells_of_no_edit(installed):
