@@ -91,7 +91,7 @@ def _motion(poses: Float64) -> Float64:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    header, *lines = csv.reader(read_text(path).splitlines(), skipinitialspace=True)
+    header, *lines = [*csv.reader(read_text(path).splitlines(), skipinitialspace=True)] or [[]]
     columns = [name.strip() for name in header]
     lacking = [key for key in ("frame", *_PLACE, *_TURN) if key not in columns]
     if lacking:
