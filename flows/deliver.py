@@ -49,8 +49,8 @@ UNCOMPARED = (
     "were on this machine."
 )
 LYING = (
-    "By their poses the photos lie on their side, so networks see them turned upright; masks and all else stay as the "
-    "photos are. capture.turns=0 leaves them as they are, capture.turns=2 is for a camera that hung upside down."
+    "By their poses the photos lie on their side, so networks and the report see them turned upright; the files stay as "
+    "the photos are. capture.turns=0 leaves them as they are, capture.turns=2 is for a camera that hung upside down."
 )
 FALLBACKS = {
     "segmenter": "colour, depth and normals (no network)",

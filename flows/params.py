@@ -61,8 +61,8 @@ class CaptureParams:
     not fit the given ones, and uses what it finds where photos then fit better and measured depth no worse."""
     turns: QuarterTurns | None = None
     """Quarter turns, counterclockwise, by which the segmenter and the encoder see the photos turned, since they know
-    things as they stand; none = photos that lie on their side by the given poses stand upright. Nothing else is
-    turned."""
+    things as they stand, and the report shows them; none = photos that lie on their side by the given poses stand
+    upright. Masks stay as the photos are."""
     monodepth: str = "auto"
     """The network for depth=mono: a name of the catalogue, or "auto"."""
     ingest: IngestParams = field(default_factory=IngestParams)

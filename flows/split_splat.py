@@ -94,9 +94,15 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
             perception=networks.perception,
         )
     results["report_pictures"] = report_pictures(
-        capture.frames, capture.cameras, capture.depths, masks_split, results["masks"], results["scene"]
+        capture.frames,
+        capture.cameras,
+        capture.depths,
+        masks_split,
+        results["masks"],
+        results["scene"],
+        turns=capture.turns,
     )
-    results["thumbnails"] = thumbnails(capture.frames, results["masks"])
+    results["thumbnails"] = thumbnails(capture.frames, results["masks"], turns=capture.turns)
     if networks.patches is not None:
         results["dense_descriptors"] = dense_descriptors(results["scene"], capture.cameras, networks.patches, params)
     results["names"] = name(results["describe"], encoder=networks.encoder)

@@ -26,23 +26,29 @@ def report_pictures(
     split_maps: Sequence[LabelMap],
     maps: Sequence[LabelMap],
     scene: Gaussians,
+    *,
+    turns: int = 0,
 ) -> tuple[Picture, ...]:
     """Draw three views, each as "VIEW/photo", "VIEW/masks_split", "VIEW/masks", "VIEW/render" and "VIEW/depth, WHAT IT
     MEANS", then "Instances", the Gaussians in the colours of their instances, and "Cameras".
 
-    All lists are in the order of the frames. An empty scene has no renderings.
+    All lists are in the order of the frames. An empty scene has no renderings. turns: by how many quarters,
+    counterclockwise, views are turned to stand upright.
     """
+
+    def of_view(k: int) -> Iterator[tuple[str, UInt8]]:
+        frame = frames[k]
+        yield f"{frame.name}/photo", draw(frame)
+        yield f"{frame.name}/masks_split", draw(split_maps[k], frame=frame)
+        yield f"{frame.name}/masks", draw(maps[k], frame=frame)
+        if len(scene):
+            yield f"{frame.name}/render", draw(scene, cameras=cameras, view=k)
+        picture, note = _depth(depths[k], "m" if cameras.metric else "units")
+        yield f"{frame.name}/depth, {note}", picture
 
     def drawn() -> Iterator[tuple[str, UInt8]]:
         for k in sorted({int(k) for k in (np.arange(_SHOWN) + 0.5) * len(frames) / _SHOWN}):
-            frame = frames[k]
-            yield f"{frame.name}/photo", draw(frame)
-            yield f"{frame.name}/masks_split", draw(split_maps[k], frame=frame)
-            yield f"{frame.name}/masks", draw(maps[k], frame=frame)
-            if len(scene):
-                yield f"{frame.name}/render", draw(scene, cameras=cameras, view=k)
-            picture, note = _depth(depths[k], "m" if cameras.metric else "units")
-            yield f"{frame.name}/depth, {note}", picture
+            yield from ((name, np.rot90(picture, turns)) for name, picture in of_view(k))
         if len(scene):
             colors = instance_colors(int(scene.instance_id.max()) + 1)[scene.instance_id]
             spacing = 2 * float(np.exp(np.median(scene.log_scales)))

@@ -20,10 +20,11 @@ _DIMMED = 0.3
 
 
 @task()
-def thumbnails(frames: Sequence[Frame], maps: Sequence[LabelMap]) -> tuple[Thumbnail, ...]:
+def thumbnails(frames: Sequence[Frame], maps: Sequence[LabelMap], *, turns: int = 0) -> tuple[Thumbnail, ...]:
     """A square picture [128, 128, 3] of each instance that a view shows, its surroundings faded; by rising id.
 
-    frames, maps: of all views, in one order. Each photo is decoded once.
+    frames, maps: of all views, in one order. Each photo is decoded once. turns: by how many quarters, counterclockwise,
+    pictures are turned to stand upright.
     """
     filled: dict[int, int] = {}
     best: dict[int, tuple[int, int]] = {}
@@ -42,7 +43,7 @@ def thumbnails(frames: Sequence[Frame], maps: Sequence[LabelMap]) -> tuple[Thumb
     for view, instances in shown.items():
         photo, ids = decode_rgb(frames[view]), maps[view].ids
         for instance in instances:
-            picture = compressed(_cut_out(photo, ids == instance))
+            picture = compressed(np.rot90(_cut_out(photo, ids == instance), turns))
             found.append(Thumbnail(instance, filled[instance] / pixels_of_all, picture))
     return tuple(sorted(found, key=lambda one: one.instance_id))
 

@@ -134,6 +134,11 @@ def test_three_views_spread_over_the_capture_are_drawn():
     few = report_pictures(frames[:2], cameras, depths[:2], maps[:2], maps[:2], nothing)
     assert [one.name for one in few if one.name.endswith("photo")] == ["v0/photo", "v1/photo"]
     assert decompressed(pictures[0].content).shape == (h, w, 3)
+    lying = report_pictures(frames, cameras, depths, maps, maps, nothing, turns=3)
+    for one, turned in zip(pictures[:12], lying, strict=False):
+        whole = np.rot90(decompressed(one.content), 3).astype(int)
+        assert one.name == turned.name and np.abs(decompressed(turned.content) - whole).mean() < 8
+    assert lying[12].content.tobytes() == pictures[12].content.tobytes(), "the cameras stand as they are"
 
 
 def test_what_the_colours_of_a_depth_map_mean_stands_in_its_caption():

@@ -38,6 +38,8 @@ def test_beyond_the_photos_border_a_picture_is_white() -> None:
     picture = decompressed(thumbnails(*_views())[1].content)
     assert picture[-2:].min() > 250 and picture[:, -2:].min() > 250
     assert np.abs(picture[64, 64].astype(int) - COLORS[0]).max() <= 2
+    turned = decompressed(thumbnails(*_views(), turns=1)[1].content)
+    assert turned[:2].min() > 250 and turned[:, -2:].min() > 250 and turned[-2:, 64].min() < 250
 
 
 def test_an_instances_share_is_of_all_pixels_of_all_views() -> None:
