@@ -49,7 +49,7 @@ UNCOMPARED = (
     "were on this machine."
 )
 LYING = (
-    "By their poses the photos lie on their side, so networks and the report see them turned upright; the files stay as "
+    "By their poses the photos lie on their side, so networks and the report see them turned upright; masks stay as "
     "the photos are. capture.turns=0 leaves them as they are, capture.turns=2 is for a camera that hung upside down."
 )
 FALLBACKS = {
