@@ -88,12 +88,13 @@ def lying(upright: Path) -> Path:
         return folder
     shutil.copytree(upright, folder)
     for file in (*folder.rglob("*.jpg"), *folder.rglob("*.png")):
-        cv2.imwrite(str(file), np.ascontiguousarray(np.rot90(_ids(file), -1)), [cv2.IMWRITE_JPEG_QUALITY, 98])
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if file.suffix == ".jpg" else []
+        cv2.imwrite(str(file), np.ascontiguousarray(np.rot90(_ids(file), -1)), quality)
     for file in folder.glob("pose/*.txt"):
         pose = np.loadtxt(file)
         pose[:3, :2] = np.column_stack([-pose[:3, 1], pose[:3, 0]])
         np.savetxt(file, pose)
-    for file in folder.glob("intrinsic/*.txt"):
+    for file in folder.glob("intrinsic/intrinsic_*.txt"):
         matrix = np.loadtxt(file)
         (fx, _, cx), (_, fy, cy) = matrix[:2, :3]
         width = _ids(next((folder / file.stem.removeprefix("intrinsic_")).iterdir())).shape[1]
