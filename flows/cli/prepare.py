@@ -141,8 +141,8 @@ def prepare(
     Raises InputError when a network cannot be used.
     """
     if scene.kind == "stray":
-        taken = params.capture.video.every(params.capture.stride)
-        scene = steadiest(scene, taken.stride, taken.max_frames)
+        taken = params.capture.video
+        scene = steadiest(scene, taken.stride, taken.max_frames, params.capture.stride)
     else:
         scene = scene.every(params.capture.stride)
     params = replace(params, capture=turned(scene, params.capture))

@@ -65,13 +65,13 @@ def open_stray(root: Path) -> SceneFiles:
     )
 
 
-def steadiest(scene: SceneFiles, stride: int, max_frames: int) -> SceneFiles:
+def steadiest(scene: SceneFiles, stride: int, max_frames: int, every: int = 1) -> SceneFiles:
     """One frame out of each `stride` of a recording, or of more where that gives above `max_frames`: the one before and
-    after which the phone moved least, and so the sharpest."""
+    after which the phone moved least, and so the sharpest. every: so many times fewer frames."""
     poses = scene.world_to_camera
     assert poses is not None
     count = len(poses)
-    stride = max(stride, -(-count // max_frames))
+    stride = every * max(stride, -(-count // max_frames))
     motion = _motion(poses)
     chosen = [start + int(np.argmin(motion[start : start + stride])) for start in range(0, count, stride)]
     told = {*(scene.names[i] for i in chosen), *scene.skipped}

@@ -189,6 +189,7 @@ def test_of_each_stretch_of_a_recording_the_frame_is_taken_at_which_the_phone_mo
     assert [file.stem for file in chosen.depths] == ["000003", "000007"]
     assert len(steadiest(scene, 0, 3).names) == 3  # four frames each, and what is left
     assert steadiest(scene, 1, 120).names == scene.names
+    assert len(steadiest(scene, 0, 120, every=5).names) == 2 and len(steadiest(scene, 0, 5, every=2).names) == 3
 
 
 def test_a_turn_on_the_spot_counts_as_motion_too(tmp_path):
