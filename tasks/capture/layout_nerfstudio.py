@@ -14,6 +14,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_files import header_size
 from ss_flow.tasks.capture.scene_files import (
+    OPENGL_TO_OPENCV,
     Pose,
     SceneFiles,
     check_lens,
@@ -24,7 +25,6 @@ from ss_flow.tasks.capture.scene_files import (
 )
 from ss_flow.tasks.geometry.cameras import Camera
 
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 """Those that a photo's name may leave out, as in NeRF's synthetic scenes."""
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
@@ -95,7 +95,7 @@ def transforms_document(cameras: Sequence[Camera], files: Sequence[str]) -> dict
     """The content of a `transforms.json` of pinhole cameras; files: the photo of each, relative to it."""
     frames = []
     for camera, file in zip(cameras, files, strict=True):
-        matrix = np.linalg.inv(camera.world_to_camera) @ _OPENGL_TO_OPENCV
+        matrix = np.linalg.inv(camera.world_to_camera) @ OPENGL_TO_OPENCV
         lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
         size = {"w": camera.width, "h": camera.height}
         frames.append({"file_path": file, **size, **lens, "transform_matrix": matrix.tolist()})
@@ -111,7 +111,7 @@ def _pose(frame: dict[str, Any], path: Path) -> Pose:
     if matrix.shape != (4, 4):
         raise InputError(f"{where} has a transform_matrix of shape {matrix.shape}; a 4x4 matrix is expected.")
     with np.errstate(invalid="ignore"):  # of an infinite number, which is refused next
-        matrix = matrix @ _OPENGL_TO_OPENCV
+        matrix = matrix @ OPENGL_TO_OPENCV
     return rigid_inverse(matrix, where)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import (
+    OPENGL_TO_OPENCV,
     Pose,
     SceneFiles,
     by_stem,
@@ -22,7 +23,6 @@ from ss_flow.tasks.capture.scene_files import (
 from ss_flow.tasks.capture.upright import upright
 
 _JSON = frozenset({".json"})
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def is_polycam(root: Path) -> bool:
@@ -59,6 +59,7 @@ def open_polycam(root: Path) -> SceneFiles:
             f"{keyframes} holds no view with a camera in {prefix}cameras/ and a photo in {prefix}images/"
             f"{' and a depth map in depth/' if depths else ''}, all of one name; export the raw data again."
         )
+    used = set(whole)
     read = [_camera(cameras[name]) for name in whole]
     lenses, poses = upright([lens for lens, _ in read], [pose for _, pose in read])
     return SceneFiles(
@@ -72,7 +73,7 @@ def open_polycam(root: Path) -> SceneFiles:
         lenses=lenses,
         poses=poses,
         metric=True,
-        skipped=tuple(name for name in names if name not in set(whole)),
+        skipped=tuple(name for name in names if name not in used),
         all_names=tuple(names),
     )
 
@@ -87,4 +88,4 @@ def _camera(path: Path) -> tuple[Lens, Pose]:
     camera_to_world = np.array([[values[key] for key in row] for row in entries] + [[0, 0, 0, 1]], np.float64)
     fx, fy, cx, cy = (float(values[key]) for key in needed[2:6])
     lens = check_lens(Lens(int(values["width"]), int(values["height"]), fx, fy, cx, cy), str(path))
-    return lens, rigid_inverse(camera_to_world @ _OPENGL_TO_OPENCV, str(path))
+    return lens, rigid_inverse(camera_to_world @ OPENGL_TO_OPENCV, str(path))

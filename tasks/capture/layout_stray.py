@@ -45,6 +45,7 @@ def open_stray(root: Path) -> SceneFiles:
     kept = [i for i, stem in enumerate(stems) if i < length and (stem in depths or not depths)]
     if not kept:
         raise InputError(f"{root / 'depth'} holds no depth map of a frame that {track.name} lists; 000000.png is one.")
+    used = set(kept)
     lenses, poses = upright(
         [_lens(rows[i], common, size, track) for i in kept],
         [_pose(rows[i], track) for i in kept],
@@ -60,7 +61,7 @@ def open_stray(root: Path) -> SceneFiles:
         lenses=lenses,
         poses=poses,
         metric=True,
-        skipped=tuple(name for i, name in enumerate(names) if i not in set(kept)),
+        skipped=tuple(name for i, name in enumerate(names) if i not in used),
         all_names=tuple(names),
     )
 

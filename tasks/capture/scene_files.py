@@ -35,6 +35,8 @@ Pose = tuple[float, ...]
 """World-to-camera, 16 numbers row by row (plain numbers, so that a step's key can hold it)."""
 NO_POSE: Pose = tuple(np.eye(4).ravel().tolist())
 """In the place of one that is yet to be found."""
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From behind, takes a camera-to-world matrix from OpenGL's axes of the camera to OpenCV's."""
 Point = tuple[float, float]
 
 

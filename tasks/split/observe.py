@@ -86,8 +86,9 @@ def observe(
         inside = inner[visibility.pixel[row]]
         whole[interior.whole] = inner[interior.pixels] = False
         standing = np.where(inside, INSIDE, BORDER).astype(np.uint8)
-        places = points.points[visibility.point_index[row[inside]]]
-        standing[inside] = np.where(params.clusters.kept(places, points.spacing), INSIDE, STRAY)
+        if params.clusters.eps:  # else all are kept, and each mask's points need not be looked up
+            places = points.points[visibility.point_index[row[inside]]]
+            standing[inside] = np.where(params.clusters.kept(places, points.spacing), INSIDE, STRAY)
         mask.append(interior.mask)
         rows.append(row)
         standings.append(standing)
