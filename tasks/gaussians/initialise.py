@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Float32, Float64, Gaussians, Int32, UInt8
 from ss_flow.tasks.geometry.shape import box_diagonal
+
+G = TypeVar("G", bound=Gaussians)
 
 SH_ZERO = 0.28209479177387814
 """The constant basis function, sqrt(1 / (4 pi))."""
@@ -97,26 +100,24 @@ def laid_flat(gaussians: Gaussians, thickness: float) -> Gaussians:
     return replace(gaussians, quaternions=turn.astype(np.float32), log_scales=flat)
 
 
-def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+def with_sh_degree(gaussians: G, degree: int) -> G:
     """The same Gaussians with room for (at least) a degree: missing coefficients are 0."""
     missing = (degree + 1) ** 2 - gaussians.sh.shape[1]
     if missing <= 0:
         return gaussians
-    arrays = {f.name: getattr(gaussians, f.name) for f in fields(Gaussians)}
-    arrays["sh"] = np.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0)))
-    return Gaussians(**arrays)
+    return replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0))))
 
 
-def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+def concatenate(parts: Sequence[G]) -> G:
     """All rows of several sets, one after the other; lower SH degrees are filled with 0. Needs at least one set."""
     degree = round(max(p.sh.shape[1] for p in parts) ** 0.5) - 1
     same = [with_sh_degree(p, degree) for p in parts]
-    return Gaussians(**{f.name: np.concatenate([getattr(p, f.name) for p in same]) for f in fields(Gaussians)})
+    return replace(same[0], **{f.name: np.concatenate([getattr(p, f.name) for p in same]) for f in fields(same[0])})
 
 
-def select(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.integer]) -> Gaussians:
+def select(gaussians: G, rows: NDArray[np.bool_] | NDArray[np.integer]) -> G:
     """Some rows, by mask or by index."""
-    return Gaussians(**{f.name: getattr(gaussians, f.name)[rows] for f in fields(Gaussians)})
+    return replace(gaussians, **{f.name: getattr(gaussians, f.name)[rows] for f in fields(gaussians)})
 
 
 def extents(gaussians: Gaussians) -> Float32:

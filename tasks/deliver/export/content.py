@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, Gaussians, Int32, UInt8
-from ss_flow.tasks.gaussians.initialise import SH_ZERO
+from ss_flow.tasks.gaussians.initialise import SH_ZERO, select
 from ss_flow.tasks.geometry.cameras import up_of
 
 
@@ -29,8 +29,7 @@ class FileContent:
 @task(name="deliver.export.chosen")
 def chosen(scene: Gaussians, *, instances: tuple[int, ...]) -> Gaussians:
     """The Gaussians of some instances, in the scene's order; of an edited scene with what says which fill holes."""
-    own = np.isin(scene.instance_id, instances)
-    return replace(scene, **{f.name: getattr(scene, f.name)[own] for f in fields(scene)})
+    return select(scene, np.isin(scene.instance_id, instances))
 
 
 def degree_of(gaussians: Gaussians) -> int:
