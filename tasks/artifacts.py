@@ -444,11 +444,7 @@ class Appearances(ViewLists):
     """Which views show which instances: what the steps for one instance depend on."""
 
     instance_id: Int32
-    """[I] ascending."""
-    first: Int32
-    """[I + 1] where the views of each instance begin in `view`."""
-    view: Int32
-    """[A] rows of the scene's views, ascending for each instance."""
+    """[I] ascending, of the rows."""
 
     def of(self, ids: Int32) -> list[int]:
         """The views that show any of these instances, ascending."""

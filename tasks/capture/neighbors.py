@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64
 from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view
 from ss_flow.tasks.geometry.plane_sweep import typical_depth, view_scores
 from ss_flow.tasks.packed import ViewLists
@@ -31,12 +31,8 @@ class NeighborParams:
 
 @dataclass(frozen=True)
 class Neighbors(ViewLists):
-    """Each view's neighbours, and the depths between which it is swept."""
+    """Each view's neighbours, and the depths between which it is swept; a row a view."""
 
-    first: Int32
-    """[K + 1] where the neighbours of each view begin in `view`."""
-    view: Int32
-    """[A] places of views in the scene's order, ascending for each view."""
     span: Float64
     """[K, 2] the nearest and the farthest depth, world units; NaN where it must be found by a sweep."""
 
