@@ -18,7 +18,7 @@ from ss_flow.tasks.capture.layout_colmap import read_points
 from ss_flow.tasks.capture.lens import Lens, without_distortion
 from ss_flow.tasks.capture.photo_files import Photo, Pixels, pixels_of, read_gray, read_photo
 from ss_flow.tasks.capture.scene_files import Pose
-from ss_flow.tasks.geometry.images import averaged_valid, encode_png
+from ss_flow.tasks.geometry.images import averaged_valid, encode_valid, size_within
 from ss_flow.tasks.ranges import Count, JpegQuality
 from ss_flow.tasks.words import first_of
 
@@ -120,21 +120,19 @@ def frame_of(
     distorted = lens is not None and not lens.pinhole
     if lens is not None and distorted:
         image, keep = without_distortion(image, keep, lens.scaled(width, height))
-    scale = min(1.0, params.max_side / max(width, height))
-    w, h = (max(1, round(width * scale)), max(1, round(height * scale)))
-    if scale < 1:
+    w, h = size_within(params.max_side, width, height)
+    if shrinks := (w, h) != (width, height):
         image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
         keep = averaged_valid(keep, w, h)
     # A photo that is to be read as it is stored must not tell other programs to turn it.
-    if photo.orientation != 1 or turn or distorted or scale < 1 or photo.format not in ("jpeg", "png"):
+    if photo.orientation != 1 or turn or distorted or shrinks or photo.format not in ("jpeg", "png"):
         if params.jpeg_quality:
             encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
         else:
             encoded = cv2.imencode(".png", image)[1].ravel()
     else:
         encoded = np.frombuffer(photo.data, np.uint8)
-    packed = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
-    return Frame(name, w, h, encoded, packed, width, height, photo.focal)
+    return Frame(name, w, h, encoded, encode_valid(keep), width, height, photo.focal)
 
 
 def black_border(image: UInt8) -> Bool:

@@ -19,6 +19,7 @@ from ss_flow.tasks.capture.layout_scannet import read_sens_index
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_files import Photo, Pixels, inspect, pixels_of
 from ss_flow.tasks.capture.sensor_depth import in_world_units, registered_depth
+from ss_flow.tasks.geometry.images import size_within
 from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
 _WHOLE = 0.9
@@ -142,9 +143,8 @@ def _encode(image: UInt8, index: int, aspect: float, params: VideoParams) -> Fra
     height, width = image.shape[0], max(1, round(image.shape[1] * aspect))
     if width != image.shape[1]:  # a lens with one focal length needs square pixels
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
-    scale = min(1.0, params.max_side / max(width, height))
-    w, h = max(1, round(width * scale)), max(1, round(height * scale))
-    if scale < 1:
+    w, h = size_within(params.max_side, width, height)
+    if (w, h) != (width, height):
         image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
     encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
     return Frame(f"frame-{index:06d}", w, h, encoded, np.zeros(0, np.uint8), width, height)

@@ -22,7 +22,7 @@ from ss_flow.tasks.capture.matches import FIRST_FOCAL, Matches
 from ss_flow.tasks.capture.pairs import Look, PairParams
 from ss_flow.tasks.capture.pose_fit import matches_that_fit
 from ss_flow.tasks.capture.turning import refuse_turning
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png, encode_valid
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Positive
 
 _BENT = 0.1
@@ -212,8 +212,7 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
         frame = frame_of[name]
         if not (lens := found_lens(cameras, i)).pinhole:
             image, keep = without_distortion(decode_rgb(frame), decode_valid(frame), lens)
-            valid = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
-            frame = replace(frame, encoded=encode_png(image), valid=valid)
+            frame = replace(frame, encoded=encode_png(image), valid=encode_valid(keep))
         result.append(frame)
         progress(i + 1, len(cameras), name)
     return tuple(result)
