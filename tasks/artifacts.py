@@ -377,6 +377,11 @@ class Gaussians:
         return len(self.means)
 
     @property
+    def sh_degree(self) -> int:
+        """Of the spherical harmonics."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
     def opacities(self) -> Float64:
         """[N] 0..1."""
         return 1 / (1 + np.exp(-self.opacity_logits.astype(np.float64)))

@@ -110,7 +110,7 @@ def with_sh_degree(gaussians: G, degree: int) -> G:
 
 def concatenate(parts: Sequence[G]) -> G:
     """All rows of several sets, one after the other; lower SH degrees are filled with 0. Needs at least one set."""
-    degree = round(max(p.sh.shape[1] for p in parts) ** 0.5) - 1
+    degree = max(p.sh_degree for p in parts)
     same = [with_sh_degree(p, degree) for p in parts]
     return replace(same[0], **{f.name: np.concatenate([getattr(p, f.name) for p in same]) for f in fields(same[0])})
 
