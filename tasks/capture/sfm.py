@@ -60,9 +60,9 @@ class SfmParams:
 
     features: FeatureParams = field(default_factory=FeatureParams)
     pairs: PairParams = field(default_factory=PairParams)
-    guided_matching: Literal["never", "missing", "always"] = "missing"
-    """Whether photos are matched a second time along the epipolar lines that the first match gave: "missing" - only
-    photos that find no pose without, and these with twice as many partners."""
+    guided_matching: Literal["never", "missing"] = "missing"
+    """Whether photos are matched a second time along the epipolar lines that the first match gave: "missing" - those
+    that find no pose without, and with twice as many partners."""
     mapping: MappingParams = field(default_factory=MappingParams)
     min_registered: Fraction = 0.5
     """The share of photos that must find their pose; below it the step fails."""
