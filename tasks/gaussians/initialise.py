@@ -38,7 +38,6 @@ def initialise(
     confidence: float | Float32,
     part_id: int | Int32 = 0,
     *,
-    sh_degree: int = 0,
     opacity: float = 0.1,
 ) -> Gaussians:
     """Round Gaussians at points (spec P1).
@@ -55,14 +54,12 @@ def initialise(
         spread = neighbour_spread(points)
         # Coincident points would give a scale of 0, a logarithm without end.
         spread = np.maximum(spread, 1e-3 * max(float(np.median(spread)), 1e-6))
-    sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (colors / 255.0 - 0.5) / SH_ZERO
     return Gaussians(
         means=np.ascontiguousarray(points, np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         log_scales=np.repeat(np.log(spread).astype(np.float32)[:, None], 3, axis=1),
         opacity_logits=np.full(n, np.log(opacity / (1 - opacity)), np.float32),
-        sh=sh,
+        sh=((colors / 255.0 - 0.5) / SH_ZERO).astype(np.float32)[:, None],
         instance_id=np.broadcast_to(np.asarray(instance_id, np.int32), (n,)).copy(),
         instance_conf=np.broadcast_to(np.asarray(confidence, np.float32), (n,)).copy(),
         part_id=np.broadcast_to(np.asarray(part_id, np.int32), (n,)).copy(),
