@@ -24,15 +24,12 @@ def poses(frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] |
     first = sfm(found, matches, gather([]), params=params.mapping)
     missing = unregistered(looks, first)
 
-    # Guided matches fit wrong poses too: they tell nothing.
-    telling = gather([]) if params.guided_matching == "always" else matches
-
     def complete(left: Unregistered) -> Cameras:
         tries = [first]
         if len(left.row) and params.guided_matching == "missing":
             again = gather([rematched(found, looks, row, left.total, params) for row in left.row.tolist()])
             tries.append(sfm(found, matches, again, params=params.mapping))
-        return accepted(gather(tries), missing, found, telling, min_registered=params.min_registered)
+        return accepted(gather(tries), missing, found, matches, min_registered=params.min_registered)
 
     return expand(missing, complete)
 
@@ -116,8 +113,7 @@ def matched(
 
     def of_photo(photo: Features, row: int) -> Matches:
         chosen = partners(looks[row], pick(looks, range(row)), place=row, params=params.pairs)
-        guided = params.guided_matching == "always"
-        return expand(chosen, lambda plan: match(photo, pick(found, plan.row.tolist()), guided=guided))
+        return expand(chosen, lambda plan: match(photo, pick(found, plan.row.tolist())))
 
     return each(found, INDEX, names=names, build=of_photo)
 

@@ -377,6 +377,11 @@ class Gaussians:
         return len(self.means)
 
     @property
+    def sh_degree(self) -> int:
+        """Of the spherical harmonics."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
     def opacities(self) -> Float64:
         """[N] 0..1."""
         return 1 / (1 + np.exp(-self.opacity_logits.astype(np.float64)))
@@ -444,11 +449,7 @@ class Appearances(ViewLists):
     """Which views show which instances: what the steps for one instance depend on."""
 
     instance_id: Int32
-    """[I] ascending."""
-    first: Int32
-    """[I + 1] where the views of each instance begin in `view`."""
-    view: Int32
-    """[A] rows of the scene's views, ascending for each instance."""
+    """[I] ascending, of the rows."""
 
     def of(self, ids: Int32) -> list[int]:
         """The views that show any of these instances, ascending."""

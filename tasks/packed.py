@@ -114,6 +114,7 @@ def bounds(mask: Bool) -> tuple[int, int, int, int]:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
+@dataclass(frozen=True)
 class ViewLists:
     """Some of a scene's views for each row, one list after the other."""
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ss_flow.flows.view.session import Piece
 from ss_flow.tasks.artifacts import EditedScene, Float64
-from ss_flow.tasks.edit.operations import joined, some_rows
+from ss_flow.tasks.gaussians.initialise import concatenate, select
 from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera
@@ -26,7 +26,7 @@ class Picker:
     def __init__(self, pieces: Mapping[int, Piece]) -> None:
         """pieces: those that are shown."""
         shown = [piece.gaussians for piece in pieces.values()]
-        self._scene: EditedScene | None = joined(shown) if shown else None
+        self._scene: EditedScene | None = concatenate(shown) if shown else None
         self._sigma = np.exp(self._scene.log_scales.max(axis=1)) if self._scene is not None else np.zeros(0)
 
     def met(self, pixel: Camera) -> tuple[int, Float64] | None:
@@ -37,7 +37,7 @@ class Picker:
         """
         if self._scene is None:
             return None
-        near = some_rows(self._scene, self._rows_near(pixel))
+        near = select(self._scene, self._rows_near(pixel))
         row = int(render(near, pixel).top_contributor[0, 0])
         if row < 0:
             return None

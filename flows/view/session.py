@@ -17,7 +17,8 @@ from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check
 from ss_flow.flows.results import BACKGROUND
 from ss_flow.tasks.artifacts import Cameras, EditedScene, Float64, Gaussians
-from ss_flow.tasks.edit.operations import edited, joined, some_rows
+from ss_flow.tasks.edit.operations import edited
+from ss_flow.tasks.gaussians.initialise import concatenate, select
 from ss_flow.tasks.geometry.clustering import rows_by_label
 
 Operation = Mapping[str, Any]
@@ -71,7 +72,7 @@ class Session:
         """
         whole = edited(scene, filled=0)
         pieces = {
-            instance: Piece(rows.astype(np.int64), some_rows(whole, rows))
+            instance: Piece(rows.astype(np.int64), select(whole, rows))
             for instance, rows in rows_by_label(scene.instance_id).items()
         }
         self._begun = Objects.of(instances, scene, cameras)
@@ -114,7 +115,7 @@ class Session:
     def scene(self) -> EditedScene:
         """All Gaussians, in the order in which `ss-flow edit` writes them."""
         pieces = list(self.state.pieces.values())
-        return some_rows(joined([p.gaussians for p in pieces]), np.argsort(np.concatenate([p.rows for p in pieces])))
+        return select(concatenate([p.gaussians for p in pieces]), np.argsort(np.concatenate([p.rows for p in pieces])))
 
     def select(self, instance: int | None, *, more: bool = False) -> None:
         """Select an instance, or nothing. more: besides those that are; one that is selected already is let go."""
@@ -176,7 +177,7 @@ def _applied(step: Step, ids: Sequence[int], state: State) -> tuple[dict[int, Pi
     next_row = state.next_row + len(after) - len(stay)
     rows = np.concatenate([stay, np.arange(state.next_row, next_row)])
     changed = {
-        instance: Piece(rows[own], some_rows(after, own)) for instance, own in rows_by_label(after.instance_id).items()
+        instance: Piece(rows[own], select(after, own)) for instance, own in rows_by_label(after.instance_id).items()
     }
     return others | changed, next_row
 
@@ -185,7 +186,7 @@ def _gathered(pieces: Sequence[Piece]) -> Piece:
     """Several pieces as one, in the order of the scene: sums over it come to the same bits."""
     rows = np.concatenate([piece.rows for piece in pieces])
     order = np.argsort(rows)
-    return Piece(rows[order], some_rows(joined([piece.gaussians for piece in pieces]), order))
+    return Piece(rows[order], select(concatenate([piece.gaussians for piece in pieces]), order))
 
 
 def _named(operation: Operation, objects: Objects) -> list[int]:

@@ -17,6 +17,7 @@ from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, CaptureChecks, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.capture.misfits import CheckParams, coarse, told
+from ss_flow.tasks.capture.scene_files import OPENGL_TO_OPENCV
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, size_within
 
@@ -44,8 +45,6 @@ _FAR_PAIRS = 40
 _TIED = 1 / 3
 """Weight of an exposure of 1 against a factor between neighbours: errors of many factors must not add up over a walk.
 Slow changes are told as less than they are."""
-_OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Between a camera's axes in OpenGL and in OpenCV."""
 _MIRRORS = [np.diag(signs) for signs in ([1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, 1.0])]
 """Along y, z and x of the camera and of the world."""
 _FLAT, _TEXTURED = 1, 8
@@ -113,7 +112,7 @@ def _exchanged(views: Sequence[_View], cameras: Cameras, params: CheckParams) ->
     inverted = "the poses are inverted: camera-to-world and world-to-camera are exchanged"
     turned = "y and z of the cameras are turned: OpenGL's axes and OpenCV's are exchanged"
     mirrored = "the poses are mirrored: they are those of a left-handed world, as Unity's is"
-    tried = [(inverse, inverted), (_OTHER_AXES @ inverse, inverted), (_OTHER_AXES @ given, turned)]
+    tried = [(inverse, inverted), (OPENGL_TO_OPENCV @ inverse, inverted), (OPENGL_TO_OPENCV @ given, turned)]
     tried += [(mirror @ given @ mirror, mirrored) for mirror in _MIRRORS]
     for meant, words in tried:
         moved = [replace(v, camera=replace(v.camera, world_to_camera=m)) for v, m in zip(views, meant, strict=True)]

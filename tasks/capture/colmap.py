@@ -11,6 +11,9 @@ from types import ModuleType
 
 from ss_flow.errors import InputError
 
+SEED = 0
+"""Of whatever the library draws by lot: two runs agree to the bit."""
+
 
 def has_pycolmap() -> bool:
     """Whether the library is installed; it is not loaded."""

@@ -106,8 +106,6 @@ def photo_maps(found: Observations, num_views: int, prior: float) -> Float64:
         gains = _gains(found, weight * np.square(color.mean(axis=1)), num_views, count)
         scene = _means(color / gains[view], point, weight, count)
         weight = _weights(color - gains[view] * scene[point])
-    if not prior:
-        return _affine(gains)
     first = maps = _affine(gains)
     pull = prior * (seen + _FEW)
     for _ in range(_ROUNDS):

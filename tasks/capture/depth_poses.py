@@ -12,7 +12,7 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Int32
-from ss_flow.tasks.capture.colmap import load_pycolmap
+from ss_flow.tasks.capture.colmap import SEED, load_pycolmap
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.matches import MAX_ERROR, Matches
 from ss_flow.tasks.capture.refine_poses import RefinePosesParams, Unrefinable, adjusted
@@ -37,7 +37,6 @@ def placed_by_depth(
     min_matches: int,
     min_registered: float,
     params: RefinePosesParams = RefinePosesParams(),
-    seed: int = 0,
 ) -> Cameras:
     """Cameras of the photos that find their place, in the photos' order, in the sensor's unit of length.
 
@@ -49,7 +48,7 @@ def placed_by_depth(
     fewer than 3, find theirs.
     """
     seen = [_Seen.of(*one) for one in zip(photos, depths, unposed.intrinsics, strict=True)]
-    poses = _placed(seen, matches, min_matches, seed)
+    poses = _placed(seen, matches, min_matches)
     if len(poses) < max(3, min_registered * len(seen)):
         raise InputError(
             f"only {len(poses)} of {len(seen)} frames found their place by what the depth sensor measured; frames that "
@@ -64,7 +63,7 @@ def placed_by_depth(
         world_to_camera=np.stack([poses[row] for row in rows]),
     )
     try:
-        return adjusted([seen[row].photo for row in rows], placed, matches, params, seed).cameras
+        return adjusted([seen[row].photo for row in rows], placed, matches, params).cameras
     except Unrefinable as error:
         warn(f"Poses stay as the depth sensor gave them, without an adjustment of all together: {error}.")
         return placed
@@ -97,7 +96,7 @@ class _Seen:
         """How many matches say where the photo was taken."""
         return sum(map(len, self.rows))
 
-    def pose(self, pycolmap: Any, min_matches: int, seed: int) -> Float64 | None:
+    def pose(self, pycolmap: Any, min_matches: int) -> Float64 | None:
         """[4, 4] world-to-camera; None where too few matches confirm one, or the photo's own depth contradicts."""
         rows, points = np.concatenate(self.rows), np.concatenate(self.points)
         size = {"width": self.photo.width, "height": self.photo.height}
@@ -105,7 +104,7 @@ class _Seen:
         options = pycolmap.AbsolutePoseEstimationOptions()
         options.ransac.max_error = MAX_ERROR
         options.ransac.max_num_trials = _TRIALS
-        options.ransac.random_seed = seed
+        options.ransac.random_seed = SEED
         pixels = self.photo.points[rows].astype(np.float64)
         found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, options)
         if found is None or found["num_inliers"] < min_matches:
@@ -131,7 +130,7 @@ def _depth_at(points: Float64, depth: Float32) -> Float64:
     return found
 
 
-def _placed(seen: list[_Seen], matches: Sequence[Matches], min_matches: int, seed: int) -> dict[int, Float64]:
+def _placed(seen: list[_Seen], matches: Sequence[Matches], min_matches: int) -> dict[int, Float64]:
     """[4, 4] world-to-camera of the photos that find a place, by their rows."""
     pycolmap = load_pycolmap()
     links = _links(seen, matches)
@@ -152,7 +151,7 @@ def _placed(seen: list[_Seen], matches: Sequence[Matches], min_matches: int, see
             if other not in poses and photo.known >= max(min_matches, refused.get(other, 0) + 1)
         ]  # fmt: skip
         row = max(open_rows, key=lambda other: seen[other].known, default=None)
-        pose = None if row is None else seen[row].pose(pycolmap, min_matches, seed)
+        pose = None if row is None else seen[row].pose(pycolmap, min_matches)
     return poses
 
 

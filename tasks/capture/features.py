@@ -9,7 +9,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Float32, Frame, UInt8
 from ss_flow.tasks.capture.colmap import load_pycolmap
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, size_within
 from ss_flow.tasks.ranges import Count, Positive
 
 UNIT = 512.0
@@ -51,9 +51,8 @@ def features(frame: Frame, *, params: FeatureParams = FeatureParams()) -> Featur
 
     pycolmap = load_pycolmap()
     gray = cv2.cvtColor(decode_rgb(frame), cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, params.max_image_side / max(frame.width, frame.height))
-    if scale < 1:
-        size = (max(1, round(frame.width * scale)), max(1, round(frame.height * scale)))
+    size = size_within(params.max_image_side, frame.width, frame.height)
+    if size != (frame.width, frame.height):
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False

@@ -18,13 +18,14 @@ from ss_flow.tasks.capture.layout_colmap import read_points
 from ss_flow.tasks.capture.lens import Lens, without_distortion
 from ss_flow.tasks.capture.photo_files import Photo, Pixels, pixels_of, read_gray, read_photo
 from ss_flow.tasks.capture.scene_files import Pose
-from ss_flow.tasks.geometry.images import averaged_valid, encode_png
+from ss_flow.tasks.geometry.images import averaged_valid, encode_valid, size_within
 from ss_flow.tasks.ranges import Count, JpegQuality
 from ss_flow.tasks.words import first_of
 
 _BLACK = 8
 """Of 255; JPEG makes black up to so bright beside a picture."""
-_UPRIGHT = {2: "flip", 3: "180", 4: "flip 180", 5: "flip 270", 6: "90", 7: "flip 90", 8: "270"}
+_UPRIGHT = {2: (True, 0), 3: (False, 2), 4: (True, 2), 5: (True, 1), 6: (False, 3), 7: (True, 3), 8: (False, 1)}
+"""By EXIF's orientation, whether a photo is to be mirrored, and by how many quarters turned then, counterclockwise."""
 
 
 @dataclass(frozen=True)
@@ -102,12 +103,10 @@ def frame_of(
 
     image = pixels.image
     stored = image.shape[1::-1]
-    turn = _UPRIGHT.get(photo.orientation, "")
-    if lens is not None and lens.turns:
-        turn = str(360 - 90 * lens.turns)
-    elif lens is not None and lens.width and stored == (lens.width, lens.height):
-        turn = ""
-    image = _turned(image, turn)
+    turn = _UPRIGHT.get(photo.orientation, (False, 0))
+    if lens is not None and (lens.turns or stored == (lens.width, lens.height)):
+        turn = (False, lens.turns)
+    image = _turned(image, *turn)
     height, width = image.shape[:2]
     if lens is not None and lens.width and (width, height) != (lens.width, lens.height):
         raise InputError(
@@ -116,25 +115,23 @@ def frame_of(
         )
     keep = np.ones((height, width), bool) if mask is None else _valid_mask(mask, width, height)
     if pixels.opaque is not None:
-        keep = keep & _turned(pixels.opaque, turn)
+        keep = keep & _turned(pixels.opaque, *turn)
     distorted = lens is not None and not lens.pinhole
     if lens is not None and distorted:
         image, keep = without_distortion(image, keep, lens.scaled(width, height))
-    scale = min(1.0, params.max_side / max(width, height))
-    w, h = (max(1, round(width * scale)), max(1, round(height * scale)))
-    if scale < 1:
+    w, h = size_within(params.max_side, width, height)
+    if shrinks := (w, h) != (width, height):
         image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
         keep = averaged_valid(keep, w, h)
     # A photo that is to be read as it is stored must not tell other programs to turn it.
-    if photo.orientation != 1 or turn or distorted or scale < 1 or photo.format not in ("jpeg", "png"):
+    if photo.orientation != 1 or any(turn) or distorted or shrinks or photo.format not in ("jpeg", "png"):
         if params.jpeg_quality:
             encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
         else:
             encoded = cv2.imencode(".png", image)[1].ravel()
     else:
         encoded = np.frombuffer(photo.data, np.uint8)
-    packed = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
-    return Frame(name, w, h, encoded, packed, width, height, photo.focal)
+    return Frame(name, w, h, encoded, encode_valid(keep), width, height, photo.focal)
 
 
 def black_border(image: UInt8) -> Bool:
@@ -150,11 +147,8 @@ def black_border(image: UInt8) -> Bool:
     return np.asarray(piece[1:-1, 1:-1] == piece[0, 0])
 
 
-def _turned(image: np.ndarray, turn: str) -> np.ndarray:
-    if "flip" in turn:
-        image = image[:, ::-1]
-    quarter_turns = {"90": 3, "180": 2, "270": 1}.get(turn.removeprefix("flip").strip(), 0)
-    return np.ascontiguousarray(np.rot90(image, quarter_turns)) if turn else image
+def _turned(image: np.ndarray, mirrored: bool, quarters: int) -> np.ndarray:
+    return np.ascontiguousarray(np.rot90(image[:, ::-1] if mirrored else image, quarters))
 
 
 def _valid_mask(ref: FileRef, width: int, height: int) -> Bool:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Float32
+from ss_flow.tasks.artifacts import Float32, Float64
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import (
     Pose,
@@ -235,29 +236,27 @@ def _views_text(path: Path) -> list[_View]:
     return views
 
 
-def _pose(values: tuple[float, ...] | list[float], path: Path, name: str) -> Pose:
-    matrix = np.eye(4)
+def _pose(values: Sequence[float], path: Path, name: str) -> Pose:
     where = f"{path} for {name}"
-    matrix[:3, :3] = rotation_of(np.array(values[:4]), where)
-    matrix[:3, 3] = values[4:]
-    return tuple(float(x) for x in check_rigid(matrix, where).ravel())
+    return tuple(check_rigid(pose_matrix(values[:4], values[4:], where), where).ravel().tolist())
 
 
-def rotation_of(quaternion: np.ndarray, where: str) -> np.ndarray:
-    """[3, 3] the rotation of a quaternion w x y z of any length but zero; where one is not finite, NaN.
+def pose_matrix(quaternion: Sequence[float], place: Sequence[float], where: str) -> Float64:
+    """[4, 4] a rotation, as a quaternion w x y z of any length but zero, and then a shift; where it is not finite, NaN.
 
     where: what to name in a message.
-    Raises InputError when its length is zero.
+    Raises InputError when the quaternion's length is zero.
     """
-    if not quaternion.any():
+    if not any(quaternion):
         raise InputError(f"the pose in {where} has a quaternion of length 0; a rotation has one of length 1.")
     with np.errstate(invalid="ignore"):
-        w, x, y, z = quaternion / np.linalg.norm(quaternion)
+        w, x, y, z = np.array(quaternion) / np.linalg.norm(quaternion)
     return np.array(
         [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), place[0]],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), place[1]],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), place[2]],
+            [0, 0, 0, 1],
         ]
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float64
-from ss_flow.tasks.capture.layout_colmap import rotation_of
+from ss_flow.tasks.capture.layout_colmap import pose_matrix
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, by_stem, check_lens, files_in, read_text, rigid_inverse
 from ss_flow.tasks.capture.upright import upright
@@ -116,10 +116,8 @@ def _number(row: dict[str, str], key: str, path: Path) -> float:
 
 def _pose(row: dict[str, str], path: Path) -> Pose:
     where = f"{path} for frame {row['frame']}"
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_of(np.array([_number(row, key, path) for key in _TURN]), where)
-    matrix[:3, 3] = [_number(row, key, path) for key in _PLACE]
-    return rigid_inverse(matrix, where)
+    turn, place = ([_number(row, key, path) for key in keys] for keys in (_TURN, _PLACE))
+    return rigid_inverse(pose_matrix(turn, place, where), where)
 
 
 def _lens(row: dict[str, str], common: tuple[float, ...] | None, size: tuple[int, int], path: Path) -> Lens:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from bisect import bisect_left
 from pathlib import Path
 
-import numpy as np
-
 from ss_flow.errors import InputError
-from ss_flow.tasks.capture.layout_colmap import rotation_of
+from ss_flow.tasks.capture.layout_colmap import pose_matrix
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.scene_files import SceneFiles, check_lens, read_text, rigid_inverse
 
@@ -90,10 +88,7 @@ def _pose(words: list[str], path: Path, photo: str) -> tuple[float, ...]:
             f"{path} has a line without `tx ty tz qx qy qz qw` after its time, the pose of {photo}."
         ) from error
     where = f"{path} for {photo}"
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_of(np.array([qw, qx, qy, qz]), where)
-    matrix[:3, 3] = x, y, z
-    return rigid_inverse(matrix, where)
+    return rigid_inverse(pose_matrix((qw, qx, qy, qz), (x, y, z), where), where)
 
 
 def _lens(root: Path) -> Lens:

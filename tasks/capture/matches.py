@@ -11,7 +11,7 @@ import numpy as np
 from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
-from ss_flow.tasks.capture.colmap import load_pycolmap
+from ss_flow.tasks.capture.colmap import SEED, load_pycolmap
 from ss_flow.tasks.capture.features import UNIT, Features
 
 Allowed = Callable[[slice], Bool]
@@ -52,14 +52,14 @@ class Matches:
 
 
 @task(name="capture.match")
-def match(photo: Features, others: Sequence[Features], *, guided: bool = False, seed: int = 0) -> Matches:
+def match(photo: Features, others: Sequence[Features], *, guided: bool = False) -> Matches:
     """Match a photo with others, and keep what RANSAC confirms.
 
     guided: match once more along the epipolar lines that the first matches give, where the ratio test has fewer rivals.
     """
     pycolmap = load_pycolmap()
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
+    options.ransac.random_seed = SEED
     options.ransac.max_num_trials = _TRIALS
     own = _Prepared(pycolmap, photo)
     found = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
 
@@ -13,11 +12,8 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame
 from ss_flow.tasks.geometry.alignment import fit_scale_shift
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, resampled
-from ss_flow.tasks.models.onnx import load_onnxruntime, network_identity, providers
+from ss_flow.tasks.models.onnx import imagenet_input, network_identity, open_session, run
 from ss_flow.tasks.ranges import Count, Fraction, Positive
-
-_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
-_DEVIATION = np.array((0.229, 0.224, 0.225), np.float32)
 
 
 @dataclass(frozen=True)
@@ -28,8 +24,6 @@ class MonoParams:
     """Longer side of the network's input, in pixels, unless the model fixes it."""
     multiple: Count = 14
     """Both sides of the input are multiples of this (a patch of the network)."""
-    predicts: Literal["inverse", "depth"] = "inverse"
-    """What the network's output grows with: "inverse" depth, or "depth"."""
     max_relative: Positive = 0.05
     """A known depth counts as met when it is off by no more than this share."""
     min_points: Count = 20
@@ -55,12 +49,10 @@ def mono(
 
     known: depth maps among which the view's own, if there is one, gives the scale (a sensor's, or a sweep's); otherwise
         the sparse points of structure from motion do.
-    model: ONNX; input [1, 3, h, w] RGB normalised as for ImageNet, output [1, h, w] or [1, 1, h, w].
+    model: ONNX; input [1, 3, h, w] (`imagenet_input`), output [1, h, w] or [1, 1, h, w] that grows with inverse depth.
     Raises InputError when the model has another form, or too little is known to fit the scale.
     """
     predicted = _predict(frame, model, params)
-    if params.predicts == "depth":
-        predicted = np.reciprocal(np.maximum(predicted, np.float32(1e-6)))
     relative, depth = _known_depths(frame, cameras, known, predicted, params)
     fit = fit_scale_shift(relative, 1 / depth, params.max_relative) if len(depth) >= params.min_points else None
     if fit is None or fit[2] < params.min_met:
@@ -82,14 +74,7 @@ def mono(
 def _predict(frame: Frame, model: FileRef, params: MonoParams) -> Float32:
     import cv2
 
-    onnxruntime = load_onnxruntime()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    try:
-        session: Any = onnxruntime.InferenceSession(str(model.path), options, providers=providers())
-    except Exception as error:  # onnxruntime has no public base class of its errors
-        raise InputError(f"{model.path} cannot be loaded as an ONNX model ({str(error).splitlines()[0]}).") from error
+    session = open_session(model)
     wanted = session.get_inputs()[0]
     if len(session.get_inputs()) != 1 or len(wanted.shape) != 4:
         raise InputError(f"{model.path} does not take one image [1, 3, h, w]; a monocular depth model is expected.")
@@ -100,8 +85,7 @@ def _predict(frame: Frame, model: FileRef, params: MonoParams) -> Float32:
     rgb = decode_rgb(frame)
     shrinks = width < frame.width
     resized = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-    tensor = ((resized.astype(np.float32) / 255 - _MEAN) / _DEVIATION).transpose(2, 0, 1)[None]
-    output = np.asarray(session.run(None, {wanted.name: np.ascontiguousarray(tensor)})[0], np.float32)
+    output = np.asarray(run(session, {wanted.name: imagenet_input(resized)})[0], np.float32)
     if output.ndim not in (3, 4) or output.size != output.shape[-1] * output.shape[-2]:
         raise InputError(
             f"{model.path} gives an output of shape {output.shape}; [1, h, w] is expected of a depth model."

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ss_flow.running import progress
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64
 from ss_flow.tasks.geometry.cameras import Camera, cameras_by_view, pixels_in_view
 from ss_flow.tasks.geometry.plane_sweep import typical_depth, view_scores
 from ss_flow.tasks.packed import ViewLists
@@ -31,12 +31,8 @@ class NeighborParams:
 
 @dataclass(frozen=True)
 class Neighbors(ViewLists):
-    """Each view's neighbours, and the depths between which it is swept."""
+    """Each view's neighbours, and the depths between which it is swept; a row a view."""
 
-    first: Int32
-    """[K + 1] where the neighbours of each view begin in `view`."""
-    view: Int32
-    """[A] places of views in the scene's order, ascending for each view."""
     span: Float64
     """[K, 2] the nearest and the farthest depth, world units; NaN where it must be found by a sweep."""
 
@@ -60,7 +56,7 @@ def neighbors(
     """
     by_view = cameras_by_view(cameras)
     guess = typical_depth(by_view)
-    spans = [_span(cameras, camera) for camera in by_view]
+    spans = [_widened(pixels_in_view(cameras.sparse_points, camera)[3], 0.98) for camera in by_view]
     chosen = []
     for view, span in enumerate(spans):
         progress(view, len(spans))
@@ -69,7 +65,7 @@ def neighbors(
         depths = [
             np.concatenate([measured[k].depth.ravel() for k in (view, *near)]) for view, near in enumerate(chosen)
         ]
-        spans = [_widened(depth[depth > 0], 0.01, 0.99) for depth in depths]
+        spans = [_widened(depth[depth > 0], 0.99) for depth in depths]
     known = np.array([(np.nan, np.nan) if span is None else span for span in spans], np.float64)
     return Neighbors(span=known.reshape(-1, 2), **Neighbors.arrays(chosen))
 
@@ -83,14 +79,10 @@ def _best(cameras: tuple[Camera, ...], view: int, depth: float, count: int) -> l
     return sorted(others[i] for i in np.argsort(-scores, kind="stable")[:count])
 
 
-def _span(cameras: Cameras, camera: Camera) -> tuple[float, float] | None:
-    *_, seen = pixels_in_view(cameras.sparse_points, camera)
-    return _widened(seen, 0.01, 0.98)
-
-
-def _widened(depth: NDArray[np.floating], low: float, high: float) -> tuple[float, float] | None:
-    """The span between two quantiles of known depths, made somewhat wider; None where there are hardly any."""
+def _widened(depth: NDArray[np.floating], high: float) -> tuple[float, float] | None:
+    """The span of known depths, from the lowest hundredth up to a quantile, made somewhat wider; None where there are
+    hardly any."""
     if len(depth) < _LEAST_POINTS:
         return None
-    near, far = np.quantile(depth, (low, high))
+    near, far = np.quantile(depth, (0.01, high))
     return float(near) * 0.8, float(far) * 1.25

@@ -86,7 +86,9 @@ def improved(
     held = [(quads(s.view.gray), s.view.valid.astype(np.uint8), _inverse(s.depth)) for s in sources]
     photos = (StereoPhoto * len(sources))(
         *(
-            StereoPhoto(*(array.ctypes.data for array in arrays), *_size(s.view), *_there_and_back(reference, s.view))
+            StereoPhoto(
+                *(array.ctypes.data for array in arrays), *s.view.gray.shape[::-1], *_there_and_back(reference, s.view)
+            )
             for arrays, s in zip(held, sources, strict=True)
         )
     )
@@ -117,10 +119,6 @@ def quads(gray: Float32) -> np.ndarray:
 def _inverse(depth: Float32) -> Float32:
     known = depth > 0
     return np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
-
-
-def _size(view: SweepView) -> tuple[int, int]:
-    return view.gray.shape[1], view.gray.shape[0]
 
 
 def _there_and_back(reference: SweepView, source: SweepView) -> list[ctypes.Array[ctypes.c_float]]:

@@ -23,6 +23,8 @@ from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
 _WHOLE = 0.9
 """The share of the announced frames below which a video is taken to be cut or damaged."""
+_OF_VIDEO = Photo(b"", "other", 0, 0, 1)
+"""What stands for the photo file of a video's frame."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class VideoParams:
     max_side: Count = 1600
     """Frames whose longer side is above this are scaled down to it, in pixels."""
     jpeg_quality: JpegQuality = 95
-    """Quality at which frames are encoded."""
+    """Quality at which frames are encoded; 0 keeps them lossless as PNG."""
 
     def every(self, stride: int) -> VideoParams:
         """Where only one frame out of so many of them is to be taken."""
@@ -142,12 +144,8 @@ def _encode(image: UInt8, index: int, aspect: float, params: VideoParams) -> Fra
     height, width = image.shape[0], max(1, round(image.shape[1] * aspect))
     if width != image.shape[1]:  # a lens with one focal length needs square pixels
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
-    scale = min(1.0, params.max_side / max(width, height))
-    w, h = max(1, round(width * scale)), max(1, round(height * scale))
-    if scale < 1:
-        image = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
-    encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, params.jpeg_quality])[1].ravel()
-    return Frame(f"frame-{index:06d}", w, h, encoded, np.zeros(0, np.uint8), width, height)
+    name, ingest = f"frame-{index:06d}", IngestParams(params.max_side, params.jpeg_quality)
+    return frame_of(name, _OF_VIDEO, Pixels(image, None, False), name, None, None, ingest)
 
 
 @task(name="capture.recorded_frames")
@@ -185,8 +183,7 @@ def recorded_frames(
             )
         if place == entries[i]:
             where, mask = f"{recording.path}, frame {place},", valid[i] if valid else None
-            stored = Photo(b"", "other", 0, 0, 1)
-            result.append(frame_of(names[i], stored, Pixels(image, None, False), where, mask, lenses[i], params))
+            result.append(frame_of(names[i], _OF_VIDEO, Pixels(image, None, False), where, mask, lenses[i], params))
         progress(place + 1, entries[-1] + 1, names[i])
     reader.release()
     return tuple(result)

@@ -12,7 +12,7 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Float64
-from ss_flow.tasks.capture.colmap import load_pycolmap
+from ss_flow.tasks.capture.colmap import SEED, load_pycolmap
 from ss_flow.tasks.capture.colmap_database import fill_database
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.matches import Matches
@@ -49,7 +49,6 @@ def refined_cameras(
     *,
     params: RefinePosesParams = RefinePosesParams(),
     insist: bool = True,
-    seed: int = 0,
 ) -> Cameras:
     """The cameras with poses under which the photos' common points agree best (`adjusted`).
 
@@ -59,7 +58,7 @@ def refined_cameras(
     Raises InputError then.
     """
     try:
-        found = adjusted(photos, cameras, matches, params, seed)
+        found = adjusted(photos, cameras, matches, params)
     except Unrefinable as error:
         if insist:
             raise InputError(
@@ -89,11 +88,7 @@ class Adjusted:
 
 
 def adjusted(
-    photos: Sequence[Features],
-    cameras: Cameras,
-    matches: Sequence[Matches],
-    params: RefinePosesParams,
-    seed: int,
+    photos: Sequence[Features], cameras: Cameras, matches: Sequence[Matches], params: RefinePosesParams
 ) -> Adjusted:
     """Cameras with poses under which the common points of their photos agree best.
 
@@ -123,7 +118,7 @@ def adjusted(
     error = max(params.first_error, params.last_error)
     focal = float(np.median(cameras.intrinsics[:, 0]))
     while True:
-        filtering, triangulating = _limits(pycolmap, error, focal, seed)
+        filtering, triangulating = _limits(pycolmap, error, focal)
         numbers = sorted(model.reg_image_ids())
         for i, number in enumerate(numbers):
             mapper.triangulate_image(triangulating, number)
@@ -138,7 +133,9 @@ def adjusted(
             break
         error = max(error / 2, params.last_error)
     mapper.end_reconstruction(False)
-    rows = [number - 1 for number in sorted(model.reg_image_ids()) if _points(model, number) >= params.min_points]
+    rows = [
+        number - 1 for number in sorted(model.reg_image_ids()) if model.image(number).num_points3D >= params.min_points
+    ]
     if len(rows) < _LEAST_PHOTOS:
         raise Unrefinable(f"fewer than {_LEAST_PHOTOS} photos see {params.min_points} points in common with others")
     poses = np.stack([np.vstack([model.image(row + 1).cam_from_world().matrix(), (0, 0, 0, 1)]) for row in rows])
@@ -148,14 +145,14 @@ def adjusted(
     return _result(pycolmap, model, cameras, rows, onto_given)
 
 
-def _limits(pycolmap: Any, error: float, focal: float, seed: int) -> tuple[Any, Any]:
+def _limits(pycolmap: Any, error: float, focal: float) -> tuple[Any, Any]:
     """What COLMAP filters and triangulates by when points may be seen so far off, in pixels."""
     filtering = pycolmap.IncrementalMapperOptions()
     filtering.num_threads = 1
-    filtering.random_seed = seed
+    filtering.random_seed = SEED
     filtering.filter_max_reproj_error = error
     triangulating = pycolmap.IncrementalTriangulatorOptions()
-    triangulating.random_seed = seed
+    triangulating.random_seed = SEED
     triangulating.create_max_angle_error = triangulating.continue_max_angle_error = float(np.degrees(error / focal))
     triangulating.complete_max_reproj_error = triangulating.merge_max_reproj_error = error
     return filtering, triangulating
@@ -218,10 +215,6 @@ def _tell(given: Cameras, found: Adjusted) -> None:
         f"degrees (at most {turned.max():.2f}); points are seen {found.error_after:.2f} pixels off their place instead "
         f"of {found.error_before:.2f} (medians)."
     )
-
-
-def _points(model: Any, number: int) -> int:
-    return int(model.image(number).num_points3D)
 
 
 def _median_error(model: Any) -> float:

@@ -17,7 +17,7 @@ from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame, Registration
 from ss_flow.tasks.geometry.holes import close_holes
-from ss_flow.tasks.geometry.images import decode_rgb, resampled
+from ss_flow.tasks.geometry.images import decode_rgb, resampled, size_within
 from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.unread import by_default
 
@@ -106,7 +106,8 @@ def registration(
     agree = abs(first[0] - second[0]) * _SIDE / 2 + shifts_apart <= _APART
     if gain < params.tau_found or not agree:
         return Registration(1.0, np.zeros(2), gain)
-    result = Registration(found[0], np.array(found[1:]) / _reduction(frames[0]), gain)
+    reduced = min(1.0, _SIDE / max(frames[0].width, frames[0].height))
+    result = Registration(found[0], np.array(found[1:]) / reduced, gain)
     if advise and gain >= params.tau_clear:
         warn(
             f"Depth edges fit the photos better when the depth images are {_said(result)}; use --calibrate depth, or "
@@ -150,15 +151,10 @@ def _said(found: Registration) -> str:
     return f"scaled by {found.scale:.3f} and shifted by ({x:+.1f}, {y:+.1f}) pixels"
 
 
-def _reduction(frame: Frame) -> float:
-    return min(1.0, _SIDE / max(frame.width, frame.height))
-
-
 def _view(frame: Frame, intrinsics: Float64, depth: DepthMap, jump: float) -> _View:
     import cv2
 
-    size = _reduction(frame)
-    width, height = max(1, round(frame.width * size)), max(1, round(frame.height * size))
+    width, height = size_within(_SIDE, frame.width, frame.height)
     small = cv2.resize(decode_rgb(frame), (width, height), interpolation=cv2.INTER_AREA)
     lab = cv2.GaussianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32), (0, 0), 1)
     slopes = cv2.Sobel(lab, -1, 1, 0), cv2.Sobel(lab, -1, 0, 1)

@@ -307,7 +307,7 @@ def rigid_inverse(camera_to_world: Float64, where: str) -> Pose:
     inverse = np.eye(4)
     inverse[:3, :3] = checked[:3, :3].T
     inverse[:3, 3] = -checked[:3, :3].T @ checked[:3, 3]
-    return tuple(float(x) for x in inverse.ravel())
+    return tuple(inverse.ravel().tolist())
 
 
 def check_rigid(matrix: Float64, where: str) -> Float64:

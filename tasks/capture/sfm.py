@@ -13,7 +13,7 @@ from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Frame, Int32
-from ss_flow.tasks.capture.colmap import load_pycolmap
+from ss_flow.tasks.capture.colmap import SEED, load_pycolmap
 from ss_flow.tasks.capture.colmap_database import fill_database
 from ss_flow.tasks.capture.features import FeatureParams, Features
 from ss_flow.tasks.capture.ingest import warn_of_skipped
@@ -22,7 +22,7 @@ from ss_flow.tasks.capture.matches import FIRST_FOCAL, Matches
 from ss_flow.tasks.capture.pairs import Look, PairParams
 from ss_flow.tasks.capture.pose_fit import matches_that_fit
 from ss_flow.tasks.capture.turning import refuse_turning
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png
+from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png, encode_valid
 from ss_flow.tasks.ranges import Angle, Count, Fraction, Positive
 
 _BENT = 0.1
@@ -60,9 +60,9 @@ class SfmParams:
 
     features: FeatureParams = field(default_factory=FeatureParams)
     pairs: PairParams = field(default_factory=PairParams)
-    guided_matching: Literal["never", "missing", "always"] = "missing"
-    """Whether photos are matched a second time along the epipolar lines that the first match gave: "missing" - only
-    photos that find no pose without, and these with twice as many partners."""
+    guided_matching: Literal["never", "missing"] = "missing"
+    """Whether photos are matched a second time along the epipolar lines that the first match gave: "missing" - those
+    that find no pose without, and with twice as many partners."""
     mapping: MappingParams = field(default_factory=MappingParams)
     min_registered: Fraction = 0.5
     """The share of photos that must find their pose; below it the step fails."""
@@ -85,7 +85,6 @@ def sfm(
     again: tuple[Matches, ...],
     *,
     params: MappingParams = MappingParams(),
-    seed: int = 0,
 ) -> Cameras:
     """Cameras of those photos that COLMAP's best model registers, in the photos' order (spec S2).
 
@@ -98,10 +97,10 @@ def sfm(
     with fixed seeds, so that two runs agree to the bit. Raises InputError where photos were taken from one place.
     """
     refuse_turning(photos, matches)
-    best = _mapped(photos, matches, again, params, seed)
+    best = _mapped(photos, matches, again, params)
     if _bend(best) <= _BENT:
         return best
-    straight = _mapped(photos, matches, again, replace(params, camera_model="SIMPLE_PINHOLE"), seed)
+    straight = _mapped(photos, matches, again, replace(params, camera_model="SIMPLE_PINHOLE"))
     without, bent = (matches_that_fit(model, photos, matches)[0] for model in (straight, best))
     return best if bent > _MUCH * without else straight
 
@@ -116,11 +115,7 @@ def _bend(cameras: Cameras) -> float:
 
 
 def _mapped(
-    photos: Sequence[Features],
-    matches: tuple[Matches, ...],
-    again: tuple[Matches, ...],
-    params: MappingParams,
-    seed: int,
+    photos: Sequence[Features], matches: tuple[Matches, ...], again: tuple[Matches, ...], params: MappingParams
 ) -> Cameras:
     """What `sfm` returns, under one model of the lens."""
     pycolmap = load_pycolmap()
@@ -133,10 +128,10 @@ def _mapped(
     database, kept = fill_database(photos, (*matches, *again), lens)
     manager = pycolmap.ReconstructionManager()
     if params.mapper == "global":
-        pipeline = pycolmap.GlobalPipeline(_global_options(pycolmap, seed), database, manager)
+        pipeline = pycolmap.GlobalPipeline(_global_options(pycolmap), database, manager)
         step, start = pycolmap.GlobalPipelineCallback.MODEL_UPDATE_CALLBACK, 0
     else:
-        pipeline = pycolmap.IncrementalPipeline(_incremental_options(pycolmap, params, seed), database, manager)
+        pipeline = pycolmap.IncrementalPipeline(_incremental_options(pycolmap, params), database, manager)
         step, start = pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK, 2
     steps = itertools.count(start)
 
@@ -212,33 +207,32 @@ def registered(frames: tuple[Frame, ...], cameras: Cameras) -> tuple[Frame, ...]
         frame = frame_of[name]
         if not (lens := found_lens(cameras, i)).pinhole:
             image, keep = without_distortion(decode_rgb(frame), decode_valid(frame), lens)
-            valid = np.zeros(0, np.uint8) if keep.all() else encode_png(keep.astype(np.uint8) * 255)
-            frame = replace(frame, encoded=encode_png(image), valid=valid)
+            frame = replace(frame, encoded=encode_png(image), valid=encode_valid(keep))
         result.append(frame)
         progress(i + 1, len(cameras), name)
     return tuple(result)
 
 
-def _incremental_options(pycolmap: Any, params: MappingParams, seed: int) -> Any:
-    pycolmap.set_random_seed(seed)
+def _incremental_options(pycolmap: Any, params: MappingParams) -> Any:
+    pycolmap.set_random_seed(SEED)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
-    options.random_seed = seed
+    options.random_seed = SEED
     options.mapper.num_threads = 1
-    options.mapper.random_seed = seed
+    options.mapper.random_seed = SEED
     options.mapper.abs_pose_min_num_inliers = params.min_pose_matches
     options.mapper.init_min_tri_angle = params.min_start_angle
-    options.triangulation.random_seed = seed
+    options.triangulation.random_seed = SEED
     options.min_model_size = 3
     options.extract_colors = False
     return options
 
 
-def _global_options(pycolmap: Any, seed: int) -> Any:
-    pycolmap.set_random_seed(seed)
+def _global_options(pycolmap: Any) -> Any:
+    pycolmap.set_random_seed(SEED)
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = 1
-    options.random_seed = seed
+    options.random_seed = SEED
     options.min_model_size = 3
     return options
 

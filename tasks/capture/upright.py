@@ -37,4 +37,4 @@ def _turned(lens: Lens, pose: Pose, turns: int) -> tuple[Lens, Pose]:
             lens, width=lens.height, height=lens.width, fx=lens.fy, fy=lens.fx, cx=lens.cy, cy=lens.width - lens.cx
         )
         matrix = _QUARTER @ matrix
-    return replace(lens, turns=turns), tuple(float(x) for x in matrix.ravel())
+    return replace(lens, turns=turns), tuple(matrix.ravel().tolist())

@@ -44,14 +44,10 @@ def along(cameras: Cameras, *, frames: int) -> tuple[Camera, ...]:
     found = []
     for time, center, turn in zip(times, centers, turns, strict=True):
         lens = views[round(time)].scaled(first.width, first.height)
-        found.append(_posed(lens, turn, center))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ center
+        found.append(replace(lens, world_to_camera=pose))
     return tuple(found)
-
-
-def _posed(lens: Camera, rotation: Float64, center: Float64) -> Camera:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
-    return Camera(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, pose)
 
 
 @task(name="deliver.camera_paths.round_instance")

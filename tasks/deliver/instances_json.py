@@ -21,17 +21,13 @@ _CRUMB = 0.001
 
 
 def instances_document(
-    instances: Sequence[InstanceMasks],
-    gaussians: Gaussians | None,
-    names: InstanceNames | None,
-    tree: Hierarchy | None = None,
+    instances: Sequence[InstanceMasks], gaussians: Gaussians, names: InstanceNames, tree: Hierarchy
 ) -> dict[str, Any]:
     """The content of instances.json, ready for `json.dumps`.
 
-    instances: after Split or refinement; the background (id 0) is left out. gaussians: the whole scene; without them an
-    instance has no Gaussians and its box is that of its points. names: without them, or where they know nothing, an
-    instance is "object 7" by its id. tree: what the instances are parts of
-    and which are stuff; without it, all are things on their own.
+    instances: after Split or refinement; the background (id 0) is left out. gaussians: the whole scene; the box of an
+    instance without any is that of its points. names: where they know nothing, an instance is "object 7" by its id.
+    tree: what the instances are parts of, and which are stuff.
 
     Each instance has: id, name, named_by (the encoder, "hints" for a name of the user's own, or null), kind ("thing" or
     "stuff"), color [r, g, b], parent (the smallest group that holds it, or null), parts (part_id, num_points, bbox and
@@ -44,12 +40,12 @@ def instances_document(
     """
     known = sorted((i for i in instances if i.instance_id != 0), key=lambda i: i.instance_id)
     called = _unique_names([i.instance_id for i in known], names)
-    rows_of = rows_by_label(gaussians.instance_id) if gaussians is not None else {}
-    stuff, parents = _kinds_and_parents(tree)
+    rows_of = rows_by_label(gaussians.instance_id)
+    stuff = set(tree.node[tree.stuff].tolist())
+    parents = {int(node): int(parent) for node, parent in zip(tree.node, tree.parent, strict=True) if parent}
     entries = []
     for instance in known:
         rows = rows_of.get(instance.instance_id, np.zeros(0, np.intp))
-        own = select(gaussians, rows) if gaussians is not None and len(rows) else None
         crumb = _is_crumb(instance)
         entry = {
             "id": instance.instance_id,
@@ -59,7 +55,7 @@ def instances_document(
             "color": list(instance_color(instance.instance_id)),
             "parent": parents.get(instance.instance_id),
             "parts": _parts(instance),
-            **(placed(instance.points) if own is None else gaussians_placed(own)),
+            **(gaussians_placed(select(gaussians, rows)) if len(rows) else placed(instance.points)),
             "views": list(instance.views),
             "confidence": round(float(instance.confidence), 4),
             "num_parts": int(instance.point_part.max(initial=0)),
@@ -84,14 +80,7 @@ def instance_file(instance_id: int) -> str:
     return f"instances/{instance_id:04d}.ply"
 
 
-def _kinds_and_parents(tree: Hierarchy | None) -> tuple[set[int], dict[int, int]]:
-    if tree is None:
-        return set(), {}
-    parents = {int(node): int(parent) for node, parent in zip(tree.node, tree.parent, strict=True) if parent}
-    return set(tree.node[tree.stuff].tolist()), parents
-
-
-def _groups(ids: Sequence[int], tree: Hierarchy | None, parents: dict[int, int]) -> list[dict[str, Any]]:
+def _groups(ids: Sequence[int], tree: Hierarchy, parents: dict[int, int]) -> list[dict[str, Any]]:
     """What the instances are parts of, the smallest groups first."""
     members: dict[int, list[int]] = {}
     for instance_id in ids:
@@ -99,8 +88,6 @@ def _groups(ids: Sequence[int], tree: Hierarchy | None, parents: dict[int, int])
         while above is not None:
             members.setdefault(above, []).append(instance_id)
             above = parents.get(above)
-    if tree is None:
-        return []
     return [
         {
             "id": int(node),
@@ -125,15 +112,15 @@ def _is_crumb(instance: InstanceMasks) -> bool:
     return instance.weak or int(instance.areas().sum()) < _CRUMB * int(instance.sizes.prod(axis=1).sum())
 
 
-def _named_by(instance_id: int, names: InstanceNames | None) -> str | None:
-    if names is None or instance_id not in names.instance_id:
+def _named_by(instance_id: int, names: InstanceNames) -> str | None:
+    if instance_id not in names.instance_id:
         return None
     return "hints" if instance_id in names.given else names.encoder
 
 
-def _unique_names(ids: Sequence[int], names: InstanceNames | None) -> dict[int, str]:
-    words = {} if names is None else dict(zip(names.instance_id.tolist(), names.names, strict=True))
-    own = set() if names is None else set(names.given.tolist())
+def _unique_names(ids: Sequence[int], names: InstanceNames) -> dict[int, str]:
+    words = dict(zip(names.instance_id.tolist(), names.names, strict=True))
+    own = set(names.given.tolist())
     called: dict[int, str] = {}
     taken: set[str] = set()
     for instance_id in sorted(ids, key=lambda i: i not in own):  # what the user said stays as it was said

@@ -12,7 +12,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from ss_flow.tasks.artifacts import Frame, Gaussians, LabelMap
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_pixels import on_photo, photo_pixels
 from ss_flow.tasks.deliver import ply
+from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.geometry.images import encode_png
 
 RUN_FILE = "run.json"
@@ -192,9 +192,8 @@ def write_scene(folder: Path, scene: Gaussians, instances: Mapping[str, Any]) ->
     (folder / "instances").mkdir()
     for entry in instances["instances"]:
         if entry["file"]:
-            own = scene.instance_id == entry["id"]
-            one = replace(scene, **{f.name: getattr(scene, f.name)[own] for f in fields(scene)})
-            ply.write_gaussians(folder / entry["file"], one, labelled=True)
+            own = select(scene, scene.instance_id == entry["id"])
+            ply.write_gaussians(folder / entry["file"], own, labelled=True)
 
 
 def write_masks(

@@ -20,8 +20,8 @@ from ss_flow.tasks.artifacts import (
     UInt8,
 )
 from ss_flow.tasks.edit.holes import Measured, Remains, Uncovered, uncovered
-from ss_flow.tasks.edit.operations import edited, joined, some_rows
-from ss_flow.tasks.gaussians.initialise import initialise, select
+from ss_flow.tasks.edit.operations import edited
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
@@ -103,8 +103,8 @@ def fill(
     for number in np.unique(plane_of).tolist():
         of_plane = plane_of == number
         colors[of_plane] = _colors(places[of_plane], points, planes[number].rows)
-    shaped = some_rows(after, ~_came_to_light(before, after, instances, views, places, measured, gone))
-    return joined([shaped, _with_ids_of(shaped, _flat(places, colors, plane_of, planes, spacing))])
+    shaped = select(after, ~_came_to_light(before, after, instances, views, places, measured, gone))
+    return concatenate([shaped, _with_ids_of(shaped, _flat(places, colors, plane_of, planes, spacing))])
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ def _came_to_light(
     from scipy.spatial import cKDTree
 
     stays = ~np.isin(before.instance_id, instances) & np.isin(before.instance_id, after.instance_id)
-    rest = some_rows(before, stays)
+    rest = select(before, stays)
     reach = _NEAR * measured.points.spacing
 
     def within(of: Float32 | Float64) -> Bool:

@@ -20,7 +20,7 @@ from ss_flow.tasks.artifacts import (
     PointCloud,
     PointLabels,
 )
-from ss_flow.tasks.edit.operations import some_rows
+from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view, project
@@ -143,7 +143,7 @@ def uncovered(
     before: EditedScene, after: EditedScene, cameras: Cameras, instances: tuple[int, ...]
 ) -> Iterator[Uncovered]:
     """The views that show the instances, each cropped to them."""
-    own = some_rows(before, np.isin(before.instance_id, instances))
+    own = select(before, np.isin(before.instance_id, instances))
     for view, name in enumerate(cameras.names):
         progress(view + 1, len(cameras), name)
         camera = camera_of(cameras, view)

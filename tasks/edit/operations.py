@@ -6,7 +6,6 @@ operation does not name are the same to the bit afterwards, in the same order; n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from ss_flow.errors import InputError
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Bool, EditedScene, Float64, Gaussians
 from ss_flow.tasks.gaussians.harmonics import rotated
-from ss_flow.tasks.gaussians.initialise import SH_ZERO, with_sh_degree
+from ss_flow.tasks.gaussians.initialise import SH_ZERO, concatenate, select
 from ss_flow.tasks.geometry.shape import box_diagonal
 
 _LUMA = (0.2126, 0.7152, 0.0722)
@@ -48,27 +47,27 @@ def begin(scene: Gaussians) -> EditedScene:
 @task(name="edit.remove")
 def remove(scene: EditedScene, *, instances: tuple[int, ...]) -> EditedScene:
     """The scene without some instances."""
-    return some_rows(scene, ~np.isin(scene.instance_id, instances))
+    return select(scene, ~np.isin(scene.instance_id, instances))
 
 
 @task(name="edit.keep")
 def keep(scene: EditedScene, *, instances: tuple[int, ...]) -> EditedScene:
     """The scene with nothing but some instances."""
-    return some_rows(scene, np.isin(scene.instance_id, instances))
+    return select(scene, np.isin(scene.instance_id, instances))
 
 
 @task(name="edit.duplicate")
 def duplicate(scene: EditedScene, *, instance: int, new_id: int, motion: Motion) -> EditedScene:
     """The scene with one instance a second time, moved, under a new id."""
-    copy = moved(some_rows(scene, scene.instance_id == instance), motion)
-    return joined([scene, replace(copy, instance_id=np.full(len(copy), new_id, np.int32))])
+    copy = moved(select(scene, scene.instance_id == instance), motion)
+    return concatenate([scene, replace(copy, instance_id=np.full(len(copy), new_id, np.int32))])
 
 
 @task(name="edit.transform")
 def transform(scene: EditedScene, *, instances: tuple[int, ...], motion: Motion) -> EditedScene:
     """The scene with some instances moved as one."""
     own = np.isin(scene.instance_id, instances)
-    return with_rows(scene, own, moved(some_rows(scene, own), motion))
+    return with_rows(scene, own, moved(select(scene, own), motion))
 
 
 @task(name="edit.recolour")
@@ -80,7 +79,7 @@ def recolour(scene: EditedScene, *, instances: tuple[int, ...], color: tuple[int
     instance that is black all over has no light and shade to keep and becomes evenly coloured.
     """
     own = np.isin(scene.instance_id, instances)
-    part = some_rows(scene, own)
+    part = select(scene, own)
     sh = part.sh.astype(np.float64)
     sh[:, 0] += 0.5 / SH_ZERO  # so that the sum of basis * sh is the colour itself
     luma = sh @ np.array(_LUMA)
@@ -128,7 +127,7 @@ def put_in_place(
     way = _centre(scene.means[old]) - _centre(other.means)
     placed = moved(other, Motion(move=vector(way), scale=float(factor)))
     renamed = replace(placed, instance_id=np.full(len(placed), new_id, np.int32))
-    return joined([some_rows(scene, ~old), renamed])
+    return concatenate([select(scene, ~old), renamed])
 
 
 @task(name="edit.relabel")
@@ -179,26 +178,12 @@ def edited(gaussians: Gaussians, *, filled: int) -> EditedScene:
     return EditedScene(**arrays, filled=np.full(len(gaussians), filled, np.uint8))
 
 
-def some_rows(scene: EditedScene, rows: Bool | NDArray[np.integer]) -> EditedScene:
-    """Some Gaussians, by mask or by index."""
-    return EditedScene(**{f.name: getattr(scene, f.name)[rows] for f in fields(EditedScene)})
-
-
 def with_rows(scene: EditedScene, rows: Bool, changed: EditedScene) -> EditedScene:
     """The scene with other Gaussians in some rows."""
     arrays = {f.name: getattr(scene, f.name).copy() for f in fields(EditedScene)}
     for name, array in arrays.items():
         array[rows] = getattr(changed, name)
     return EditedScene(**arrays)
-
-
-def joined(parts: Sequence[EditedScene]) -> EditedScene:
-    """All rows, one scene after the other; lower SH degrees are filled with 0."""
-    degree = round(max(part.sh.shape[1] for part in parts) ** 0.5) - 1
-    arrays = {
-        f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(EditedScene) if f.name != "sh"
-    }
-    return EditedScene(**arrays, sh=np.concatenate([with_sh_degree(part, degree).sh for part in parts]))
 
 
 def _centre(means: NDArray[np.float32]) -> Float64:

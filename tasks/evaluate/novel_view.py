@@ -46,14 +46,12 @@ def novel_view(
     cameras_trained: tuple[Camera, ...] = (),
     colours: tuple[ColourTransform, ...] = (),
     *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     perception: Model | None = None,
 ) -> Metrics:
     """Render the scene from the held-out cameras and compare with the photos, as 8-bit images.
 
     colours: what the photos that were trained on went through, one each of `cameras_trained`.
-    background: colour where nothing is, 0..1. perception: the network of LPIPS. Pixels that a frame's `valid` mask
-    excludes count in no measure.
+    perception: the network of LPIPS. Pixels that a frame's `valid` mask excludes count in no measure.
     Returns psnr (dB) and ssim, and psnr_colour_fitted, the PSNR after `colour_fitted`; where photos went through
     transforms, psnr_neighbour_colours, in the colours that `NeighbourColours` expects; with a network lpips, and
     lpips_unscaled, that of pictures 0..1 (see `Lpips.differences`); each the mean over the views.
@@ -75,7 +73,7 @@ def novel_view(
         if not valid.any():
             raise InputError(f"The mask of held-out view {frame.name} leaves no pixel to compare; drop the view.")
         camera = camera_of(cameras_held_out, view).scaled(frame.width, frame.height)
-        rgb, photo = render(scene, camera, background=background).rgb, decode_rgb(frame)
+        rgb, photo = render(scene, camera).rgb, decode_rgb(frame)
         image, fitted = to_8bit(rgb), to_8bit(colour_fitted(np.clip(rgb, 0, 1), photo, valid))
         found.append(
             {

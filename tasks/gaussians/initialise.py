@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Float32, Float64, Gaussians, Int32, UInt8
 from ss_flow.tasks.geometry.shape import box_diagonal
+
+G = TypeVar("G", bound=Gaussians)
 
 SH_ZERO = 0.28209479177387814
 """The constant basis function, sqrt(1 / (4 pi))."""
@@ -35,7 +38,6 @@ def initialise(
     confidence: float | Float32,
     part_id: int | Int32 = 0,
     *,
-    sh_degree: int = 0,
     opacity: float = 0.1,
 ) -> Gaussians:
     """Round Gaussians at points (spec P1).
@@ -52,14 +54,12 @@ def initialise(
         spread = neighbour_spread(points)
         # Coincident points would give a scale of 0, a logarithm without end.
         spread = np.maximum(spread, 1e-3 * max(float(np.median(spread)), 1e-6))
-    sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (colors / 255.0 - 0.5) / SH_ZERO
     return Gaussians(
         means=np.ascontiguousarray(points, np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         log_scales=np.repeat(np.log(spread).astype(np.float32)[:, None], 3, axis=1),
         opacity_logits=np.full(n, np.log(opacity / (1 - opacity)), np.float32),
-        sh=sh,
+        sh=((colors / 255.0 - 0.5) / SH_ZERO).astype(np.float32)[:, None],
         instance_id=np.broadcast_to(np.asarray(instance_id, np.int32), (n,)).copy(),
         instance_conf=np.broadcast_to(np.asarray(confidence, np.float32), (n,)).copy(),
         part_id=np.broadcast_to(np.asarray(part_id, np.int32), (n,)).copy(),
@@ -97,26 +97,24 @@ def laid_flat(gaussians: Gaussians, thickness: float) -> Gaussians:
     return replace(gaussians, quaternions=turn.astype(np.float32), log_scales=flat)
 
 
-def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+def with_sh_degree(gaussians: G, degree: int) -> G:
     """The same Gaussians with room for (at least) a degree: missing coefficients are 0."""
     missing = (degree + 1) ** 2 - gaussians.sh.shape[1]
     if missing <= 0:
         return gaussians
-    arrays = {f.name: getattr(gaussians, f.name) for f in fields(Gaussians)}
-    arrays["sh"] = np.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0)))
-    return Gaussians(**arrays)
+    return replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0))))
 
 
-def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+def concatenate(parts: Sequence[G]) -> G:
     """All rows of several sets, one after the other; lower SH degrees are filled with 0. Needs at least one set."""
-    degree = round(max(p.sh.shape[1] for p in parts) ** 0.5) - 1
+    degree = max(p.sh_degree for p in parts)
     same = [with_sh_degree(p, degree) for p in parts]
-    return Gaussians(**{f.name: np.concatenate([getattr(p, f.name) for p in same]) for f in fields(Gaussians)})
+    return replace(same[0], **{f.name: np.concatenate([getattr(p, f.name) for p in same]) for f in fields(same[0])})
 
 
-def select(gaussians: Gaussians, rows: NDArray[np.bool_] | NDArray[np.integer]) -> Gaussians:
+def select(gaussians: G, rows: NDArray[np.bool_] | NDArray[np.integer]) -> G:
     """Some rows, by mask or by index."""
-    return Gaussians(**{f.name: getattr(gaussians, f.name)[rows] for f in fields(Gaussians)})
+    return replace(gaussians, **{f.name: getattr(gaussians, f.name)[rows] for f in fields(gaussians)})
 
 
 def extents(gaussians: Gaussians) -> Float32:

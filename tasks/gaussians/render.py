@@ -68,9 +68,8 @@ def render(
         if not np.isfinite(array).all():
             raise ValueError(f"{name} holds values that are not finite")
     labels = channels_of(gaussians.instance_id, label_ids) if len(label_ids) else None
-    degree = round(gaussians.sh.shape[1] ** 0.5) - 1
     red, green, blue = background
-    settings = Settings((red, green, blue), len(label_ids), degree, winners)
+    settings = Settings((red, green, blue), len(label_ids), gaussians.sh_degree, winners)
     if _device(gaussians) != "cpu":
         from ss_flow.tasks.gaussians.torch_render import draw
 

@@ -155,7 +155,7 @@ class _Training:
         # An order of its own that every step can look up: it moves no other draw, and a later try need not know it.
         self._turns = np.random.default_rng(seed).permutation(len(self._parts))
         self._generator = np.random.default_rng(seed)
-        self._given_degree = round(initial.sh.shape[1] ** 0.5) - 1
+        self._given_degree = initial.sh_degree
         spans = params.iterations // params.sh_every
         last = min(params.sh_degree, spans) if spans >= 2 else 0
         self._last_degree = max(self._given_degree, last)

@@ -78,6 +78,11 @@ def decode_valid(frame: Frame) -> Bool:
     return gray > 0
 
 
+def encode_valid(valid: Bool) -> UInt8:
+    """What `Frame.valid` holds of the pixels that count: [H, W]."""
+    return np.zeros(0, np.uint8) if valid.all() else encode_png(valid.astype(np.uint8) * 255)
+
+
 def averaged_valid(valid: Bool, width: int, height: int) -> Bool:
     """[height, width] which pixels of a photo count once it is scaled down (INTER_AREA): where all they average does.
 

@@ -126,7 +126,7 @@ def matching_cost(
     for d, inverse_depth in enumerate(inverse_depths):
         for layer in ranked:
             layer.fill(-2)
-        for gray, valid, (at_infinity, parallax, depth_row) in prepared:
+        for gray, valid, (at_infinity, parallax) in prepared:
             homography = at_infinity + inverse_depth * parallax
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
             warped = cv2.warpPerspective(gray, homography, (width, height), flags=flags)
@@ -136,7 +136,7 @@ def matching_cost(
             score = (mean(centered * warped) - reference_mean * warped_mean) / (reference_deviation * deviation)
             inside = cv2.erode(seen, np.ones((window, window), np.uint8), borderType=cv2.BORDER_REFLECT)
             score[inside == 0] = -2
-            _hide_behind(score, depth_row[0] + inverse_depth * depth_row[1])
+            _hide_behind(score, homography[2])
             for layer in ranked:
                 higher = np.maximum(layer, score)
                 np.minimum(layer, score, out=score)
@@ -149,12 +149,11 @@ def matching_cost(
     return cost
 
 
-def _transfer(reference: Camera, source: Camera) -> tuple[Float64, Float64, tuple[Float64, Float64]]:
-    """Homographies H(w) = A + w B from reference to source pixels for the plane at inverse depth w, and the two parts
-    of their third row before scaling, whose sign tells what lies before the source camera."""
+def _transfer(reference: Camera, source: Camera) -> tuple[Float64, Float64]:
+    """A and B of the homographies H(w) = A + w B from reference to source pixels for the plane at inverse depth w. The
+    sign that their third row gives tells what lies before the source camera."""
     at_infinity, shift = pixel_transfer(reference, source)
-    parallax = np.outer(shift, np.linalg.inv(_matrix(reference))[2])
-    return at_infinity, parallax, (at_infinity[2], parallax[2])
+    return at_infinity, np.outer(shift, np.linalg.inv(_matrix(reference))[2])
 
 
 def pixel_transfer(reference: Camera, source: Camera) -> tuple[Float64, Float64]:

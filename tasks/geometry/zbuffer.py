@@ -25,7 +25,4 @@ def paint(value: Int32, pixel: Int32, depth: Float32 | Float64, num_pixels: int)
     value, pixel, depth: [M] of each point. Used for the virtual label images (Split&Splat, M*_k; spec S4.1).
     """
     front = nearest_per_pixel(pixel, depth, num_pixels)
-    image = np.zeros(num_pixels, np.int32)
-    hit = front >= 0
-    image[hit] = value[front[hit]]
-    return image
+    return np.append(value, 0)[front].astype(np.int32)  # -1, no point there, takes the 0

@@ -39,9 +39,6 @@ class FileEntry:
     """Bytes, where known."""
     sha256: str | None
     """Digest, hexadecimal; None where the first download pins it."""
-    inputs: tuple[tuple[str, tuple[int, ...]], ...]
-    outputs: tuple[tuple[str, tuple[int, ...]], ...]
-    """Contract: names and shapes, -1 where a size may vary; empty where the file is no network."""
     package: str = ""
     """The import package that it lies in, at `source`, where it comes with one; else it lies in the model's folder."""
 
@@ -131,8 +128,6 @@ def _entry(name: str, table: dict[str, Any]) -> ModelEntry:
             file["source"],
             file.get("size"),
             file.get("sha256"),
-            tuple((key, tuple(shape)) for key, shape in file.get("inputs", {}).items()),
-            tuple((key, tuple(shape)) for key, shape in file.get("outputs", {}).items()),
             file.get("package", ""),
         )
         for role, file in table["files"].items()

@@ -17,7 +17,7 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import warn
 from ss_flow.task import FileRef
-from ss_flow.tasks.artifacts import Float32
+from ss_flow.tasks.artifacts import Float32, UInt8
 from ss_flow.tasks.device import VARIABLE, has_device, wanted
 from ss_flow.tasks.processor import on_this_processor, widest_instruction_set
 
@@ -34,6 +34,8 @@ _AS_ASKED = 1
 _ONE_AT_A_TIME = threading.Lock()
 _SLOW_FUSIONS = ("SkipLayerNormFusion", "BiasGeluFusion")
 """What ONNX Runtime puts in the place of two operators and, on a CPU, computes without vector instructions."""
+_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
+_DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 
 
 def network_identity() -> dict[str, str]:
@@ -194,6 +196,11 @@ def _assert_file(path: Path) -> None:
 
 def _unreadable(path: str, error: Exception) -> InputError:
     return InputError(f"{path} cannot be read as an ONNX network ({_first_line(error)}); fetch it again.")
+
+
+def imagenet_input(image: UInt8) -> Float32:
+    """[1, 3, h, w] a picture [h, w, 3] RGB as networks take it that were trained on ImageNet's."""
+    return np.ascontiguousarray(((image.astype(np.float32) / 255 - _MEAN) / _DEVIATION).transpose(2, 0, 1)[None])
 
 
 def run(session: onnxruntime.InferenceSession, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:

@@ -10,11 +10,8 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float32, UInt8
 from ss_flow.tasks.models.catalogue import PATCHES, Model
-from ss_flow.tasks.models.onnx import open_session, run
+from ss_flow.tasks.models.onnx import imagenet_input, open_session, run
 from ss_flow.tasks.models.sam import Sam
-
-_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
-_DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 
 
 class PatchEncoder(Protocol):
@@ -42,9 +39,8 @@ class DinoV2:
 
         count = max(1, round(rgb.shape[0] / self._patch))
         side = count * self._patch
-        scaled = np.asarray(cv2.resize(rgb, (side, side), interpolation=cv2.INTER_AREA), np.float32) / 255
-        pixels = np.ascontiguousarray(((scaled - _MEAN) / _DEVIATION).transpose(2, 0, 1)[None])
-        tokens = run(self._session, {"pixel_values": pixels})[0]
+        scaled = np.asarray(cv2.resize(rgb, (side, side), interpolation=cv2.INTER_AREA), np.uint8)
+        tokens = run(self._session, {"pixel_values": imagenet_input(scaled)})[0]
         if tokens.ndim != 3 or tokens.shape[1] < count**2:
             raise InputError(f"the network gives {list(tokens.shape)} for {count} x {count} patches: it is no DINOv2.")
         return np.asarray(tokens[0, -(count**2) :].reshape(count, count, -1), np.float32)

@@ -166,7 +166,9 @@ class _Decoder(GraphWriter):
         tokens = self.normalised(self._added(tokens, seen), "transformer.norm_final_attn")
         heads = "iou_prediction_head", *(f"output_hypernetworks_mlps.{mask}" for mask in range(MASKS))
         quality, *kernels = (
-            self._perceptron(self.operator("Gather", tokens, np.array(token), axis=1), *_layers_of(head))
+            self._perceptron(
+                self.operator("Gather", tokens, np.array(token), axis=1), *(f"{head}.layers.{n}" for n in range(3))
+            )
             for token, head in enumerate(heads)
         )
         kernels = [self.operator("Unsqueeze", kernel, np.array([1])) for kernel in kernels]
@@ -243,7 +245,3 @@ class _Decoder(GraphWriter):
         over = np.array([2])
         powers = self.operator("Exp", self.operator("Sub", scores, self.operator("ReduceMax", scores, over)))
         return self.operator("Div", powers, self.operator("ReduceSum", powers, over))
-
-
-def _layers_of(head: str) -> list[str]:
-    return [f"{head}.layers.{number}" for number in range(3)]

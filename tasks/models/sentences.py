@@ -28,6 +28,7 @@ class SentenceEncoder:
     def __init__(self, weights: FileRef, tokenizer: FileRef) -> None:
         """Raises InputError when a file is missing or damaged, or of another network."""
         from safetensors import SafetensorError, safe_open
+        from safetensors.numpy import load_file
         from tokenizers import Tokenizer
 
         try:
@@ -43,7 +44,7 @@ class SentenceEncoder:
         # Every text is the first segment, so its segment's vector goes to each place alike.
         first_segment = tables[f"{_EMBEDDINGS}.token_type_embeddings.weight"][0]
         self._places = tables[f"{_EMBEDDINGS}.position_embeddings.weight"] + first_segment
-        self._session = open_written(weights, lambda: _network(_read(weights)))
+        self._session = open_written(weights, lambda: _network(load_file(weights.path)))
 
     @property
     def dimension(self) -> int:
@@ -63,12 +64,6 @@ class SentenceEncoder:
                 embedded = self._words[np.array([tokens[row] for row in some])] + self._places[:length]
                 rows[some] = run(self._session, {"embedded": embedded})[0]
         return unit_rows(rows)
-
-
-def _read(file: FileRef) -> dict[str, Float32]:
-    from safetensors.numpy import load_file
-
-    return dict(load_file(file.path))
 
 
 def _network(weights: Mapping[str, Float32]) -> bytes:

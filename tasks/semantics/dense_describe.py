@@ -59,17 +59,16 @@ class DenseDescribeParams:
     """Described Gaussians whose mean one gets that no view shows."""
 
 
-def _identity() -> dict[str, str]:
-    return network_identity() | backend_identity()
-
-
 @task(name="semantics.dense_describe.apart")
 def apart(scene: Gaussians) -> tuple[Gaussians, ...]:
     """The Gaussians of each instance, by ascending id, without the background."""
     return tuple(select(scene, rows) for i, rows in sorted(rows_by_label(scene.instance_id).items()) if i != 0)
 
 
-@task(resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=_identity)
+@task(
+    resources=Resources(cores=1, memory_mb=1500, gpus=0.1),
+    environment=lambda: network_identity() | backend_identity(),
+)
 def dense_describe(
     own: Gaussians, cameras: Cameras, *, network: Model, params: DenseDescribeParams = DenseDescribeParams()
 ) -> DenseDescriptors:

@@ -25,7 +25,8 @@ _AROUND = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 
 @dataclass(frozen=True)
 class MergePlan(ViewLists):
-    """One round of merging: pairs that can be merged side by side."""
+    """One round of merging: pairs that can be merged side by side, a row each, with the views that show any instance of
+    a pair."""
 
     pairs: Int32
     """[P, 2] positions of the groups to merge, the one with the lower instance id first; no group is in two pairs."""
@@ -37,10 +38,6 @@ class MergePlan(ViewLists):
     """w_mask of this round."""
     collisions: Float32
     """[G, G] the collision matrix C of all groups."""
-    first: Int32
-    """[P + 1] where the views of each pair begin in `view`."""
-    view: Int32
-    """[A] rows of the scene's views, those that show any instance of a pair, ascending for each pair."""
 
 
 def group_box(gaussians: Gaussians, *, min_opacity: float, quantile: float) -> Float64:

@@ -30,4 +30,4 @@ def shown_in(masks: Sequence[LabelMap]) -> Appearances:
 def _listed(ids: Int32, found: Iterable[Int32]) -> Appearances:
     """found: the ids in each view, in any order."""
     present = np.array([np.isin(ids, of_view) for of_view in found], bool).T
-    return Appearances(ids, **Appearances.arrays([np.flatnonzero(row).tolist() for row in present]))
+    return Appearances(instance_id=ids, **Appearances.arrays([np.flatnonzero(row).tolist() for row in present]))

@@ -18,7 +18,7 @@ from ss_flow.tasks.masks.overlap import drop_duplicates, mask_iou, suppress
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree, merge_union, whole_pictures, without_speckles
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
-from ss_flow.tasks.models.sam import Embedding, PromptedImage, Sam
+from ss_flow.tasks.models.sam import LOW, Embedding, PromptedImage, Sam
 from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Range
 from ss_flow.tasks.unread import by_default
@@ -252,8 +252,6 @@ def _box_iou(masks: Bool) -> Float32:
 
 def _low_resolution(valid: Bool) -> Bool:
     """Which pixels of the network's masks show valid image: the top left part of [256, 256] that the image fills."""
-    from ss_flow.tasks.models.sam import LOW
-
     height, width = valid.shape
     step = max(height, width) / LOW
     rows = ((np.arange(max(1, round(height / step))) + 0.5) * step).astype(int).clip(max=height - 1)

@@ -130,7 +130,8 @@ def find_touches(cloud: PointCloud, label: Int32, filled: Int32, eye: Float64, s
     ends = borders(filled, cloud, TouchingParams())
     near = _around(cloud, ends)
     colors = _across(cloud, label, filled, ends, near)
-    alike = _stays(colors)
+    # Where no change of colour can be seen, it stays; black tells nothing.
+    alike = bright(colors.own) & (np.abs(colors.change) < OTHER).all(axis=1)
     if shadows:
         for contact in _contacts(cloud, filled, ends, _across(cloud, filled, filled, ends, near), eye):
             for step in shadows:
@@ -154,11 +155,6 @@ def _contacts(cloud: PointCloud, label: Int32, ends: Borders, colors: _Colors, e
         centre, normal = plane_through(cloud.points[around[around >= 0]].astype(np.float64))
         contacts.append(_Contact(here, (own == low)[here], towards(normal, centre, eye), change[here]))
     return contacts
-
-
-def _stays(colors: _Colors) -> Bool:
-    """[T] where no change of colour can be seen; black tells nothing."""
-    return np.asarray(bright(colors.own) & (np.abs(colors.change) < OTHER).all(axis=1))
 
 
 def bright(brightness: Float64) -> Bool:

@@ -19,7 +19,7 @@ from ss_flow.flows.depths import depth_source
 from ss_flow.flows.params import CaptureParams
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.ply import write_gaussians
-from ss_flow.tasks.gaussians.initialise import initialise, laid_flat
+from ss_flow.tasks.gaussians.initialise import initialise, laid_flat, with_sh_degree
 from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
 
 GIVEN_STEPS = {"capture.given_scene", "splat.vote", "splat.label"}
@@ -31,7 +31,7 @@ def splat(tiny, tmp_path_factory) -> Path:
     """A scene that another trainer might have written: of the true surface, with quaternions of any length."""
     points = read_columns(tiny.out / "cloud_labeled.ply")
     places, colors = (np.stack([points[name] for name in names], axis=1) for names in ("xyz", ("red", "green", "blue")))
-    made = laid_flat(initialise(places, colors, 0, 0.0, sh_degree=2, opacity=0.95), 0.1)
+    made = laid_flat(with_sh_degree(initialise(places, colors, 0, 0.0, opacity=0.95), 2), 0.1)
     rng = np.random.default_rng(0)
     length = rng.uniform(0.2, 5, (len(made), 1)).astype(np.float32)
     file = tmp_path_factory.mktemp("splat") / "point_cloud.ply"

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from ss_flow.flows.view.picking import Picker, pixel_met
 from ss_flow.flows.view.session import Piece, Session
-from ss_flow.tasks.edit.operations import begin, some_rows
-from ss_flow.tasks.gaussians.initialise import initialise
+from ss_flow.tasks.edit.operations import begin
+from ss_flow.tasks.gaussians.initialise import initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera
 
@@ -63,7 +63,7 @@ def test_a_ray_that_points_away_from_the_picture_meets_no_pixel():
 def test_what_is_hidden_is_not_met_and_nothing_is_met_where_nothing_is():
     places, ids = np.array([[0, 0, 2], [0, 0, 3]], np.float32), np.array([5, 6], np.int32)
     scene = begin(initialise(places, np.zeros((2, 3), np.uint8), ids, 0.1))
-    near, far = (Piece(np.array([row]), some_rows(scene, np.array([row]))) for row in (0, 1))
+    near, far = (Piece(np.array([row]), select(scene, np.array([row]))) for row in (0, 1))
     pixel = Camera(1, 1, FOCAL, FOCAL, 0.5, 0.5, np.eye(4))
     behind = Camera(1, 1, FOCAL, FOCAL, 0.5, 0.5, np.diag([1.0, -1, -1, 1]))
     assert instance_at(Picker({5: near, 6: far}), pixel) == 5

@@ -20,7 +20,7 @@ from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import check
 from ss_flow.flows.view.session import Operation, Session, read_operations, write_script
 from ss_flow.tasks.artifacts import EditedScene
-from ss_flow.tasks.edit.operations import some_rows
+from ss_flow.tasks.gaussians.initialise import select
 
 
 def mixed() -> EditedScene:
@@ -31,7 +31,7 @@ def mixed() -> EditedScene:
         "quaternions": rng.normal(size=(len(whole), 4)).astype(np.float32),
         "sh": rng.normal(size=(len(whole), 4, 3)).astype(np.float32),
     }
-    return some_rows(EditedScene(**{**vars(whole), **changed}), rng.permutation(len(whole)))
+    return select(EditedScene(**{**vars(whole), **changed}), rng.permutation(len(whole)))
 
 
 def session(*operations: Operation) -> Session:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, Float32, Float64, Gaussians, Int32, UInt8
-from ss_flow.tasks.gaussians.initialise import SH_ZERO
+from ss_flow.tasks.artifacts import Cameras, Float32, Float64, Gaussians, UInt8
+from ss_flow.tasks.gaussians.initialise import SH_ZERO, select
 from ss_flow.tasks.geometry.cameras import up_of
 
 
@@ -29,13 +30,7 @@ class FileContent:
 @task(name="deliver.export.chosen")
 def chosen(scene: Gaussians, *, instances: tuple[int, ...]) -> Gaussians:
     """The Gaussians of some instances, in the scene's order; of an edited scene with what says which fill holes."""
-    own = np.isin(scene.instance_id, instances)
-    return replace(scene, **{f.name: getattr(scene, f.name)[own] for f in fields(scene)})
-
-
-def degree_of(gaussians: Gaussians) -> int:
-    """The degree of the spherical harmonics."""
-    return round(gaussians.sh.shape[1] ** 0.5) - 1
+    return select(scene, np.isin(scene.instance_id, instances))
 
 
 def base_colors(gaussians: Gaussians) -> Float64:
@@ -75,9 +70,9 @@ def morton_order(means: Float32) -> NDArray[np.intp]:
     return np.argsort(code, kind="stable")
 
 
-def instances_of(gaussians: Gaussians) -> Int32:
-    """The ids that are there, ascending."""
-    return np.unique(gaussians.instance_id)
+def name_of(instance_id: int, names: Mapping[str, str]) -> str:
+    """What an instance is called; names: of the instances, by their ids as text."""
+    return names.get(str(instance_id), f"object {instance_id}" if instance_id else "background")
 
 
 def y_up(cameras: Cameras) -> Float64:

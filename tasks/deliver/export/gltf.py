@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, Gaussians
-from ss_flow.tasks.deliver.export.content import FileContent, base_colors, degree_of, instances_of, y_up
+from ss_flow.tasks.artifacts import Cameras, Float64, Gaussians
+from ss_flow.tasks.deliver.export.content import FileContent, base_colors, name_of, y_up
 from ss_flow.tasks.gaussians.initialise import select
 
 _EXTENSION = "KHR_gaussian_splatting"
-_FLOAT, _POINTS, _VERTEX_DATA = 5126, 0, 34962
+_FLOAT, _POINTS = 5126, 0
+VERTEX_DATA = 34962
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -65,11 +66,12 @@ def scene_of(nodes: list[dict[str, Any]], cameras: Cameras) -> dict[str, Any]:
 
 def node_of(instance_id: int, names: Mapping[str, str], mesh: int) -> dict[str, Any]:
     """The node of an instance; names: of the instances, by their ids as text."""
-    return {"name": _name_of(instance_id, names), "mesh": mesh, "extras": {"instance_id": instance_id}}
+    return {"name": name_of(instance_id, names), "mesh": mesh, "extras": {"instance_id": instance_id}}
 
 
-def _name_of(instance_id: int, names: Mapping[str, str]) -> str:
-    return names.get(str(instance_id), f"object {instance_id}" if instance_id else "background")
+def linear_colors(display: Float64) -> Float64:
+    """Colours 0..1 as glTF wants them, in linear light; display: in sRGB."""
+    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
 
 @task(name="deliver.export.gltf")
@@ -84,9 +86,9 @@ def gltf(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str], fl
     names: of the instances, by their ids as text.
     """
     buffer, meshes = Buffer(), []
-    ids = instances_of(gaussians).tolist()
+    ids = np.unique(gaussians.instance_id).tolist()
     if flat and ids:
-        known = [{"id": instance_id, "name": _name_of(instance_id, names)} for instance_id in ids]
+        known = [{"id": instance_id, "name": name_of(instance_id, names)} for instance_id in ids]
         parts = [({"name": "instances", "mesh": 0, "extras": {"instances": known}}, gaussians)]
     else:
         parts = [
@@ -96,7 +98,7 @@ def gltf(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str], fl
     for node, own in parts:
         attributes = _attributes(own, buffer)
         if flat:
-            attributes["_INSTANCE_ID"] = buffer.add(own.instance_id.astype("<f4"), _VERTEX_DATA)
+            attributes["_INSTANCE_ID"] = buffer.add(own.instance_id.astype("<f4"), VERTEX_DATA)
         appearance = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
         appearance |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
         primitive = {"mode": _POINTS, "attributes": attributes, "extensions": {_EXTENSION: appearance}}
@@ -107,16 +109,15 @@ def gltf(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str], fl
 
 def _attributes(own: Gaussians, buffer: Buffer) -> dict[str, int]:
     opacities = own.opacities.astype("<f4")
-    display = base_colors(own).clip(0, 1)
-    linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+    linear = linear_colors(base_colors(own).clip(0, 1))
     columns = {
         f"{_EXTENSION}:ROTATION": own.unit_quaternions[:, [1, 2, 3, 0]],
         f"{_EXTENSION}:SCALE": np.exp(own.log_scales),
         f"{_EXTENSION}:OPACITY": opacities,
         "COLOR_0": np.column_stack([linear, opacities]),  # what viewers without the extension show, as points
     }
-    for degree in range(degree_of(own) + 1):
+    for degree in range(own.sh_degree + 1):
         for n in range(2 * degree + 1):
             columns[f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{n}"] = own.sh[:, degree**2 + n]
-    found = {"POSITION": buffer.add(own.means.astype("<f4"), _VERTEX_DATA, ends=True)}
-    return found | {name: buffer.add(column.astype("<f4"), _VERTEX_DATA) for name, column in columns.items()}
+    found = {"POSITION": buffer.add(own.means.astype("<f4"), VERTEX_DATA, ends=True)}
+    return found | {name: buffer.add(column.astype("<f4"), VERTEX_DATA) for name, column in columns.items()}

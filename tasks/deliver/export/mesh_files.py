@@ -10,11 +10,10 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras
 from ss_flow.tasks.deliver.export.content import FileContent
-from ss_flow.tasks.deliver.export.gltf import Buffer, glb, node_of, scene_of
+from ss_flow.tasks.deliver.export.gltf import VERTEX_DATA, Buffer, glb, linear_colors, node_of, scene_of
 from ss_flow.tasks.deliver.export.mesh import TriangleMesh
 
-_VERTEX_DATA, _INDICES = 34962, 34963
-_FLOAT, _UNSIGNED = 5126, 5125
+_INDICES, _UNSIGNED = 34963, 5125
 
 
 @task(name="deliver.export.mesh_ply")
@@ -56,11 +55,9 @@ def mesh_glb(meshes: tuple[TriangleMesh, ...], cameras: Cameras, *, names: Mappi
     buffer, nodes, entries = Buffer(), [], list[dict[str, Any]]()
     # Colours are those of the photos: the material is not to be lit, and glTF's colours are linear.
     for mesh in (mesh for mesh in meshes if len(mesh.triangles)):
-        display = mesh.colors / 255
-        linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
         attributes = {
-            "POSITION": buffer.add(mesh.vertices.astype("<f4"), _VERTEX_DATA, ends=True),
-            "COLOR_0": buffer.add(linear.astype("<f4"), _VERTEX_DATA),
+            "POSITION": buffer.add(mesh.vertices.astype("<f4"), VERTEX_DATA, ends=True),
+            "COLOR_0": buffer.add(linear_colors(mesh.colors / 255).astype("<f4"), VERTEX_DATA),
         }
         indices = buffer.add(mesh.triangles.astype("<u4").ravel(), _INDICES, _UNSIGNED)
         nodes.append(node_of(mesh.instance_id, names, len(entries)))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Float32, Gaussians, UInt8
-from ss_flow.tasks.deliver.export.content import FileContent, degree_of, levels, morton_order, smallest_three
+from ss_flow.tasks.deliver.export.content import FileContent, levels, morton_order, smallest_three
 from ss_flow.tasks.gaussians.initialise import select
 
 _LEVELS = 256
@@ -51,14 +51,14 @@ def sog(gaussians: Gaussians) -> FileContent:
     book, chosen = _codebook(ordered.sh[:, 0])
     images["sh0"] = _image(chosen, np.maximum(levels(ordered.opacities, 8), 1))
     meta["sh0"] = {"codebook": book.tolist(), "files": ["sh0.webp"]}
-    if count and degree_of(ordered):
+    if count and ordered.sh_degree:
         kind, kinds = _kinds(ordered.sh[:, 1:].reshape(count, -1))
         book, chosen = _codebook(kinds)
         coefficients = chosen.reshape(len(kinds), -1, 3)
         images["shN_centroids"] = _image_of_kinds(coefficients)
         images["shN_labels"] = _image(np.stack([kind & 255, kind >> 8, np.zeros_like(kind)], axis=1))
         files = ["shN_centroids.webp", "shN_labels.webp"]
-        bands = {"count": len(kinds), "bands": degree_of(ordered), "codebook": book.tolist()}
+        bands = {"count": len(kinds), "bands": ordered.sh_degree, "codebook": book.tolist()}
         meta["shN"] = bands | {"files": files}
     return FileContent.of(_archive(meta, images))
 

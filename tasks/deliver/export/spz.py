@@ -10,7 +10,7 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Float32, Gaussians, UInt8
-from ss_flow.tasks.deliver.export.content import FileContent, base_colors, degree_of, levels, smallest_three
+from ss_flow.tasks.deliver.export.content import FileContent, base_colors, levels, smallest_three
 from ss_flow.tasks.gaussians.initialise import SH_ZERO
 
 _MAGIC = 0x5053474E
@@ -36,7 +36,7 @@ def spz(gaussians: Gaussians) -> FileContent:
     bits = min(_MOST_FRACTION_BITS, int(np.floor(np.log2(_FARTHEST / max(farthest, 1e-9)))))
     if bits < 0:
         raise InputError(f"a Gaussian lies {farthest:.3g} units from the origin; SPZ holds coordinates to {_FARTHEST}.")
-    degree = degree_of(gaussians)
+    degree = gaussians.sh_degree
     header = struct.pack("<IIIBBBB", _MAGIC, _VERSION, len(gaussians), degree, bits, 0, 0)
     turned = gaussians.means.astype(np.float64) * (1, -1, -1)
     fixed = np.rint(turned * (1 << bits)).astype("<i4")

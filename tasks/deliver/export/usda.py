@@ -10,7 +10,7 @@ import numpy as np
 from ss_flow.running import progress
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Gaussians
-from ss_flow.tasks.deliver.export.content import FileContent, degree_of, instances_of, y_up
+from ss_flow.tasks.deliver.export.content import FileContent, name_of, y_up
 from ss_flow.tasks.gaussians.initialise import select
 
 _HEAD = """#usda 1.0
@@ -52,24 +52,23 @@ def usda(gaussians: Gaussians, cameras: Cameras, *, names: Mapping[str, str]) ->
 
     names: of the instances, by their ids as text.
     """
-    ids = instances_of(gaussians).tolist()
+    ids = np.unique(gaussians.instance_id).tolist()
     x, y, z, w = y_up(cameras)
     parts = [_HEAD.format(turn=_tuples(np.array([[w, x, y, z]]))[1:-1])]
     for done, instance_id in enumerate(ids):
         progress(done, len(ids), f"instance {instance_id}")
         own = select(gaussians, gaussians.instance_id == instance_id)
         reach = 3 * np.exp(own.log_scales.max(axis=1, keepdims=True))
-        name = names.get(str(instance_id), f"object {instance_id}" if instance_id else "background")
         parts.append(
             _PRIM.format(
                 id=instance_id,
-                name=_string(name),
+                name=_string(name_of(instance_id, names)),
                 extent=_tuples(np.stack([(own.means - reach).min(axis=0), (own.means + reach).max(axis=0)])),
                 positions=_tuples(own.means),
                 orientations=_tuples(own.unit_quaternions),
                 scales=_tuples(np.exp(own.log_scales)),
                 opacities=_tuples(own.opacities.astype(np.float32)),
-                degree=degree_of(own),
+                degree=own.sh_degree,
                 coefficients=_tuples(own.sh.reshape(-1, 3)),
             )
         )

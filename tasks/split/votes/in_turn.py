@@ -37,18 +37,6 @@ class SequentialParams:
 
 
 @dataclass(frozen=True)
-class Match:
-    """The label that a mask votes for."""
-
-    mask: int
-    """Its place in the view's Observation."""
-    label: int
-    """0 when the mask founds a new object."""
-    purity: float
-    """Share of the painted pixels under the mask that carry the label."""
-
-
-@dataclass(frozen=True)
 class Matches:
     """All matched masks of all views, in the order in which they voted."""
 
@@ -79,18 +67,18 @@ def vote_in_turn(
             progress(turn * len(visibility) + k, params.passes * len(visibility), view.name)
             virtual = _virtual_labels(view, given, votes, tau_label)
             # Two phases: no mask of a view sees the votes of another mask of the same view (spec A5).
-            for match in [_match(j, view, seen, virtual, num_labels, params) for j in range(len(seen.mask))]:
-                points = seen.inside(match.mask)
-                chosen = match.label
-                if not chosen:
+            found = [_match(j, view, seen, virtual, num_labels, params) for j in range(len(seen.mask))]
+            for j, (label, purity) in enumerate(found):
+                points = seen.inside(j)
+                if not label:
                     if len(points) < params.min_new_points:
                         continue
                     num_labels += 1
-                    chosen = num_labels
-                _vote(votes, points, chosen, match.purity, params)
+                    label = num_labels
+                _vote(votes, points, label, purity, params)
                 matched.view.append(k)
-                matched.mask.append(int(seen.mask[match.mask]))
-                matched.label.append(chosen)
+                matched.mask.append(int(seen.mask[j]))
+                matched.label.append(label)
         leader, share = votes.leaders()
         given = np.where(share >= tau_label, leader, 0).astype(np.int32)
     return votes, matched
@@ -110,16 +98,17 @@ def _virtual_labels(view: Visibility, given: Int32, votes: Votes, tau_label: flo
 
 def _match(
     mask: int, view: Visibility, seen: Observation, virtual: Int32, num_labels: int, params: SequentialParams
-) -> Match:
-    """The label that a mask overlaps most, or none when it hardly overlaps any (spec S4.2)."""
+) -> tuple[int, float]:
+    """The label that a mask overlaps most, 0 when it hardly overlaps any; and the share of the painted pixels under the
+    mask that carry the label (spec S4.2)."""
     row, standing = seen.under(mask)
     pixels = np.unique(view.pixel[row[standing != BORDER]])
     overlap = np.bincount(virtual[pixels], minlength=num_labels + 1)[1:]
     total = int(overlap.sum())
     if total < max(params.min_overlap, params.min_overlap_share * len(pixels), 1):
-        return Match(mask, 0, 1.0)
+        return 0, 1.0
     best = int(overlap.argmax())
-    return Match(mask, best + 1, float(overlap[best] / total))
+    return best + 1, float(overlap[best] / total)
 
 
 def _vote(votes: Votes, points: Int32, label: int, purity: float, params: SequentialParams) -> None:

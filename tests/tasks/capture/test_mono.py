@@ -90,6 +90,6 @@ def test_depth_that_nothing_agrees_with_is_refused(model, scene):
 def test_a_file_that_is_no_model_is_refused_by_name(scene, tmp_path: Path):
     frame, cameras, _ = scene
     (tmp_path / "broken.onnx").write_bytes(b"nothing")
-    with pytest.raises(InputError, match=r"broken\.onnx cannot be loaded") as refusal:
+    with pytest.raises(InputError, match=r"broken\.onnx cannot be read as an ONNX network") as refusal:
         mono(frame, cameras, (), model=FileRef(tmp_path / "broken.onnx", "0"))
     assert "\n" not in str(refusal.value)

@@ -7,9 +7,11 @@ from view_masks import as_fields
 from ss_flow.tasks.artifacts import Gaussians, Hierarchy, InstanceMasks
 from ss_flow.tasks.deliver.instances_json import instance_file, instances_document
 from ss_flow.tasks.deliver.palette import instance_color
+from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS
 from ss_flow.tasks.semantics.name import InstanceNames
 
-NOTHING = np.zeros(0, np.uint8)
+NO_NAMES = InstanceNames(np.zeros(0, np.int32), (), np.zeros(0, np.float32), "clip")
+NO_TREE = Hierarchy(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(0, bool))
 
 
 def instance(instance_id: int, points, views=(0, 2), weak: bool = False, shown: int = 4) -> InstanceMasks:
@@ -33,7 +35,7 @@ def gaussians(means, ids) -> Gaussians:
 
 
 def test_an_instance_is_described_by_its_points():
-    document = instances_document([instance(7, [[0, 0, 0], [2, 4, 6]])], None, None)
+    document = instances_document([instance(7, [[0, 0, 0], [2, 4, 6]])], NO_GAUSSIANS, NO_NAMES, NO_TREE)
     assert json.loads(json.dumps(document)) == {
         "version": 1,
         "background_id": 0,
@@ -67,7 +69,7 @@ def test_an_instance_is_described_by_its_points():
 
 def test_where_there_are_gaussians_they_say_where_it_is():
     scene = gaussians([[9, 9, 9], [1, 0, 0], [5, 5, 5], [3, 0, 0]], [0, 7, 8, 7])
-    entry = instances_document([instance(7, [[0, 0, 0]])], scene, None)["instances"][0]
+    entry = instances_document([instance(7, [[0, 0, 0]])], scene, NO_NAMES, NO_TREE)["instances"][0]
     assert entry["bbox"] == {"min": [1, 0, 0], "max": [3, 0, 0]} and entry["centroid"] == [2, 0, 0]
     assert entry["num_gaussians"] == 2 and entry["file"] == instance_file(7) == "instances/0007.ply"
 
@@ -77,7 +79,9 @@ def test_gaussians_that_are_hardly_to_be_seen_do_not_widen_a_box_unless_all_are(
     told = []
     for opacities in ([0.9, 0.2, 0.1], [0.1, 0.1, 0.1]):
         logits = np.log(np.array(opacities, np.float32) / (1 - np.array(opacities, np.float32)))
-        document = instances_document([instance(7, [[0, 0, 0]])], replace(scene, opacity_logits=logits), None)
+        document = instances_document(
+            [instance(7, [[0, 0, 0]])], replace(scene, opacity_logits=logits), NO_NAMES, NO_TREE
+        )
         told.append(document["instances"][0])
     assert [entry["bbox"]["max"] for entry in told] == [[3, 0, 0], [80, 0, 0]]
     assert [entry["centroid"] for entry in told] == [[28, 0, 0]] * 2
@@ -85,7 +89,7 @@ def test_gaussians_that_are_hardly_to_be_seen_do_not_widen_a_box_unless_all_are(
 
 def test_a_weak_instance_has_points_but_no_file():
     scene = gaussians([[1, 0, 0]], [8])
-    entry = instances_document([instance(7, [[1, 1, 1]], weak=True)], scene, None)["instances"][0]
+    entry = instances_document([instance(7, [[1, 1, 1]], weak=True)], scene, NO_NAMES, NO_TREE)["instances"][0]
     assert entry["weak"] and entry["file"] is None and entry["centroid"] == [1, 1, 1]
 
 
@@ -93,7 +97,7 @@ def test_names_are_unique_and_the_unknown_go_by_their_id():
     names = InstanceNames(
         np.array([3, 1, 2, 4], np.int32), ("mug", "mug", "object", "sofa"), np.ones(4, np.float32), "clip"
     )
-    document = instances_document([instance(i, [[0, 0, 0]]) for i in (5, 4, 3, 2, 1)], None, names)
+    document = instances_document([instance(i, [[0, 0, 0]]) for i in (5, 4, 3, 2, 1)], NO_GAUSSIANS, names, NO_TREE)
     found = [(e["id"], e["name"], e["named_by"]) for e in document["instances"]]
     assert found == [
         (1, "mug", "clip"),
@@ -107,7 +111,7 @@ def test_names_are_unique_and_the_unknown_go_by_their_id():
 def test_names_that_the_user_gave_stay_and_are_told_from_those_of_the_encoder():
     ids, given = np.array([1, 2, 3], np.int32), np.array([2, 3], np.int32)
     names = InstanceNames(ids, ("mug", "mug", "my lamp"), np.ones(3, np.float32), "clip", given)
-    document = instances_document([instance(i, [[0, 0, 0]]) for i in (1, 2, 3)], None, names)
+    document = instances_document([instance(i, [[0, 0, 0]]) for i in (1, 2, 3)], NO_GAUSSIANS, names, NO_TREE)
     found = [(e["name"], e["named_by"]) for e in document["instances"]]
     assert found == [("mug 2", "clip"), ("mug", "hints"), ("my lamp", "hints")]
 
@@ -121,7 +125,7 @@ def test_the_background_is_no_instance_and_instances_know_their_groups_and_kind(
         np.array([False, False, False, True, False, False]),
     )
     known = [instance(i, [[0, 0, 0]]) for i in (0, 1, 2, 3, 4)]
-    document = instances_document(known, None, None, tree)
+    document = instances_document(known, NO_GAUSSIANS, NO_NAMES, tree)
     found = [(e["id"], e["parent"], e["kind"]) for e in document["instances"]]
     assert found == [(1, 5, "thing"), (2, 5, "thing"), (3, 6, "thing"), (4, None, "stuff")]
     assert document["groups"] == [
@@ -132,11 +136,13 @@ def test_the_background_is_no_instance_and_instances_know_their_groups_and_kind(
 
 def test_crumbs_are_counted_and_have_no_file():
     scene = gaussians([[1, 0, 0], [1, 0, 0]], [7, 8])
-    document = instances_document([instance(7, [[0, 0, 0]], shown=0), instance(8, [[0, 0, 0]])], scene, None)
+    document = instances_document(
+        [instance(7, [[0, 0, 0]], shown=0), instance(8, [[0, 0, 0]])], scene, NO_NAMES, NO_TREE
+    )
     assert [(e["crumb"], e["file"]) for e in document["instances"]] == [(True, None), (False, "instances/0008.ply")]
     assert document["num_crumbs"] == 1
 
 
 def test_an_instance_without_points_has_no_place():
-    entry = instances_document([instance(1, [])], None, None)["instances"][0]
+    entry = instances_document([instance(1, [])], NO_GAUSSIANS, NO_NAMES, NO_TREE)["instances"][0]
     assert entry["bbox"] is None and entry["centroid"] is None

@@ -12,7 +12,7 @@ from ss_flow.tasks.artifacts import DepthMap, PointCloud, PointLabels
 from ss_flow.tasks.edit import operations
 from ss_flow.tasks.edit.fill import fill
 from ss_flow.tasks.edit.holes import Measured, holes
-from ss_flow.tasks.gaussians.initialise import initialise
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 
 SPACING = 0.03
@@ -113,7 +113,7 @@ def test_what_was_hidden_inside_of_what_has_left_goes_when_its_hole_is_filled(se
     centre, size = box_scene.BOXES[BOX - 1].mean(axis=0), np.diff(box_scene.BOXES[BOX - 1], axis=0)[0]
     places = (centre + np.random.default_rng(0).uniform(-0.15, 0.15, (40, 3)) * size).astype(np.float32)
     hidden = operations.begin(initialise(places, np.full((40, 3), 255, np.uint8), 1, 1.0, opacity=0.9))
-    now = operations.joined([scene, hidden])
+    now = concatenate([scene, hidden])
     after = fill(now, operations.remove(now, instances=(BOX,)), measured, instances=(BOX,), gone=(BOX,))
     assert after.filled.any() and not np.isin(after.means, places).all(axis=1).any()
 

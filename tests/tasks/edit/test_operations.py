@@ -16,9 +16,9 @@ from ss_flow.tasks.artifacts import Cameras, EditedScene, Gaussians
 from ss_flow.tasks.deliver.compressed import decompressed
 from ss_flow.tasks.deliver.ply import write_gaussians
 from ss_flow.tasks.edit import operations
-from ss_flow.tasks.edit.operations import Motion, some_rows
+from ss_flow.tasks.edit.operations import Motion
 from ss_flow.tasks.edit.pictures import before_and_after
-from ss_flow.tasks.gaussians.initialise import SH_ZERO
+from ss_flow.tasks.gaussians.initialise import SH_ZERO, select
 from ss_flow.tasks.gaussians.read_ply import read_columns
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera
@@ -46,7 +46,7 @@ def same(a: EditedScene, b: EditedScene) -> bool:
 
 
 def others(scene: EditedScene, *ids: int) -> EditedScene:
-    return some_rows(scene, ~np.isin(scene.instance_id, ids))
+    return select(scene, ~np.isin(scene.instance_id, ids))
 
 
 def camera_at(world_to_camera: np.ndarray) -> Camera:
@@ -106,7 +106,7 @@ def test_removing_and_keeping_are_each_others_complement():
 def test_a_copy_has_the_new_id_and_lies_where_it_was_moved():
     scene = scene_of()
     after = operations.duplicate(scene, instance=2, new_id=7, motion=Motion(move=(0.0, 0.0, 1.5)))
-    old, new = some_rows(after, after.instance_id == 2), some_rows(after, after.instance_id == 7)
+    old, new = select(after, after.instance_id == 2), select(after, after.instance_id == 7)
     np.testing.assert_allclose(new.means, old.means + np.array([0, 0, 1.5]), atol=1e-6)
     assert same(replace(new, means=old.means, instance_id=old.instance_id), old)
 
@@ -141,7 +141,7 @@ def test_a_black_object_becomes_evenly_coloured():
 
 def test_another_object_takes_the_place_and_the_size_of_the_one_it_replaces(tmp_path):
     scene = scene_of(90)
-    other = some_rows(scene_of(40, seed=5), np.ones(40, bool))
+    other = select(scene_of(40, seed=5), np.ones(40, bool))
     write_gaussians(tmp_path / "other.ply", replace(other, means=other.means * 7 + 3), labelled=True)
     read = operations.read_object(file=FileRef(tmp_path / "other.ply", ""))
     after = operations.put_in_place(scene, read, instance=1, new_id=8, scale=None, turn=NO_TURN)
@@ -161,7 +161,7 @@ def test_an_object_from_a_world_whose_up_is_another_is_put_upright(there):
     here = (0.0, 0.0, 1.0)
     turn = operations.smallest_turn(there, here)
     after = operations.put_in_place(scene, other, instance=1, new_id=8, scale=1.0, turn=turn)
-    own = some_rows(after, after.instance_id == 8)
+    own = select(after, after.instance_id == 8)
     heights = (other.means - other.means.mean(axis=0)) @ np.array(there)
     np.testing.assert_allclose((own.means - own.means.mean(axis=0)) @ np.array(here), heights, atol=1e-5)
     turned = (
@@ -178,7 +178,7 @@ def test_an_object_from_a_world_whose_up_is_another_is_put_upright(there):
 
 
 def test_a_file_without_gaussians_replaces_nothing(tmp_path):
-    write_gaussians(tmp_path / "none.ply", some_rows(scene_of(), np.zeros(60, bool)), labelled=True)
+    write_gaussians(tmp_path / "none.ply", select(scene_of(), np.zeros(60, bool)), labelled=True)
     with pytest.raises(InputError, match="holds no Gaussians"):
         operations.read_object(file=FileRef(tmp_path / "none.ply", ""))
 
@@ -220,4 +220,4 @@ def test_pictures_show_the_three_views_that_changed_most_before_on_the_left_and_
     assert [picture.name for picture in found] == [f"{name}: before and after" for name in "bce"]
     shown = np.concatenate([render(scene, camera_at(POSE)).rgb for scene in (before, after)], axis=1)
     assert np.abs(decompressed(found[0].content) / 255 - shown.clip(0, 1)).mean() < 0.02
-    assert before_and_after(before, some_rows(after, np.zeros(len(after), bool)), cameras) == ()
+    assert before_and_after(before, select(after, np.zeros(len(after), bool)), cameras) == ()

@@ -21,7 +21,7 @@ from ss_flow.tasks.gaussians.densification import (
     densify,
     rotations,
 )
-from ss_flow.tasks.gaussians.initialise import concatenate, initialise, laid_flat, select
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, laid_flat, select, with_sh_degree
 from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
@@ -427,7 +427,8 @@ def test_initial_scales_are_the_root_mean_square_of_three_neighbours():
 
 
 def test_joining_fills_colours_of_lower_degree_and_picking_undoes_it():
-    low, high = ball_points(5), initialise(np.ones((3, 3), np.float32), np.zeros((3, 3), np.uint8), 2, 1.0, sh_degree=2)
+    three = initialise(np.ones((3, 3), np.float32), np.zeros((3, 3), np.uint8), 2, 1.0)
+    low, high = ball_points(5), with_sh_degree(three, 2)
     both = concatenate([low, high])
     assert both.sh.shape == (8, 9, 3) and both.instance_id.tolist() == [4] * 5 + [2] * 3
     assert np.array_equal(select(both, both.instance_id == 4).means, low.means)

@@ -19,7 +19,7 @@ WEIGHTS = Path(__file__).parents[3] / ".." / "shared" / "models"
 
 
 def entry(sha256: str | None, npm: str = "tiny@1.0.0") -> dict[str, ModelEntry]:
-    file = FileEntry("encoder", "encoder.onnx", "dist/encoder.onnx", None, sha256, (), ())
+    file = FileEntry("encoder", "encoder.onnx", "dist/encoder.onnx", None, sha256)
     return {"tiny": ModelEntry("tiny", "segmenter", "MIT", "a test", "", npm, (file,), (("stability", 0.5),), ())}
 
 
@@ -87,7 +87,7 @@ def test_folders_of_the_environment_come_before_the_cache(monkeypatch, tmp_path)
 @pytest.fixture
 def packaged(monkeypatch, tmp_path):
     """A model whose file lies in a package that can be imported."""
-    file = FileEntry("network", "net.bin", "data/net.bin", None, None, (), (), "packaged_weights")
+    file = FileEntry("network", "net.bin", "data/net.bin", None, None, "packaged_weights")
     one = ModelEntry("packed", "text-image", "MIT", "a test", "", "", (file,), (), (), extra="weights", on_request=True)
     monkeypatch.setattr(catalogue, "load_catalogue", lambda: {"packed": one})
     monkeypatch.syspath_prepend(tmp_path)
@@ -121,7 +121,7 @@ def test_a_model_that_an_extra_installs_is_not_downloaded(packaged, tmp_path):
 def halves(monkeypatch, packaged):
     """The same model, of which another file is downloaded."""
     (one,) = catalogue.load_catalogue().values()
-    own = FileEntry("own", "own.bin", "own.bin", None, None, (), ())
+    own = FileEntry("own", "own.bin", "own.bin", None, None)
     both = replace(one, npm="tiny@1.0.0", files=(own, *one.files))
     monkeypatch.setattr(catalogue, "load_catalogue", lambda: {"packed": both})
     return packaged
@@ -159,7 +159,7 @@ def test_whole_weights_pass_and_damaged_weights_are_named_with_both_digests(tiny
 def test_cut_off_weights_are_found_by_their_size_before_any_digest(tmp_path):
     path = tmp_path / "encoder.onnx"
     path.write_bytes(b"1234")
-    expected = FileEntry("encoder", "encoder.onnx", "", 5, "0" * 64, (), ())
+    expected = FileEntry("encoder", "encoder.onnx", "", 5, "0" * 64)
     with pytest.raises(InputError, match="has 4 bytes but should have 5"):
         catalogue.verify_file(path, expected)
 

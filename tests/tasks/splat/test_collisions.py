@@ -13,7 +13,7 @@ from ss_flow.tasks.splat.plan import PlanParams, plan
 
 UNTIL_NONE = PlanParams(max_rounds=1_000_000)
 EXACT = replace(UNTIL_NONE, bbox_quantile=0.0)
-NOWHERE_SHOWN = Appearances(np.zeros(0, np.int32), **Appearances.arrays([]))
+NOWHERE_SHOWN = Appearances(instance_id=np.zeros(0, np.int32), **Appearances.arrays([]))
 
 
 def group(points, instance_id: int, opacity: float = 0.9) -> Gaussians:

@@ -138,7 +138,7 @@ def test_no_training_reads_a_parameter_that_is_kept_out_of_its_key(built):
 
 
 def test_touching_instances_collide_and_are_planned_as_a_pair(built):
-    shown = Appearances(np.array([0, 1, 2], np.int32), **Appearances.arrays([[0, 1, 2], [0], [0, 2]]))
+    shown = Appearances(instance_id=np.array([0, 1, 2], np.int32), **Appearances.arrays([[0, 1, 2], [0], [0, 2]]))
     made = plan((built.ball, built.box), shown, params=PlanParams(max_rounds=1), round=0)
     assert made.pairs.tolist() == [[1, 0]] and made.views(0) == [0, 2]
 
