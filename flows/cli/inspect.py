@@ -1,4 +1,4 @@
-"""Looking at runs and at what they left: status, why, graph, cache ls, cache show."""
+"""Looking at runs and at what they left: status, graph, cache ls, cache show."""
 
 from __future__ import annotations
 
@@ -216,9 +216,15 @@ class CacheShow:
         run, digests, asked = results_named(store, self.scene, self.what)
         values = [store.get(digest) for digest in digests]
         if self.png:
-            from ss_flow.flows.cli.drawing import draw_results
+            from ss_flow.flows.view.artifact import around_of, artifact_picture
 
-            draw_results(store, run or latest_run(store, self.scene), values, self.view, self.png)
+            around = around_of(store, run or latest_run(store, self.scene))
+            if around.cameras is not None and not 0 <= self.view < len(around.cameras.names):
+                last = len(around.cameras.names) - 1
+                raise InputError(f"--view {self.view} is out of range; the run has views 0 to {last}.")
+            picture = artifact_picture(values[0] if len(values) == 1 else values, around, self.view)
+            self.png.parent.mkdir(parents=True, exist_ok=True)
+            self.png.write_bytes(picture)
         out = console(json=False)
         for line in told(values, digests, store, run, asked):
             out.print(escape(line))
