@@ -98,7 +98,7 @@ class Demo:
     """How to run."""
 
     def run(self) -> int:
-        from ss_flow.flows.demo import demo_scene, photographs
+        from ss_flow.flows.demo import generated_scene, photographs
         from ss_flow.flows.generated import RoomParams
 
         options, scene = self.execution, self.out / "scene"
@@ -112,7 +112,7 @@ class Demo:
         room = RoomParams(objects=self.objects, views=self.views, seed=self.seed)
         out = console(json=options.json)
         with display(out) as screen:
-            there = demo_scene(scene, room, self.masks, options.store.open_store(), screen, engine)
+            there = generated_scene(scene, room, self.masks, options.store.open_store(), screen, engine)
         if there:
             return run_scene(open_scene(scene), self.out / "result", params, options)
         first = {"label": photographs.name, "why": f"{scene} does not hold this room"}
