@@ -16,7 +16,7 @@ from ss_flow.errors import InputError
 from ss_flow.flows import export as formats
 from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run, references
 from ss_flow.flows.cli.prepare import display
-from ss_flow.flows.deliver import STATUS_EXIT
+from ss_flow.flows.deliver import STATUS_EXIT, failure_records
 from ss_flow.flows.results import BACKGROUND, FinishedRun, not_of_an_edit
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Gaussians
@@ -128,12 +128,10 @@ class Export:
 
     def _write_workspace(self, out: Path, run: FinishedRun) -> int:
         """Write the photos and cameras that the run worked with."""
-        frames = [run.store.get(value) for value in run.document["results"]["ingest"]]
-        cameras = run.results.one("cameras")
+        frames, cameras = run.results.all("ingest"), run.results.one("cameras")
         with replacing_own(out, EXPORT) as filling:
             if self.format == "colmap":
-                maps = [run.store.get(value) for value in run.document["results"]["masks"]]
-                write_undistorted(filling, frames, cameras, maps)
+                write_undistorted(filling, frames, cameras, run.results.all("masks"))
             else:
                 write_nerfstudio(filling, frames, cameras)
             files = [
@@ -167,9 +165,8 @@ class Export:
         return files
 
     def _tell(self, out: Path, report: Report | None, files: list[dict[str, Any]]) -> int:
-        failed = report.failures if report else []
-        status = "degraded" if failed else "ok"
-        failures = [{"label": f.label, "error": f"{type(f.error).__name__}: {f.error}"} for f in failed]
+        failures = failure_records(report) if report else []
+        status = "degraded" if failures else "ok"
         warnings = sorted({w for node in (report.nodes if report else ()) for w in node.get("warnings") or ()})
         if self.json:
             document = {"status": status, "format": self.format, "out": str(out), "files": files}
