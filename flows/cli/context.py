@@ -76,6 +76,10 @@ class StoreOptions:
         return store
 
 
+InStore = tyro.conf.OmitArgPrefixes[StoreOptions]
+"""Of a command's field `store`: its options are those of the command."""
+
+
 def default_cache() -> Path:
     """The user's cache folder for ss-flow."""
     return user_cache() / "store"

@@ -18,6 +18,7 @@ from rich.table import Table
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import (
+    InStore,
     OptionalPath,
     StoreOptions,
     choose_model,
@@ -79,7 +80,7 @@ class Evaluate:
     """For "lerf-...": a file (.json) of what to ask for in the place of a category's own name: {category: text}."""
     json: bool = False
     """Print one JSON document."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:

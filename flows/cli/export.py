@@ -14,7 +14,7 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import export as formats
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run, references
+from ss_flow.flows.cli.context import InStore, OptionalPath, StoreOptions, console, file_digests, open_run, references
 from ss_flow.flows.cli.prepare import display
 from ss_flow.flows.deliver import STATUS_EXIT, failure_records
 from ss_flow.flows.results import BACKGROUND, FinishedRun, not_of_an_edit
@@ -59,7 +59,7 @@ class Export:
     """How many tasks may run at once; 0 = one a core."""
     json: bool = False
     """Print one JSON document."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:

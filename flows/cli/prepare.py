@@ -19,7 +19,7 @@ from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows import settings
 from ss_flow.flows.capture import Capture, capture, turned
-from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model, choose_patches, references
+from ss_flow.flows.cli.context import InStore, OptionalText, StoreOptions, choose_model, choose_patches, references
 from ss_flow.flows.deliver import deliver, remarks, run_document
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
@@ -64,7 +64,7 @@ class RunOptions:
     """Read all input files again, instead of trusting their size and time of change."""
     json: bool = False
     """Print one JSON document on stdout, and nothing else there."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     @property

@@ -16,6 +16,7 @@ from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import (
+    InStore,
     OptionalCount,
     OptionalNumber,
     OptionalPath,
@@ -65,7 +66,7 @@ class Query:
     shows them)."""
     json: bool = False
     """Print one JSON document."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:

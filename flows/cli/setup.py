@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import PositionalText, StoreOptions, console
+from ss_flow.flows.cli.context import InStore, PositionalText, StoreOptions, console
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.tasks.models import catalogue
 
@@ -131,7 +131,7 @@ class Completion:
 class Doctor:
     """Tell whether this machine has all that runs need, and what to do where it has not."""
 
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:

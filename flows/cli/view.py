@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import (
+    InStore,
     OptionalCount,
     OptionalPath,
     StoreOptions,
@@ -60,7 +61,7 @@ class View:
     """The address to listen on; 0.0.0.0 lets other machines in who know the token."""
     port: int = 8080
     """The port to listen on; the next free one where it is taken."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
