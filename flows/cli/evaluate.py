@@ -167,7 +167,7 @@ class Evaluate:
     def _of_labels(self, warnings: list[str]) -> _Tables:
         run = open_run(self.result, self.store, _LERF_NEEDED[self.protocol])
         files = open_scene(Path(run.document["scene"]))
-        name = encoder_name(run.store, run.results.digests["describe"])
+        name = encoder_name(run)
         with file_digests(run.store) as digests:
             labelled = LabelledScene.of(
                 self.truth or labels_of(files),

@@ -19,12 +19,10 @@ from ss_flow.flows.cli.context import (
     OptionalCount,
     OptionalPath,
     StoreOptions,
-    choose_model,
     console,
-    file_digests,
     open_run,
 )
-from ss_flow.flows.cli.query import encoder_name, query_params
+from ss_flow.flows.cli.query import encoder_of, query_params
 from ss_flow.flows.results import FinishedRun, read_run
 from ss_flow.tasks.deliver.output import check_named
 
@@ -194,6 +192,4 @@ def search_of(run: FinishedRun) -> Search | None:
 
     if run.results.missing(("describe",)):
         return None
-    with file_digests(run.store) as digests:
-        encoder = choose_model("text-image", encoder_name(run.store, run.results.digests["describe"]), digests)
-    return Search(tuple(run.results.all("describe")), query_params(run.document), encoder)
+    return Search(tuple(run.results.all("describe")), query_params(run.document), encoder_of(run))
