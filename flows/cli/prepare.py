@@ -128,7 +128,7 @@ class Prepared:
 
     def steps(self) -> list[str]:
         """The names of the DAG's results. Raises InputError as `build` does."""
-        with Flow(self.name).building():
+        with Flow().building():
             return list(self.build())
 
 
