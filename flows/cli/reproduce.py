@@ -14,11 +14,11 @@ from rich.console import Console
 
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.store import Store
-from ss_flow.engine import Report, Request, run_flows
+from ss_flow.engine import Report, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import paper, settings
 from ss_flow.flows.cli.context import console, file_digests, references
-from ss_flow.flows.cli.prepare import Prefixed, Prepared, RunOptions, display, header, prepare, tell_remarks
+from ss_flow.flows.cli.prepare import Prefixed, Prepared, RunOptions, display, prepare, tell_remarks
 from ss_flow.flows.cli.reproduce_report import Found, Run, failures, section_of, tell_table
 from ss_flow.flows.deliver import FALLBACKS
 from ss_flow.flows.demo import generated_scene
@@ -180,17 +180,16 @@ class Reproduce:
 
         with display(tell) as screen:
             requests = [
-                Request(
-                    partial(build, place),
-                    one.prepared.name,
-                    header(one.prepared, self.execution) | recorded_as(one.prepared.name, self._what(runs[place])),
-                    None,
+                one.prepared.request(
+                    self.execution,
                     Prefixed(screen, " ".join(self._what(runs[place]).values()), leading=place == min(ready)),
                     partial(done, place),
+                    recorded_as(one.prepared.name, self._what(runs[place])),
                 )
                 for place, one in ready.items()
             ]
-            run_flows(requests, store, **self.execution.engine())
+            measuring = [replace(r, build=partial(build, place)) for place, r in zip(ready, requests, strict=True)]
+            run_flows(measuring, store, **self.execution.engine())
         return found
 
     def _what(self, run: Run) -> dict[str, str]:
