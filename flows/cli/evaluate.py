@@ -179,7 +179,8 @@ class Evaluate:
             )
         if labelled.unread:
             said = ", ".join(labelled.unread)
-            warnings.append(f"{name_in_words(name)} cannot be asked for {said}; these categories score 0.")
+            who = "the encoder of colour words" if name == "none" else name
+            warnings.append(f"{who} cannot be asked for {said}; these categories score 0.")
         build = LERF[self.protocol]
         asked: dict[str, Any] = {"encoder": FALLBACKS["encoder"] if name == "none" else name}
         if self.protocol != "lerf-2d":
@@ -198,11 +199,6 @@ class _Tables:
     """Rows of single objects, by what they are."""
     asked: Mapping[str, Any] = field(default_factory=dict)
     """What texts were asked with, where they were (spec 2.2): the encoder, and what it depends on besides."""
-
-
-def name_in_words(encoder: str) -> str:
-    """What to call an encoder in messages."""
-    return "the encoder of colour words" if encoder == "none" else encoder
 
 
 def _evaluated(

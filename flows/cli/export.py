@@ -71,8 +71,7 @@ class Export:
         ids = run.ids(self.instance) if self.instance else run.all_ids() if by_instance else None
         folder = several or workspace
         out = self.out or Path("ss-flow-export") / f"{run.name}{self._ending(ids or (), folder=folder)}"
-        _check_place(out, run.store.location, folder=folder)
-        self._check_suffix(out, folder=folder)
+        self._check_place(out, run.store.location, folder=folder)
         if workspace:
             if "edit" in run.document:
                 raise not_of_an_edit(run.folder, run.document, "photos")
@@ -119,11 +118,17 @@ class Export:
             return f"{chosen}-{self.format}"
         return chosen + _ADDED.get(self.format, "") + formats.suffix_of(self.format)
 
-    def _check_suffix(self, out: Path, *, folder: bool) -> None:
-        """Raises InputError for a file that would be taken for one of another format by its name."""
+    def _check_place(self, out: Path, store: str, *, folder: bool) -> None:
+        """Raises InputError unless the export can be written here: a new place, or that of an earlier export; and for
+        a file that would be taken for one of another format by its name."""
+        if folder:
+            check_replaceable(out, EXPORT, store)
+            return
+        check_outside(out, store)
+        check_named(out, "--out")
         own = formats.suffix_of(self.format)
         others = {formats.suffix_of(name) for name in get_args(formats.Format)} - {""} | {".gltf"}  # glTF's JSON form
-        if not folder and out.suffix in others and not own.endswith(out.suffix):
+        if out.suffix in others and not own.endswith(out.suffix):
             raise InputError(f"{out} is named like another format; a file of {self.format} ends in {own}.")
 
     def _write_workspace(self, out: Path, run: FinishedRun) -> int:
@@ -211,12 +216,3 @@ def _check_there(scene: Gaussians, ids: tuple[int, ...] | None, folder: Path) ->
         held, what = held[held == BACKGROUND], f"the background of {folder}"
     if not len(held):
         raise InputError(f"{what} has no Gaussians, so there is nothing to export.")
-
-
-def _check_place(out: Path, store: str, *, folder: bool) -> None:
-    """Raises InputError unless the export can be written here: a new place, or that of an earlier export."""
-    if folder:
-        check_replaceable(out, EXPORT, store)
-    else:
-        check_outside(out, store)
-        check_named(out, "--out")

@@ -7,19 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Frame
-from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.cameras import Camera, looking
 from ss_flow.tasks.geometry.images import encode_png
 
 
 def looking_at(eye, target) -> np.ndarray:
     """World-to-camera of a camera at `eye`; world y points down."""
     forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross((0, 1, 0), forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
+    return looking(eye, forward, np.array([0.0, -1.0, 0.0]))
 
 
 def _texture(u, v, salt):
