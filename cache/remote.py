@@ -34,7 +34,7 @@ from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims, Seen
 from ss_flow.cache.errors import Gone, writing
 from ss_flow.cache.files import remove, rename_folder, user_cache
-from ss_flow.cache.store import GRACE_SECONDS, MEMORY_BYTES, Action, Entry, Store
+from ss_flow.cache.store import GRACE_SECONDS, Action, Entry, Store
 
 MANIFEST = "zarr.json"
 """The file of an object that is written last, and deleted first."""
@@ -54,10 +54,10 @@ class RemoteStore(Store):
     OSError when the folder cannot be created. All methods raise StoreFailure when the bucket cannot be used.
     """
 
-    def __init__(self, location: str, folder: Path | None = None, *, memory_bytes: int = MEMORY_BYTES) -> None:
+    def __init__(self, location: str, folder: Path | None = None) -> None:
         self._bucket = Bucket(location)
         self._known: set[str] = set()
-        super().__init__(folder or default_folder(self.location), memory_bytes=memory_bytes)
+        super().__init__(folder or default_folder(self.location))
 
     @property
     def location(self) -> str:

@@ -92,7 +92,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     """
     source = depth_source(scene, params)
     frames, cameras, sensed = _placed(scene, reference, params, with_sensor=source == "sensor")
-    names = _known_names(scene)
+    names = scene.names if scene.poses is not None else None  # else a photo may still drop out for want of a pose
     known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
     masks = truth = pointed = corrected = None
     if scene.ready_masks is not None:
@@ -198,11 +198,6 @@ def _given_cameras(scene: SceneFiles, reference: Reference, frames: tuple[Frame,
         metric=scene.metric,
         sparse=reference(scene.sparse) if scene.sparse else None,
     )
-
-
-def _known_names(scene: SceneFiles) -> tuple[str, ...] | None:
-    """Names of the views, where no photo can still drop out for want of a pose."""
-    return scene.names if scene.poses is not None else None
 
 
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> tuple[Frame, ...]:

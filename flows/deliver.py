@@ -150,9 +150,14 @@ def deliver(folder: Path, store: Store, document: dict[str, Any], scene: SceneFi
         return
     with replacing_own(folder, RESULT) as filling:
         write_all(filling, store, document, scene, undistorted=undistorted)
-        document["files"] = sizes(filling)
-        document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
+        write_document(filling, document)
+
+
+def write_document(filling: Path, document: dict[str, Any]) -> None:
+    """Write run.json into a folder that has all else, and say in it what that is, and when it was delivered."""
+    document["files"] = sizes(filling)
+    document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
 
 
 def write_all(

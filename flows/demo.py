@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -46,7 +46,7 @@ def photographs(*, room: RoomParams, masks: Masks, annotated: str) -> tuple[Capt
     """Build a room and take its photos: the files of its capture, by name.
 
     masks: ready-made ones that lie beside the photos; "auto" is none. annotated: the name of the scan under which the
-    capture also has all that tables are measured by, see `generated_scenes`; "" leaves that out.
+    capture also has all that tables are measured by, see `generated_scene`; "" leaves that out.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -66,46 +66,23 @@ def photographs(*, room: RoomParams, masks: Masks, annotated: str) -> tuple[Capt
         )
 
 
-def demo_scene(
-    folder: Path, room: RoomParams, masks: Masks, store: Store, reporter: Reporter, engine: Mapping[str, Any]
-) -> bool:
-    """Have a room's capture in a folder; where the same one lies there already, no file is touched.
-
-    reporter: hears of the photographing. engine: options of `run_flows`; in a dry run nothing is written.
-    Returns whether the capture is there. Raises InputError when the folder holds something else, or more.
-    """
-    return _placed(folder, room, masks, "", store, reporter, engine)
-
-
-def generated_scenes(
-    out: Path,
-    rooms: Sequence[RoomParams],
-    masks: Masks,
-    store: Store,
-    reporter: Reporter,
-    engine: Mapping[str, Any],
-) -> list[Path]:
-    """Have rooms with all that tables are measured by in `out`/room-SEED.
-
-    Beside the capture itself: the annotated scan in ScanNet's files, the labels of three views in LERF-OVS's, and
-    clicks on every object in the views that show most of it. engine: options of `run_flows`. Returns their folders.
-    Raises InputError when `out` holds something else.
-    """
-    folders = [out / f"room-{room.seed}" for room in rooms]
-    for folder, room in zip(folders, rooms, strict=True):
-        _placed(folder, room, masks, folder.name, store, reporter, engine)
-    return folders
-
-
-def _placed(
+def generated_scene(
     folder: Path,
     room: RoomParams,
     masks: Masks,
-    annotated: str,
     store: Store,
     reporter: Reporter,
     engine: Mapping[str, Any],
+    *,
+    annotated: bool = False,
 ) -> bool:
+    """Have a room's capture in a folder; where the same one lies there already, no file is touched.
+
+    reporter: hears of the photographing. engine: options of `run_flows`; in a dry run nothing is written. annotated:
+    with all that tables are measured by: the annotated scan in ScanNet's files, the labels of three views in
+    LERF-OVS's, and clicks on every object in the views that show most of it.
+    Returns whether the capture is there. Raises InputError when the folder holds something else, or more.
+    """
     known = _recipe(folder) if folder.exists() else None
     there = False
 
@@ -128,7 +105,7 @@ def _placed(
         there = True
 
     def build() -> dict[str, Any]:
-        return {"files": photographs(room=room, masks=masks, annotated=annotated)}
+        return {"files": photographs(room=room, masks=masks, annotated=folder.name if annotated else "")}
 
     request = Request(build, str(folder.resolve()), reporter=reporter, done=done)
     run_flows([request], store, recorded=False, **engine)

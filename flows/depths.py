@@ -27,6 +27,8 @@ from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.models.catalogue import Model
 
 Depths = tuple[DepthMap, ...]
+OfView = Callable[[int, Neighbors], DepthMap]
+"""Makes a view's depth, by its place and who its neighbours are."""
 
 
 def depth_source(scene: SceneFiles, params: CaptureParams) -> str:
@@ -99,11 +101,7 @@ class Beside:
 
     def compared(self) -> tuple[Depths, Depths]:
         """The depth that several views agree on, and what is presumed besides."""
-        found = self._each(self._swept)
-        agreed = self._confirmed(found, self.params.agreement)
-        for _ in range(self.params.stereo.rounds):
-            found = self._each(functools.partial(self._refined, found, agreed))
-            agreed = self._confirmed(found, self.params.agreement)
+        found, agreed = self._found(self._each)
         return agreed, self._confirmed(found, self.params.presumed)
 
     def completed(self, sensor: Depths, gaps: Sequence[int]) -> Depths:
@@ -118,17 +116,13 @@ class Beside:
             build=lambda depth, camera: sized(depth, camera, max_side=self.params.stereo.max_side),
         )
 
-        def with_sensor(step: Callable[[int, Neighbors], DepthMap], known: Depths = small) -> Depths:
+        def with_sensor(step: OfView, known: Depths = small) -> Depths:
             def held(view: int, near: Neighbors) -> DepthMap:
                 return completed(known[view], step(view, near)) if view in gaps else known[view]
 
             return self._each(held)
 
-        found = with_sensor(self._swept)
-        agreed = with_sensor(self._agreeing(found, self.params.agreement))
-        for _ in range(self.params.stereo.rounds):
-            found = with_sensor(functools.partial(self._refined, found, agreed))
-            agreed = with_sensor(self._agreeing(found, self.params.agreement))
+        _, agreed = self._found(with_sensor)
         return with_sensor(lambda view, _: agreed[view], sensor)
 
     def rendered(self, scene: Gaussians) -> Depths:
@@ -151,7 +145,19 @@ class Beside:
             build=lambda frame: mono(frame, cameras, agreed, model=network, params=self.params.mono),
         )
 
-    def _each(self, build: Callable[[int, Neighbors], DepthMap]) -> Depths:
+    def _found(self, each_view: Callable[[OfView], Depths]) -> tuple[Depths, Depths]:
+        """What each view's photo is found to show beside its neighbours', and what of it several views agree on.
+
+        each_view: applies a step to all views.
+        """
+        found = each_view(self._swept)
+        agreed = each_view(self._agreeing(found, self.params.agreement))
+        for _ in range(self.params.stereo.rounds):
+            found = each_view(functools.partial(self._refined, found, agreed))
+            agreed = each_view(self._agreeing(found, self.params.agreement))
+        return found, agreed
+
+    def _each(self, build: OfView) -> Depths:
         return each(
             self.frames,
             INDEX,
@@ -178,7 +184,7 @@ class Beside:
     def _confirmed(self, found: Depths, params: AgreementParams) -> Depths:
         return self._each(self._agreeing(found, params))
 
-    def _agreeing(self, found: Depths, params: AgreementParams) -> Callable[[int, Neighbors], DepthMap]:
+    def _agreeing(self, found: Depths, params: AgreementParams) -> OfView:
         def agreeing(view: int, near: Neighbors) -> DepthMap:
             around = near.around(view)
             return steps.agree(pick(found, around), pick(self.cameras, around), params=params)

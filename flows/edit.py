@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.events import Reporter
-from ss_flow.flows.deliver import failure_records, node_records
+from ss_flow.flows.deliver import failure_records, node_records, write_document
 from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check, rooted
 from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run
@@ -24,7 +22,7 @@ from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
 from ss_flow.tasks.artifacts import EditedScene
 from ss_flow.tasks.deliver.output import RUN_FILE, write_scene
-from ss_flow.tasks.deliver.places import RESULT, check_replaceable, replacing_own, sizes
+from ss_flow.tasks.deliver.places import RESULT, check_replaceable, replacing_own
 from ss_flow.tasks.edit.fill import fill
 from ss_flow.tasks.edit.holes import Holes, Measured, holes
 from ss_flow.tasks.edit.operations import begin
@@ -141,9 +139,7 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
         write_scene(filling, scene, instances)
         html = report_html(document, pictures=made.all("report_pictures"), instances=instances)
         write_atomically(filling / "report.html", html)
-        document["files"] = sizes(filling)
-        document["delivered"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        (filling / RUN_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
+        write_document(filling, document)
     return document
 
 

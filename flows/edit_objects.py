@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,12 +77,8 @@ class Objects:
         return next((i for i, entry in self.entries.items() if entry["name"] == called), None)
 
     def unique(self, name: str) -> str:
-        """This name, or with the first number from 2 on that makes it the only one."""
-        names, number, candidate = set(self.names()), 1, name
-        while candidate in names:
-            number += 1
-            candidate = f"{name} {number}"
-        return candidate
+        """This name, or with a number that makes it the only one."""
+        return unused_name(name, self.names())
 
     def solid(self, instance: int) -> bool:
         """Whether it has Gaussians."""
@@ -231,6 +228,12 @@ class Objects:
         self.dense[instance] = set()
         if instance in self.entries:
             self.changed.add(instance)
+
+
+def unused_name(name: str, used: Collection[str]) -> str:
+    """A name as it is, or with the first number from 2 on that makes it another than those that are used."""
+    numbered = (f"{name} {number}" for number in itertools.count(2))
+    return next(one for one in itertools.chain([name], numbered) if one not in used)
 
 
 def _unseen(entry: Entry) -> Entry:

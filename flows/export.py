@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 from ss_flow.graph import labelled
@@ -40,10 +40,6 @@ class Source:
     def gaussians(self) -> Gaussians:
         """The node of the Gaussians that are asked for."""
         return self.scene if self.instances is None else chosen(self.scene, instances=self.instances)
-
-    def only(self, instance_id: int) -> Source:
-        """The same with one instance."""
-        return Source(self.scene, self.cameras, self.names, (instance_id,))
 
     def mesh(self, instance_id: int, holes: Literal["open", "closed"]) -> TriangleMesh:
         """The node of an instance's surface."""
@@ -94,5 +90,5 @@ def a_file_each(source: Source, format: str, holes: Literal["open", "closed"]) -
     files = {}
     for instance_id in source.instances or ():
         with labelled(str(instance_id)):
-            files[str(instance_id)] = one_file(source.only(instance_id), format, holes)
+            files[str(instance_id)] = one_file(replace(source, instances=(instance_id,)), format, holes)
     return files

@@ -18,8 +18,6 @@ from ss_flow.flows.results import FinishedRun
 from ss_flow.flows.view.artifact import around_results, artifact_picture
 from ss_flow.flows.view.drawing import Around
 from ss_flow.tasks import artifacts
-from ss_flow.tasks.deliver.draw import draw
-from ss_flow.tasks.geometry.images import encode_png
 
 
 def load_ipython_extension(shell: Any) -> None:
@@ -53,11 +51,7 @@ class Shown:
 
     def _repr_png_(self) -> bytes:
         values = [self.store.get(digest) for digest in self.digests]
-        if len(values) == 1:
-            return artifact_picture(values[0], self.around)
-        around = self.around
-        picture = draw(values, frames=around.frames, cameras=around.cameras, points=around.points)
-        return encode_png(picture).tobytes()
+        return artifact_picture(values[0] if len(values) == 1 else values, self.around)
 
 
 def shown(run: FinishedRun, name: str) -> Shown:

@@ -33,18 +33,12 @@ class Table:
 class Curve:
     """A column of a table over its parameter."""
 
-    parameter: str
-    metric: str
-    """The figure of ours that it is to be laid beside."""
-    source: str
     label: str
     """What the figures are of."""
-    percent: tuple[tuple[float, float], ...]
-    """(value of the parameter, figure in per cent), by rising value."""
-
-    def points(self) -> tuple[list[float], list[float]]:
-        """Values of the parameter, and the figures as fractions 0..1."""
-        return [x for x, _ in self.percent], [y / 100 for _, y in self.percent]
+    values: list[float]
+    """Of the parameter, ascending."""
+    figures: list[float]
+    """One a value, as fractions 0..1."""
 
 
 @functools.cache
@@ -55,21 +49,14 @@ def tables() -> dict[str, Table]:
 
 
 @functools.cache
-def curves() -> tuple[Curve, ...]:
-    """What the paper prints over one parameter."""
-    return tuple(
-        Curve(
-            table.parameter,
-            metric,
-            table.source,
+def curves() -> dict[tuple[str, str], Curve]:
+    """What the paper prints over one parameter, by the parameter and the figure of ours that it may be laid beside."""
+    return {
+        (table.parameter, metric): Curve(
             f"paper, {table.data.partition(';')[0]}",
-            tuple((float(value), row[table.columns.index(column)]) for value, row in table.rows.items()),
+            [float(value) for value in table.rows],
+            [row[table.columns.index(column)] / 100 for row in table.rows.values()],
         )
         for table in tables().values()
         for metric, column in table.curves.items()
-    )
-
-
-def curve(parameter: str, metric: str) -> Curve | None:
-    """The paper's curve of a figure over a parameter, where it prints one."""
-    return next((c for c in curves() if (c.parameter, c.metric) == (parameter, metric)), None)
+    }

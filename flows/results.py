@@ -142,8 +142,7 @@ class FinishedRun:
         """
         if name not in self.results.digests:
             raise InputError(f"{self.folder} has no result {name!r}; it has {', '.join(self.results.digests)}.")
-        if self.results.missing([name]):
-            raise InputError(f"the store {self.store.location} no longer holds {name} of {self.folder}; run it again.")
+        self.require([name])
         found = self.results.digests[name]
         return [found] if isinstance(found, str) else list(found)
 

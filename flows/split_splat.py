@@ -46,13 +46,13 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
     found = split(capture, networks, params.split)
     with labelled("split"):
         masks_split = resolve(capture.cameras, found.instances)
-    results: dict[str, Any] = {
+    known: dict[str, Any] = {
         "ingest": capture.frames,
         "cameras": capture.cameras,
-        **({"registration": capture.registration} if capture.registration is not None else {}),
+        "registration": capture.registration,
         "depth": capture.depths,
         "checks": capture.checks,
-        **({"colours": capture.colours} if capture.colours else {}),
+        "colours": capture.colours or None,
         "dense": found.points,
         "visibility": found.visibility,
         "segment": found.masks,
@@ -62,11 +62,12 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         "parts": found.parts,
         "reproject": found.instances,
         "masks_split": masks_split,
-        **({"hinted": found.hinted} if found.hinted is not None else {}),
+        "hinted": found.hinted,
+        "truth": capture.truth,
     }
+    results = {name: nodes for name, nodes in known.items() if nodes is not None}
     void = params.evaluate.zero_is_void is not False
     if capture.truth is not None:
-        results["truth"] = capture.truth
         with labelled("split"):
             results["metrics_split"] = evaluate_masks(
                 masks_split, capture.truth, found.tree, capture.frames, zero_is_void=void

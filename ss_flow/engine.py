@@ -199,7 +199,7 @@ class _Part:
 
     def build(self) -> None:
         """Make its flow, and the outputs by name that are asked for."""
-        self.flow = Flow(self.request.scene)
+        self.flow = Flow()
         with self.flow.building():
             outputs = _checked(self.request.build(), self.flow)
         until = self.request.until

@@ -70,7 +70,7 @@ def first_difference(before: Components, now: Components, items: Callable[[str],
         return f"package {name} {_shown(before['packages'], now['packages'], name)}"
     for name in _changed(before["environment"], now["environment"]):
         return f"{name} of this machine {_shown(before['environment'], now['environment'], name)}"
-    for name in changed_inputs(before, now):
+    for name in _changed(before["inputs"], now["inputs"]):
         return f"input {name} changed{items(name)}"
     return ""
 
@@ -90,11 +90,6 @@ def _what(name: str) -> str:
     module, _, attribute = name.rpartition(".")
     found = getattr(sys.modules.get(module), attribute, None)
     return "fields or code" if isinstance(found, type) and is_dataclass(found) else "code"
-
-
-def changed_inputs(before: Components, now: Components) -> list[str]:
-    """Names of the inputs that differ between two keys."""
-    return _changed(before["inputs"], now["inputs"])
 
 
 def _changed(before: dict[str, Any], now: dict[str, Any]) -> list[str]:

@@ -158,9 +158,6 @@ def current_flow() -> Flow | None:
 class Flow:
     """A graph of nodes. It grows while it runs, as expansions resolve."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
-
     @contextmanager
     def building(self, item: str = "") -> Iterator[None]:
         """Within this, calls of tasks add nodes to this flow, labelled with `item`."""

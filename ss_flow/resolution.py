@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -211,7 +211,8 @@ class Resolution:
             for failure in failures:
                 if isinstance(failure.error, NotRun):
                     return failure
-        return _flattened(self.values[item] for item in whole)
+        values: list[Any] = [self.values[item] for item in whole]
+        return tuple(digest for value in values for digest in digests_of(value))
 
     def _whole(self, node: Gather) -> list[Node]:
         """The items that did not fail."""
@@ -238,8 +239,3 @@ class Resolution:
         self._expanded[node] = inner
         self.need(inner)
         self._await(node, [inner])
-
-
-def _flattened(values: Iterable[Any]) -> tuple[str, ...]:
-    """Digests of single artifacts and of lists, as one list."""
-    return tuple(d for value in values for d in digests_of(value))

@@ -23,15 +23,11 @@ from numpy.typing import NDArray
 Listener = Callable[[int, int, str], None]
 
 
-def _nobody(done: int, total: int, note: str) -> None:
-    pass
-
-
 @dataclass(frozen=True)
 class Surroundings:
     """What the runner of a task gives it."""
 
-    listener: Listener = _nobody
+    listener: Listener = lambda done, total, note: None
     cores: int = 1
     checkpoint: Path | None = None
     """Where the task's half-done work lies, if there is any."""

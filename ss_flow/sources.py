@@ -36,10 +36,6 @@ class Source:
     text: str
     """Of compiled code, the digest of its file; "" of a folder that is a package without an `__init__.py`."""
 
-    @property
-    def is_compiled(self) -> bool:
-        return self.path.suffix != ".py"
-
 
 @dataclass
 class Module:
@@ -192,7 +188,7 @@ def module_of(name: str) -> Module | None:
 def module_without_stars(name: str) -> Module | None:
     """The same, with `from ... import *` as the import of a name "*"."""
     source = source_of(name)
-    if source is None or source.is_compiled:
+    if source is None or source.path.suffix != ".py":  # compiled
         return None
     module = Module(name, source.is_package)
     statements = list(_top_level(ast.parse(source.text, str(source.path)).body, ()))
@@ -201,7 +197,8 @@ def module_without_stars(name: str) -> Module | None:
     bound |= {name for several in changing.values() for name in several[0]}
     for statement, tests in statements:
         called = (changing[name] for name in _called_at_once(statement) if name in changing)
-        changed = [*_changed_names(statement), *itertools.chain(*itertools.chain(*called))]
+        at_once = () if isinstance(statement, DEFINITIONS) else _changed_in(statement)
+        changed = [*at_once, *itertools.chain(*itertools.chain(*called))]
         for name in dict.fromkeys([*_bound_at_top(statement), *(name for name in changed if name in bound)]):
             module.add(name, *tests, statement)
         nodes = ast.walk(statement) if isinstance(statement, _BLOCKS) else (statement,)
@@ -261,12 +258,6 @@ DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 _BLOCKS = (ast.For, ast.AsyncFor, ast.While, ast.With, ast.AsyncWith, ast.Match)
 
 
-def _changed_names(statement: ast.stmt) -> Iterator[str]:
-    """The names whose objects a statement changes: `x[...] = y`, `x.y = z`, `x.append(y)`, `fill(x)`."""
-    if not isinstance(statement, DEFINITIONS):
-        yield from _changed_in(statement)
-
-
 def _changed_by_call(function: ast.FunctionDef) -> tuple[list[str], list[str]]:
     """The names that a function declares global, and those whose objects it changes: where they are its module's."""
     declared = [name for node in ast.walk(function) if isinstance(node, ast.Global) for name in node.names]
@@ -283,6 +274,7 @@ def _called_at_once(statement: ast.stmt) -> Iterator[str]:
 
 
 def _changed_in(statement: ast.stmt) -> Iterator[str]:
+    """The names whose objects a statement changes: `x[...] = y`, `x.y = z`, `x.append(y)`, `fill(x)`."""
     for node in ast.walk(statement):
         changed: list[ast.expr] = []
         if isinstance(node, ast.Subscript | ast.Attribute) and _is_written(node):

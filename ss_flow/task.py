@@ -145,7 +145,7 @@ class Task(Generic[P, R]):
         return _taken_apart(given), dict(bound.arguments)
 
     def run(self, inputs: Mapping[str, Any], parameters: Mapping[str, Any]) -> Any:
-        """Run the function; inputs: artifacts by the names of `inputs`."""
+        """Run the function; inputs: artifacts by name, as `arguments` gives them."""
         whole = {
             name: kind(**{field.name: inputs[f"{name}.{field.name}"] for field in dataclasses.fields(kind)})
             if _is_bundle(kind)
@@ -175,19 +175,10 @@ class Task(Generic[P, R]):
         return frozenset(name for name, default in self._defaults.items() if default is inspect.Parameter.empty)
 
     @functools.cached_property
-    def inputs(self) -> dict[str, bool]:
-        """Names of the artifact parameters, and whether each takes a list."""
-        return {name: kind in (tuple, Sequence) for name, kind in self._kinds.items()}
-
-    @functools.cached_property
     def streamed(self) -> frozenset[str]:
         """The parameters that take a list whose items are read one by one."""
-        return frozenset(name for name, kind in self._kinds.items() if kind is Sequence)
-
-    @functools.cached_property
-    def _kinds(self) -> dict[str, Any]:
-        """The outermost type of each input, those of bundles one by one."""
-        return {name: typing.get_origin(hint) for name, hint in _hints_taken_apart(self._artifacts)}
+        hints = _hints_taken_apart(self._artifacts)
+        return frozenset(name for name, hint in hints if typing.get_origin(hint) is Sequence)
 
     @functools.cached_property
     def _artifacts(self) -> dict[str, Any]:

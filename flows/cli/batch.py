@@ -34,7 +34,6 @@ from ss_flow.flows.cli.prepare import (
     display,
     finish,
     first_failure,
-    header,
     prepare,
     tell_remarks,
 )
@@ -96,13 +95,7 @@ class Batch:
             tell_remarks(scenes.values(), tell)
             with display(tell) as screen:
                 requests = [
-                    Request(
-                        prepared.build,
-                        prepared.name,
-                        header(prepared, options),
-                        options.target,
-                        Prefixed(screen, folders[path], leading=position == 0),
-                    )
+                    prepared.request(options, Prefixed(screen, folders[path], leading=position == 0))
                     for position, (path, prepared) in enumerate(scenes.items())
                 ]
                 if options.dry_run:

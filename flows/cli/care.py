@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Literal, TypeVar
 
-import tyro
 from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
@@ -22,7 +21,7 @@ from ss_flow.cache.survey import Survey, Tally, Usage
 from ss_flow.cache.verify import verify
 from ss_flow.engine import RUN_CLAIM
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import OptionalCount, OptionalText, StoreOptions, console
+from ss_flow.flows.cli.context import InStore, OptionalCount, OptionalText, StoreOptions, console
 from ss_flow.flows.cli.pins import tell_pins
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.deliver import STATUS_EXIT
@@ -30,7 +29,6 @@ from ss_flow.runs import Run, latest_runs
 from ss_flow.sweep import scene_of
 from ss_flow.units import parse_bytes, parse_seconds
 
-Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 T = TypeVar("T")
 
 SHOWN = 10
@@ -55,7 +53,7 @@ class CacheCollect:
     """Tell what would go, and delete nothing."""
     json: bool = False
     """Print one JSON document."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -164,7 +162,7 @@ class CacheUsage:
     """Which table."""
     json: bool = False
     """Print one JSON document."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -206,7 +204,7 @@ class CacheVerify:
 
     json: bool = False
     """Print one JSON document."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:

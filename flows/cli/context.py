@@ -41,7 +41,7 @@ class StoreOptions:
     @property
     def location(self) -> str | Path:
         """The store's folder, or its URL."""
-        location = self.cache or os.environ.get("SS_FLOW_CACHE", "") or default_cache()
+        location = self.cache or os.environ.get("SS_FLOW_CACHE", "") or user_cache() / "store"
         return str(location) if is_url(location) else Path(location).expanduser()
 
     def existing_store(self) -> Store:
@@ -76,9 +76,8 @@ class StoreOptions:
         return store
 
 
-def default_cache() -> Path:
-    """The user's cache folder for ss-flow."""
-    return user_cache() / "store"
+InStore = tyro.conf.OmitArgPrefixes[StoreOptions]
+"""Of a command's field `store`: its options are those of the command."""
 
 
 def file_digests(store: Store, *, verify: bool = False) -> FileDigests:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import StoreOptions, console, open_run
+from ss_flow.flows.cli.context import InStore, StoreOptions, console, open_run
 from ss_flow.flows.cli.prepare import display
 
 
@@ -30,7 +30,7 @@ class EditRun:
     """How many tasks may run at once; 0 = one a core."""
     json: bool = False
     """Print one JSON document on stdout, and nothing else there."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:

@@ -18,6 +18,7 @@ from rich.table import Table
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import (
+    InStore,
     OptionalPath,
     StoreOptions,
     choose_model,
@@ -79,7 +80,7 @@ class Evaluate:
     """For "lerf-...": a file (.json) of what to ask for in the place of a category's own name: {category: text}."""
     json: bool = False
     """Print one JSON document."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
@@ -166,7 +167,7 @@ class Evaluate:
     def _of_labels(self, warnings: list[str]) -> _Tables:
         run = open_run(self.result, self.store, _LERF_NEEDED[self.protocol])
         files = open_scene(Path(run.document["scene"]))
-        name = encoder_name(run.store, run.results.digests["describe"])
+        name = encoder_name(run)
         with file_digests(run.store) as digests:
             labelled = LabelledScene.of(
                 self.truth or labels_of(files),
@@ -178,7 +179,8 @@ class Evaluate:
             )
         if labelled.unread:
             said = ", ".join(labelled.unread)
-            warnings.append(f"{name_in_words(name)} cannot be asked for {said}; these categories score 0.")
+            who = "the encoder of colour words" if name == "none" else name
+            warnings.append(f"{who} cannot be asked for {said}; these categories score 0.")
         build = LERF[self.protocol]
         asked: dict[str, Any] = {"encoder": FALLBACKS["encoder"] if name == "none" else name}
         if self.protocol != "lerf-2d":
@@ -197,11 +199,6 @@ class _Tables:
     """Rows of single objects, by what they are."""
     asked: Mapping[str, Any] = field(default_factory=dict)
     """What texts were asked with, where they were (spec 2.2): the encoder, and what it depends on besides."""
-
-
-def name_in_words(encoder: str) -> str:
-    """What to call an encoder in messages."""
-    return "the encoder of colour words" if encoder == "none" else encoder
 
 
 def _evaluated(

@@ -14,9 +14,9 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import export as formats
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, file_digests, open_run, references
+from ss_flow.flows.cli.context import InStore, OptionalPath, StoreOptions, console, file_digests, open_run, references
 from ss_flow.flows.cli.prepare import display
-from ss_flow.flows.deliver import STATUS_EXIT
+from ss_flow.flows.deliver import STATUS_EXIT, failure_records
 from ss_flow.flows.results import BACKGROUND, FinishedRun, not_of_an_edit
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Gaussians
@@ -59,7 +59,7 @@ class Export:
     """How many tasks may run at once; 0 = one a core."""
     json: bool = False
     """Print one JSON document."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -71,8 +71,7 @@ class Export:
         ids = run.ids(self.instance) if self.instance else run.all_ids() if by_instance else None
         folder = several or workspace
         out = self.out or Path("ss-flow-export") / f"{run.name}{self._ending(ids or (), folder=folder)}"
-        _check_place(out, run.store.location, folder=folder)
-        self._check_suffix(out, folder=folder)
+        self._check_place(out, run.store.location, folder=folder)
         if workspace:
             if "edit" in run.document:
                 raise not_of_an_edit(run.folder, run.document, "photos")
@@ -119,21 +118,25 @@ class Export:
             return f"{chosen}-{self.format}"
         return chosen + _ADDED.get(self.format, "") + formats.suffix_of(self.format)
 
-    def _check_suffix(self, out: Path, *, folder: bool) -> None:
-        """Raises InputError for a file that would be taken for one of another format by its name."""
+    def _check_place(self, out: Path, store: str, *, folder: bool) -> None:
+        """Raises InputError unless the export can be written here: a new place, or that of an earlier export; and for
+        a file that would be taken for one of another format by its name."""
+        if folder:
+            check_replaceable(out, EXPORT, store)
+            return
+        check_outside(out, store)
+        check_named(out, "--out")
         own = formats.suffix_of(self.format)
         others = {formats.suffix_of(name) for name in get_args(formats.Format)} - {""} | {".gltf"}  # glTF's JSON form
-        if not folder and out.suffix in others and not own.endswith(out.suffix):
+        if out.suffix in others and not own.endswith(out.suffix):
             raise InputError(f"{out} is named like another format; a file of {self.format} ends in {own}.")
 
     def _write_workspace(self, out: Path, run: FinishedRun) -> int:
         """Write the photos and cameras that the run worked with."""
-        frames = [run.store.get(value) for value in run.document["results"]["ingest"]]
-        cameras = run.results.one("cameras")
+        frames, cameras = run.results.all("ingest"), run.results.one("cameras")
         with replacing_own(out, EXPORT) as filling:
             if self.format == "colmap":
-                maps = [run.store.get(value) for value in run.document["results"]["masks"]]
-                write_undistorted(filling, frames, cameras, maps)
+                write_undistorted(filling, frames, cameras, run.results.all("masks"))
             else:
                 write_nerfstudio(filling, frames, cameras)
             files = [
@@ -167,9 +170,8 @@ class Export:
         return files
 
     def _tell(self, out: Path, report: Report | None, files: list[dict[str, Any]]) -> int:
-        failed = report.failures if report else []
-        status = "degraded" if failed else "ok"
-        failures = [{"label": f.label, "error": f"{type(f.error).__name__}: {f.error}"} for f in failed]
+        failures = failure_records(report) if report else []
+        status = "degraded" if failures else "ok"
         warnings = sorted({w for node in (report.nodes if report else ()) for w in node.get("warnings") or ()})
         if self.json:
             document = {"status": status, "format": self.format, "out": str(out), "files": files}
@@ -214,12 +216,3 @@ def _check_there(scene: Gaussians, ids: tuple[int, ...] | None, folder: Path) ->
         held, what = held[held == BACKGROUND], f"the background of {folder}"
     if not len(held):
         raise InputError(f"{what} has no Gaussians, so there is nothing to export.")
-
-
-def _check_place(out: Path, store: str, *, folder: bool) -> None:
-    """Raises InputError unless the export can be written here: a new place, or that of an earlier export."""
-    if folder:
-        check_replaceable(out, EXPORT, store)
-    else:
-        check_outside(out, store)
-        check_named(out, "--out")

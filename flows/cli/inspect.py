@@ -1,4 +1,4 @@
-"""Looking at runs and at what they left: status, why, graph, cache ls, cache show."""
+"""Looking at runs and at what they left: status, graph, cache ls, cache show."""
 
 from __future__ import annotations
 
@@ -18,14 +18,12 @@ from rich.table import Table
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import OptionalPath, PositionalPath, StoreOptions, console
+from ss_flow.flows.cli.context import InStore, OptionalPath, PositionalPath, StoreOptions, console
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.describe import told
 from ss_flow.runs import DONE, Run, latest_runs, settled
 from ss_flow.tasks.deliver.output import check_named
 from ss_flow.telemetry import trace
-
-Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ class Status:
     """Print one JSON document."""
     otlp: OptionalPath = None
     """Also write the run as an OpenTelemetry trace (OTLP, JSON) to this file."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -147,7 +145,7 @@ class Graph:
 
     scene: PositionalPath = None
     """The scene; the one that ran last, when left out."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -168,7 +166,7 @@ class CacheList:
     """The scene; the one that ran last, when left out."""
     json: bool = False
     """Print one JSON document."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -206,7 +204,7 @@ class CacheShow:
     """Draw points and Gaussians as this view's camera sees them."""
     scene: OptionalPath = None
     """The scene; the one that ran last, when left out."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -216,9 +214,15 @@ class CacheShow:
         run, digests, asked = results_named(store, self.scene, self.what)
         values = [store.get(digest) for digest in digests]
         if self.png:
-            from ss_flow.flows.cli.drawing import draw_results
+            from ss_flow.flows.view.artifact import around_of, artifact_picture
 
-            draw_results(store, run or latest_run(store, self.scene), values, self.view, self.png)
+            around = around_of(store, run or latest_run(store, self.scene))
+            if around.cameras is not None and not 0 <= self.view < len(around.cameras.names):
+                last = len(around.cameras.names) - 1
+                raise InputError(f"--view {self.view} is out of range; the run has views 0 to {last}.")
+            picture = artifact_picture(values[0] if len(values) == 1 else values, around, self.view)
+            self.png.parent.mkdir(parents=True, exist_ok=True)
+            self.png.write_bytes(picture)
         out = console(json=False)
         for line in told(values, digests, store, run, asked):
             out.print(escape(line))

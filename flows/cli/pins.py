@@ -17,12 +17,10 @@ from ss_flow.cache.pins import Pin, pin, read_pins, unpin
 from ss_flow.cache.store import Store
 from ss_flow.cache.survey import Survey
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import OptionalPath, PositionalText, StoreOptions, console
+from ss_flow.flows.cli.context import InStore, OptionalPath, PositionalText, StoreOptions, console
 from ss_flow.flows.cli.inspect import run_with
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.runs import Run, latest_runs
-
-Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class CachePin:
     """The scene that the step is of; the one that ran last, when left out."""
     json: bool = False
     """Print one JSON document."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -85,7 +83,7 @@ class CacheUnpin:
     """What was pinned, as `cache pin` lists it; the first characters of a digest will do."""
     scene: OptionalPath = None
     """Only what was pinned of this scene."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:

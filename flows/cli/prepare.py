@@ -14,12 +14,12 @@ from rich.markup import escape
 
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.store import Store
-from ss_flow.engine import Report
+from ss_flow.engine import Report, Request
 from ss_flow.errors import InputError
 from ss_flow.events import Reporter
 from ss_flow.flows import settings
 from ss_flow.flows.capture import Capture, capture, turned
-from ss_flow.flows.cli.context import OptionalText, StoreOptions, choose_model, choose_patches, references
+from ss_flow.flows.cli.context import InStore, OptionalText, StoreOptions, choose_model, choose_patches, references
 from ss_flow.flows.deliver import deliver, remarks, run_document
 from ss_flow.flows.params import Params
 from ss_flow.flows.split import Networks
@@ -64,7 +64,7 @@ class RunOptions:
     """Read all input files again, instead of trusting their size and time of change."""
     json: bool = False
     """Print one JSON document on stdout, and nothing else there."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     @property
@@ -100,15 +100,10 @@ class RunOptions:
         return {
             "jobs": self.jobs,
             "memory_mb": memory_mb,
-            "gpus": usable_gpus(),
+            "gpus": int(device_here() == "cuda" or lacks_cuda() is None),  # whatever the driver shows
             "executor": self.executor,
             "dry": self.dry_run,
         }
-
-
-def usable_gpus() -> int:
-    """1 where Gaussians or networks are computed on CUDA here, else 0, whatever the driver shows."""
-    return int(device_here() == "cuda" or lacks_cuda() is None)
 
 
 @dataclass(frozen=True)
@@ -126,9 +121,20 @@ class Prepared:
         """What its runs are recorded as."""
         return str(self.scene.place.resolve())
 
+    def request(
+        self,
+        options: RunOptions,
+        reporter: Reporter,
+        done: Callable[[Report], None] = lambda report: None,
+        recorded: dict[str, Any] | None = None,
+    ) -> Request:
+        """What to ask the engine for. recorded: what the record of the run says besides how it was asked for."""
+        asked = {"preset": options.preset, "params": settings.flat(self.params)}
+        return Request(self.build, self.name, asked | (recorded or {}), options.target, reporter, done)
+
     def steps(self) -> list[str]:
         """The names of the DAG's results. Raises InputError as `build` does."""
-        with Flow(self.name).building():
+        with Flow().building():
             return list(self.build())
 
 
@@ -209,11 +215,6 @@ def _check_item(until: str, node: Node) -> None:
     nodes = node.items if isinstance(node, Gather) else [node]
     if item and all(isinstance(one, Call) and one.item != item for one in nodes):
         raise InputError(f"--until {until!r} names an item that is not there; leave out [{item}].")
-
-
-def header(prepared: Prepared, options: RunOptions) -> dict[str, Any]:
-    """What the record of a run says of how it was asked for."""
-    return {"preset": options.preset, "params": settings.flat(prepared.params)}
 
 
 def finish(

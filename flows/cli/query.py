@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
-from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import (
+    InStore,
     OptionalCount,
     OptionalNumber,
     OptionalPath,
@@ -30,6 +30,7 @@ from ss_flow.flows.query import NEEDED, described_parts
 from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
 from ss_flow.tasks.deliver.places import Written, check_replaceable, replacing_own, sizes
+from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.colour_words import ColourWords, words_ignored
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
@@ -65,7 +66,7 @@ class Query:
     shows them)."""
     json: bool = False
     """Print one JSON document."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -81,8 +82,7 @@ class Query:
         params = self._params(document)
         if self.out is not None:
             check_replaceable(self.out, ANSWER, run.store.location)
-        with file_digests(run.store) as digests:
-            encoder = choose_model("text-image", encoder_name(run.store, document["results"]["describe"]), digests)
+        encoder = encoder_of(run)
 
         def build() -> dict[str, Any]:
             nodes, known = run.results.nodes(), {}
@@ -235,7 +235,14 @@ def _on_photos(run: FinishedRun, parts: Sequence[PartMasks], names: Sequence[str
         yield on_photo(mask.astype(np.uint8), frame, None if lens is None else photo_pixels(frame, lens)) > 0
 
 
-def encoder_name(store: Store, descriptors: Sequence[str]) -> str:
-    """The network that described the instances, which must also read the text."""
-    name = store.get(descriptors[0]).encoder if descriptors else ColourWords.name
+def encoder_name(run: FinishedRun) -> str:
+    """The network that described the instances, which must also read the text; "none" for colour words."""
+    descriptors = run.results.digests["describe"]
+    name = run.store.get(descriptors[0]).encoder if descriptors else ColourWords.name
     return "none" if name == ColourWords.name else str(name)
+
+
+def encoder_of(run: FinishedRun) -> Model | None:
+    """The same, ready to be used; None for colour words. Raises InputError when it is not on this machine."""
+    with file_digests(run.store) as digests:
+        return choose_model("text-image", encoder_name(run), digests)

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from rich.markup import escape
 
-from ss_flow.flows.cli.context import OptionalPath, StoreOptions, console, open_run
+from ss_flow.flows.cli.context import InStore, OptionalPath, StoreOptions, console, open_run
 from ss_flow.flows.cli.diff import changes, difference
 from ss_flow.flows.deliver import write_report
 from ss_flow.tasks.deliver.output import check_file
@@ -26,7 +26,7 @@ class WriteReport:
     """The output folder of a run."""
     beside: OptionalPath = None
     """That of another run, to compare with, as `ss-flow diff` does."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:

@@ -14,14 +14,14 @@ from rich.console import Console
 
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.store import Store
-from ss_flow.engine import Report, Request, run_flows
+from ss_flow.engine import Report, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import paper, settings
 from ss_flow.flows.cli.context import console, file_digests, references
-from ss_flow.flows.cli.prepare import Prefixed, Prepared, RunOptions, display, header, prepare, tell_remarks
+from ss_flow.flows.cli.prepare import Prefixed, Prepared, RunOptions, display, prepare, tell_remarks
 from ss_flow.flows.cli.reproduce_report import Found, Run, failures, section_of, tell_table
 from ss_flow.flows.deliver import FALLBACKS
-from ss_flow.flows.demo import generated_scenes
+from ss_flow.flows.demo import generated_scene
 from ss_flow.flows.evaluate import LabelledScene, labels_of
 from ss_flow.flows.generated import RoomParams
 from ss_flow.flows.params import Params
@@ -111,9 +111,12 @@ class Reproduce:
     def _scenes(self, plan: Plan, store: Store, tell: Console, engine: Mapping[str, Any]) -> list[Path]:
         if self.data == GENERATED:
             room = RoomParams(views=self.views, width=self.width, height=self.width * 3 // 4, held_out=0)
-            rooms = [replace(room, seed=seed) for seed in range(self.rooms)]
+            folders = [self.out / f"room-{seed}" for seed in range(self.rooms)]
             with display(tell) as screen:
-                return generated_scenes(self.out, rooms, self.masks, store, screen, engine)
+                for seed, folder in enumerate(folders):
+                    of_seed = replace(room, seed=seed)
+                    generated_scene(folder, of_seed, self.masks, store, screen, engine, annotated=True)
+            return folders
         return scenes_of(Path(self.data), plan.data, one=self.table in _OF_ONE_SCENE)
 
     def _params(self, plan: Plan, variant: Variant, seed: int) -> Params:
@@ -177,17 +180,16 @@ class Reproduce:
 
         with display(tell) as screen:
             requests = [
-                Request(
-                    partial(build, place),
-                    one.prepared.name,
-                    header(one.prepared, self.execution) | recorded_as(one.prepared.name, self._what(runs[place])),
-                    None,
+                one.prepared.request(
+                    self.execution,
                     Prefixed(screen, " ".join(self._what(runs[place]).values()), leading=place == min(ready)),
                     partial(done, place),
+                    recorded_as(one.prepared.name, self._what(runs[place])),
                 )
                 for place, one in ready.items()
             ]
-            run_flows(requests, store, **self.execution.engine())
+            measuring = [replace(r, build=partial(build, place)) for place, r in zip(ready, requests, strict=True)]
+            run_flows(measuring, store, **self.execution.engine())
         return found
 
     def _what(self, run: Run) -> dict[str, str]:

@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ss_flow.engine import Report, Request, run_flows
+from ss_flow.engine import Report, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import OptionalPath, console, file_digests
-from ss_flow.flows.cli.prepare import RunOptions, display, finish, header, prepare, tell_remarks
+from ss_flow.flows.cli.prepare import RunOptions, display, finish, prepare, tell_remarks
 from ss_flow.flows.cli.telling import hits_of, print_table, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
@@ -98,7 +98,7 @@ class Demo:
     """How to run."""
 
     def run(self) -> int:
-        from ss_flow.flows.demo import demo_scene, photographs
+        from ss_flow.flows.demo import generated_scene, photographs
         from ss_flow.flows.generated import RoomParams
 
         options, scene = self.execution, self.out / "scene"
@@ -112,7 +112,7 @@ class Demo:
         room = RoomParams(objects=self.objects, views=self.views, seed=self.seed)
         out = console(json=options.json)
         with display(out) as screen:
-            there = demo_scene(scene, room, self.masks, options.store.open_store(), screen, engine)
+            there = generated_scene(scene, room, self.masks, options.store.open_store(), screen, engine)
         if there:
             return run_scene(open_scene(scene), self.out / "result", params, options)
         first = {"label": photographs.name, "why": f"{scene} does not hold this room"}
@@ -142,8 +142,7 @@ def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions,
 
     tell_remarks([prepared], console_out)
     with digests, display(console_out) as screen:
-        request = Request(prepared.build, prepared.name, header(prepared, options), options.target, screen, done)
-        (report,) = run_flows([request], store, **engine)
+        (report,) = run_flows([prepared.request(options, screen, done)], store, **engine)
     if options.dry_run:
         return _tell_plan(report, console_out, json_wanted=options.json)
     (document,) = documents

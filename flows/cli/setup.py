@@ -11,6 +11,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal
 
 import tyro
@@ -18,7 +19,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.errors import InputError
-from ss_flow.flows.cli.context import PositionalText, StoreOptions, console
+from ss_flow.flows.cli.context import InStore, PositionalText, StoreOptions, console
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.tasks.models import catalogue
 
@@ -131,54 +132,36 @@ class Completion:
 class Doctor:
     """Tell whether this machine has all that runs need, and what to do where it has not."""
 
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
         again = "install again: pip install --force-reinstall"
-        checks = [
-            _Check("Python", lambda: (sys.version.split()[0], "")),
-            _Check("store", lambda: (_store(self.store), ""), "name a folder that can be written, with --cache"),
-            _Check("rasterizer", lambda: (_rasterizer(), ""), "install ss-flow again, with a C++17 compiler at hand"),
-            _Check("CUDA", _cuda),
-            _Check(
-                "Open3D",
-                lambda: (_open3d(), ""),
-                f"{again} {'open3d-cpu' if _x86_linux() else 'open3d'} libusb-package",
-            ),
-            _Check("pycolmap", lambda: (_pycolmap(), ""), f"{again} pycolmap"),
-            _Check("onnxruntime", lambda: (_onnxruntime(), ""), f"{again} onnxruntime"),
-            *(
-                _Check(name, lambda n=name, m=module: (_library(n, m), ""), f"{again} {name}")  # type: ignore[misc]
-                for name, module in _LIBRARIES
-            ),
-            *(
-                _Check(f"{kind} network", lambda k=kind: _model(k))  # type: ignore[misc]
-                for kind in _WITHOUT
-            ),
+        open3d = "open3d-cpu" if _x86_linux() else "open3d"
+        # What a run may need; what says its state, with what would better it where that is worth saying, and raises
+        # where it is needed and lacking; what to do then.
+        checks: list[tuple[str, Callable[[], str | tuple[str, str]], str]] = [
+            ("Python", lambda: sys.version.split()[0], ""),
+            ("store", partial(_store, self.store), "name a folder that can be written, with --cache"),
+            ("rasterizer", _rasterizer, "install ss-flow again, with a C++17 compiler at hand"),
+            ("CUDA", _cuda, ""),
+            ("Open3D", _open3d, f"{again} {open3d} libusb-package"),
+            ("pycolmap", _pycolmap, f"{again} pycolmap"),
+            ("onnxruntime", _onnxruntime, f"{again} onnxruntime"),
+            *((name, partial(_library, name, module), f"{again} {name}") for name, module in _LIBRARIES),
+            *((f"{kind} network", partial(_model, kind), "") for kind in _WITHOUT),
         ]
         table = Table("what", "state", "what to do", box=None)
         bad = 0
-        for check in checks:
+        for name, look, mend in checks:
             try:
-                state, mend = check.look()
-                table.add_row(check.name, escape(state), escape(mend))
+                found = look()
+                table.add_row(name, *map(escape, found if isinstance(found, tuple) else (found,)))
             except Exception as error:
                 bad += 1
-                table.add_row(check.name, f"[red]{escape(str(error) or type(error).__name__)}[/]", escape(check.mend))
+                table.add_row(name, f"[red]{escape(str(error) or type(error).__name__)}[/]", escape(mend))
         print_table(table, console(json=False))
         return 1 if bad else 0
-
-
-@dataclass(frozen=True)
-class _Check:
-    """One thing that a run may need."""
-
-    name: str
-    look: Callable[[], tuple[str, str]]
-    """Its state, and what would better it where that is worth saying; raises where it is needed and lacking."""
-    mend: str = ""
-    """What to do when it raises."""
 
 
 def _store(options: StoreOptions) -> str:

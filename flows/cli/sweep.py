@@ -19,7 +19,7 @@ from rich.markup import escape
 
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.store import Store
-from ss_flow.engine import Report, Request, run_flows
+from ss_flow.engine import Report, run_flows
 from ss_flow.errors import InputError
 from ss_flow.flows import settings
 from ss_flow.flows.cli.context import OptionalPath, OptionalText, console, file_digests
@@ -30,7 +30,6 @@ from ss_flow.flows.cli.prepare import (
     display,
     finish,
     first_failure,
-    header,
     prepare,
     tell_remarks,
 )
@@ -120,13 +119,11 @@ class Sweep:
             tell_remarks((variant.prepared for variant in variants), tell)
             with display(tell) as screen:
                 requests = [
-                    Request(
-                        variant.prepared.build,
-                        variant.prepared.name,
-                        header(variant.prepared, options) | recorded_as(variant.prepared.name, variant.values, asked),
-                        options.target,
+                    variant.prepared.request(
+                        options,
                         Prefixed(screen, variant.label(scene=len(scenes) > 1), leading=position == 0),
                         partial(done, position),
+                        recorded_as(variant.prepared.name, variant.values, asked),
                     )
                     for position, variant in enumerate(variants)
                 ]

@@ -81,10 +81,10 @@ def _lines(
                 axis.plot(*zip(*sorted(points), strict=True), marker=next(markers), label=label, alpha=0.8)
             seen += [x for x, _ in points]
     for metric in metrics if numeric else ():
-        if (published := paper.curve(params[0], metric)) is not None:
-            x, y = published.points()
-            axis.plot(x, y, linestyle="--", marker="x", color="0.4", label=published.label)
-            seen += x
+        if (published := paper.curves().get((params[0], metric))) is not None:
+            drawn = (published.values, published.figures)
+            axis.plot(*drawn, linestyle="--", marker="x", color="0.4", label=published.label)
+            seen += published.values
     if numeric and _is_logarithmic(seen):
         axis.set_xscale("log")
     if not numeric:

@@ -15,15 +15,14 @@ from rich.markup import escape
 
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import (
+    InStore,
     OptionalCount,
     OptionalPath,
     StoreOptions,
-    choose_model,
     console,
-    file_digests,
     open_run,
 )
-from ss_flow.flows.cli.query import encoder_name, query_params
+from ss_flow.flows.cli.query import encoder_of, query_params
 from ss_flow.flows.results import FinishedRun, read_run
 from ss_flow.tasks.deliver.output import check_named
 
@@ -60,7 +59,7 @@ class View:
     """The address to listen on; 0.0.0.0 lets other machines in who know the token."""
     port: int = 8080
     """The port to listen on; the next free one where it is taken."""
-    store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:
@@ -193,6 +192,4 @@ def search_of(run: FinishedRun) -> Search | None:
 
     if run.results.missing(("describe",)):
         return None
-    with file_digests(run.store) as digests:
-        encoder = choose_model("text-image", encoder_name(run.store, run.results.digests["describe"]), digests)
-    return Search(tuple(run.results.all("describe")), query_params(run.document), encoder)
+    return Search(tuple(run.results.all("describe")), query_params(run.document), encoder_of(run))

@@ -12,12 +12,10 @@ from rich.markup import escape
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.explain import part_of, since_last
-from ss_flow.flows.cli.context import PositionalPath, StoreOptions, console
+from ss_flow.flows.cli.context import InStore, PositionalPath, StoreOptions, console
 from ss_flow.flows.cli.inspect import named, runs_to_ask
 from ss_flow.runs import DONE, PreviousKeys, Run, latest_runs
 from ss_flow.sweep import scene_of
-
-Options = tyro.conf.OmitArgPrefixes[StoreOptions]
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Why:
     """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
     scene: PositionalPath = None
     """The scene; the one that ran last, when left out."""
-    store: Options = StoreOptions()
+    store: InStore = StoreOptions()
     """Where results are kept."""
 
     def run(self) -> int:

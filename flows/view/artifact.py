@@ -93,10 +93,14 @@ def write_artifact_page(
     write_atomically(file, page)
 
 
-def artifact_picture(value: Any, around: Around) -> bytes:
-    """A picture of an artifact as a PNG, over its photo where it is about one view."""
+def artifact_picture(value: Any, around: Around, view: int | None = None) -> bytes:
+    """A picture of an artifact, or of a list of them, as a PNG; over its photo where it is about one view.
+
+    view: the position of the view that looks at points and Gaussians; None = that which the artifact is about.
+    """
     name = getattr(value, "name", "")
-    view = around.cameras.names.index(name) if around.cameras and name in around.cameras.names else 0
+    if view is None:
+        view = around.cameras.names.index(name) if around.cameras and name in around.cameras.names else 0
     picture = picture_of(
         value,
         frame=around.frame(name),

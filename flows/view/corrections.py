@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections import defaultdict
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import numpy as np
 from ss_flow.cache.files import write_atomically
 from ss_flow.errors import InputError
 from ss_flow.flows.deliver import photo_lenses
+from ss_flow.flows.edit_objects import unused_name
 from ss_flow.flows.results import BACKGROUND, FinishedRun
 from ss_flow.tasks.artifacts import Float32, Float64, Frame, PointCloud, PointLabels, Visibility
 from ss_flow.tasks.capture.hints import clicks, read_hints
@@ -85,7 +84,7 @@ class Corrections:
             raise InputError("pick a point on an object; nothing else can be corrected.")
         away = np.linalg.norm(self._cloud.points[rows] - place, axis=1)
         if self.thing not in self._names:
-            self._names[self.thing] = _unused(self._run.names[str(instance)], self._names.values())
+            self._names[self.thing] = unused_name(self._run.names[str(instance)], self._names.values())
         self.picks.append(Pick(self.thing, int(rows[away.argmin()])))
 
     def next_thing(self) -> None:
@@ -176,12 +175,3 @@ class Corrections:
         except OSError as error:
             raise InputError(f"{self.file.name} cannot be written: {error.strerror}.") from None
         self._saved = list(self.picks)
-
-
-def _unused(name: str, used: Collection[str]) -> str:
-    """A name as it is, or with the first number that makes it another."""
-    numbers = itertools.count(2)
-    found = name
-    while found in used:
-        found = f"{name} {next(numbers)}"
-    return found

@@ -76,7 +76,8 @@ class ObjectList:
 
     def picture(self, instance: int) -> str:
         """A small picture of an object as HTML: a cut-out of a photo, or its colour."""
-        return self._pictures.get(instance) or _swatch(instance)
+        swatch = np.full((1, 1, 3), instance_color(instance), np.uint8)
+        return self._pictures.get(instance) or _as_html(compressed(swatch))
 
     def set_pictures(self, pictures: Mapping[int, UInt8]) -> None:
         """pictures: the bytes of a PNG or JPEG file by instance."""
@@ -164,10 +165,6 @@ class ObjectList:
             return
         self._page = max(0, self._page + (1 if event.target.value == "Next" else -1))
         self.show()
-
-
-def _swatch(instance: int) -> str:
-    return _as_html(compressed(np.full((1, 1, 3), instance_color(instance), np.uint8)))
 
 
 def _as_html(picture: UInt8) -> str:

@@ -134,9 +134,9 @@ class Session:
         """Show nothing but these."""
         self.hidden = frozenset(self.state.pieces.keys() - set(instances))
 
-    def show(self, instances: Iterable[int] | None = None) -> None:
-        """Show these again, or everything."""
-        self.hidden = frozenset() if instances is None else self.hidden - set(instances)
+    def show(self) -> None:
+        """Show everything again."""
+        self.hidden = frozenset()
 
     def visible(self) -> dict[int, Piece]:
         """What is shown."""
@@ -192,13 +192,10 @@ def _gathered(pieces: Sequence[Piece]) -> Piece:
 def _named(operation: Operation, objects: Objects) -> list[int]:
     """The ids of the instances that a checked operation names."""
     named = operation.get("instances", operation.get("instance"))
+    several = named if isinstance(named, list) else [named]
     background = (BACKGROUND, "background") if operation["op"] in ("remove", "keep") else ()
-    found = (BACKGROUND if one in background else objects.find(one) for one in _listed(named))
+    found = (BACKGROUND if one in background else objects.find(one) for one in several)
     return list(dict.fromkeys(instance for instance in found if instance is not None))
-
-
-def _listed(named: Any) -> list[Any]:
-    return named if isinstance(named, list) else [named]
 
 
 def read_operations(file: Path) -> list[Operation]:

@@ -196,11 +196,6 @@ class Timeline:
                 known[name].draw(self._scene, f"{node}/it")
                 self._drawn[index, side] = True
 
-    def remove(self) -> None:
-        """Take everything out of the scene."""
-        self._scene.remove_by_name(_ROOT)
-        self._drawn.clear()
-
     def _set(self, index: int, side: int, visible: bool) -> None:
         handle = self._scene.get_handle_by_name(f"{_ROOT}/{side}/{index}")
         if handle is not None:
@@ -221,11 +216,9 @@ def add_timeline(
     share: as for `stages`. Raises InputError when nothing of the run is left in the store.
     """
     timeline = Timeline(server.scene, run, beside, share)
-    ends = {0: "now", len(timeline.names): timeline.names[-1]}
+    ends = ((0, "now"), (len(timeline.names), timeline.names[-1]))
     with server.gui.add_folder("How it came about", expand_by_default=False):
-        slider = server.gui.add_slider(
-            "Stage", 0, len(timeline.names), 1, 0, marks=tuple((place, said) for place, said in ends.items())
-        )
+        slider = server.gui.add_slider("Stage", 0, len(timeline.names), 1, 0, marks=ends)
         told = server.gui.add_html("")
 
     @slider.on_update

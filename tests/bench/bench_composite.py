@@ -31,6 +31,7 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from depth_sensor import sensed
 from generated_desk import generate_desk
 
 from ss_flow.cache.store import Store
@@ -39,7 +40,6 @@ from ss_flow.flows import settings
 from ss_flow.flows.cli.context import file_digests
 from ss_flow.flows.cli.prepare import RunOptions, prepare
 from ss_flow.flows.generated import RoomParams, generate, write_scene
-from ss_flow.flows.generated.sensor import sensed
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import Frame, LabelMap
 from ss_flow.tasks.capture.scene import open_scene

@@ -31,6 +31,9 @@ import numpy as np
 from bench_instances import SIZES
 from bench_quality import view_of
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from depth_sensor import sensed
+
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, run_flow
 from ss_flow.flows import settings
@@ -38,7 +41,6 @@ from ss_flow.flows.capture import capture
 from ss_flow.flows.cli.context import file_digests
 from ss_flow.flows.cli.prepare import RunOptions, prepare
 from ss_flow.flows.generated import RoomParams, generate, write_scene
-from ss_flow.flows.generated.sensor import sensed
 from ss_flow.flows.params import Params
 from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef

@@ -306,11 +306,10 @@ def test_the_papers_curves_are_of_parameters_and_figures_that_there_are():
     from ss_flow.flows import settings
     from ss_flow.flows.params import Params
 
-    for curve in paper.curves():
-        assert curve.parameter in settings.flat(Params())
-        assert curve.metric in {name for names in NAMES.values() for name in names}
-        x, y = curve.points()
-        assert x == sorted(x) and all(0 <= value <= 1 for value in y)
+    for (parameter, metric), curve in paper.curves().items():
+        assert parameter in settings.flat(Params())
+        assert metric in {name for names in NAMES.values() for name in names}
+        assert curve.values == sorted(curve.values) and all(0 <= value <= 1 for value in curve.figures)
 
 
 @pytest.mark.parametrize(

@@ -121,8 +121,6 @@ def test_one_stage_is_shown_at_a_time_and_drawn_once(run, scene):
     assert visible(scene) == {"0/0"} and set(scene._handle_from_node_name) == held
     timeline.show(None)
     assert visible(scene) == set()
-    timeline.remove()
-    assert not [name for name in scene._handle_from_node_name if name.startswith("/timeline")]
 
 
 def test_another_run_stands_beside_at_the_stages_that_both_have(run, scene):

@@ -796,7 +796,7 @@ def test_a_negative_number_is_refused_in_one_sentence(store, name):
 
 
 def test_an_input_that_is_no_node_is_refused():
-    flow = Flow("x")
+    flow = Flow()
     with flow.building(), pytest.raises(TypeError, match="must be a node"):
         gather([1.0])
 
@@ -850,7 +850,7 @@ def test_a_mistake_in_a_flow_is_told_in_one_sentence(store, build, said):
         run(store, build)
 
 
-with Flow("another").building():
+with Flow().building():
     OF_ANOTHER_FLOW = toy.source(values=(1.0,))
 
 
@@ -867,12 +867,12 @@ def test_a_type_that_only_type_checkers_import_is_told_with_the_task():
         return x
 
     hidden.__annotations__["x"] = "NDArray"
-    with Flow("x").building(), pytest.raises(TypeError, match="that the task t declares is not there at run time"):
+    with Flow().building(), pytest.raises(TypeError, match="that the task t declares is not there at run time"):
         task(name="t")(hidden)(None)
 
 
 def test_only_a_node_has_items_to_pick():
-    with Flow("x").building(), pytest.raises(TypeError, match="not a list"):
+    with Flow().building(), pytest.raises(TypeError, match="not a list"):
         pick([1, 2], [0])
 
 
@@ -933,7 +933,7 @@ def test_a_call_has_parameters_of_its_own_as_its_key_sees_them():
         return Linear()
 
     given = {"pair": [1, np.int64(2)], "many": (1,), "free": {"b": [1], "a": np.float32(0.5)}}
-    with Flow("x").building():
+    with Flow().building():
         kept = several(**given).parameters
     given["free"]["b"].append(2)
     assert repr(kept) == "{'pair': (1, 2), 'many': [1], 'free': {'a': 0.5, 'b': [1]}}"
@@ -941,7 +941,7 @@ def test_a_call_has_parameters_of_its_own_as_its_key_sees_them():
 
 def test_a_dataclass_of_parameters_has_lists_of_its_own_too():
     shared, changing = Holder(Linear(), (Linear(),)), Holder(Holder(Nothing(), ([1], 2)))
-    with Flow("x").building():
+    with Flow().building():
         kept = [modelled(union=one).parameters["union"] for one in (shared, changing)]
     changing.one.many[0].append(2)
     assert kept[0] is shared and kept[1] == Holder(Holder(Nothing(), ([1], 2)))
@@ -952,9 +952,9 @@ def test_a_dataclass_that_can_be_changed_is_no_parameter():
     class Loose:
         slope: float = 1.0
 
-    with Flow("x").building(), pytest.raises(TypeError, match="union holds a Loose, no plain data and no frozen datac"):
+    with Flow().building(), pytest.raises(TypeError, match="union holds a Loose, no plain data and no frozen datac"):
         modelled(union=Loose())
-    with Flow("x").building(), pytest.raises(TypeError, match="make it a FileRef"):
+    with Flow().building(), pytest.raises(TypeError, match="make it a FileRef"):
         modelled(union=Path("photo.jpg"))
 
 
@@ -977,7 +977,7 @@ def test_of_two_parameters_of_one_name_neither_hides_the_other():
 
 
 def test_a_node_cannot_be_gone_through_as_a_list():
-    flow = Flow("x")
+    flow = Flow()
     with flow.building(), pytest.raises(TypeError, match="use `each`"):
         tuple(toy.source(values=(1.0,)))
 

@@ -82,7 +82,7 @@ def executor(request, store):
 
 def call(store, task, *inputs, **parameters):
     """A call of a task on numbers."""
-    given = dict(zip(task.inputs, (store.put(toy.number(x)) for x in inputs), strict=True))
+    given = dict(zip(task.signature.parameters, (store.put(toy.number(x)) for x in inputs), strict=False))
     keys = Keys()
     return Invocation(
         key=keys.key(task, given, parameters),

@@ -54,8 +54,7 @@ def cameras_of(frames: tuple[Frame, ...], radial: float = 0.0) -> Cameras:
 
 def pose(x: float) -> np.ndarray:
     """Camera-to-world, turned by 90 degrees about y and moved."""
-    matrix = np.array([[0, 0, 1, x], [0, 1, 0, 0.5], [-1, 0, 0, -1], [0, 0, 0, 1]], float)
-    return matrix
+    return np.array([[0, 0, 1, x], [0, 1, 0, 0.5], [-1, 0, 0, -1], [0, 0, 0, 1]], float)
 
 
 def photos(root: Path) -> Path:
@@ -126,16 +125,16 @@ def replica(root: Path, **changes) -> Path:
     return root
 
 
-def colmap(root: Path, binary: bool = True, distortion: float = 0.0, registered: int = 3) -> Path:
+def colmap(root: Path, binary: bool = True, registered: int = 3) -> Path:
     """A workspace with two models: `sparse/0` with one image, `sparse/1` with all."""
     for i, name in enumerate(NAMES):
         write(root / "images" / f"{name}.png", photo(i))
-    _colmap_model(root / "sparse" / "0", 1, binary, distortion)
-    _colmap_model(root / "sparse" / "1", registered, binary, distortion)
+    _colmap_model(root / "sparse" / "0", 1, binary)
+    _colmap_model(root / "sparse" / "1", registered, binary)
     return root
 
 
-def _colmap_model(folder: Path, count: int, binary: bool, distortion: float) -> None:
+def _colmap_model(folder: Path, count: int, binary: bool) -> None:
     folder.mkdir(parents=True)
     half = np.sqrt(0.5)
     rows = []
@@ -144,7 +143,7 @@ def _colmap_model(folder: Path, count: int, binary: bool, distortion: float) -> 
         rows.append((i + 1, (half, 0.0, -half, 0.0), inverse[:3, 3], f"{name}.png"))
     points = [(1, (0.5, 1.5, 2.5)), (2, (3.0, 4.0, 5.0))]
     if binary:
-        parameters = (30.0, 16.0, 12.0, distortion)
+        parameters = (30.0, 16.0, 12.0, 0.0)
         (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 7, 2, WIDTH, HEIGHT, *parameters))
         images = struct.pack("<Q", len(rows))
         for image, quaternion, translation, name in rows:
@@ -156,7 +155,7 @@ def _colmap_model(folder: Path, count: int, binary: bool, distortion: float) -> 
             data += struct.pack("<Q3d3BdQ", number, *xyz, 1, 2, 3, 0.5, 2) + struct.pack("<II", 1, 0) * 2
         (folder / "points3D.bin").write_bytes(data)
         return
-    (folder / "cameras.txt").write_text(f"# cameras\n7 SIMPLE_RADIAL {WIDTH} {HEIGHT} 30 16 12 {distortion}\n")
+    (folder / "cameras.txt").write_text(f"# cameras\n7 SIMPLE_RADIAL {WIDTH} {HEIGHT} 30 16 12 0.0\n")
     lines = ["# images"]
     for image, quaternion, translation, name in rows:
         numbers = " ".join(repr(float(x)) for x in (*quaternion, *translation))

@@ -58,9 +58,9 @@ def covered(distortion: Distortion) -> np.ndarray:
     return (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
 
 
-def write_distorted_room(root: Path, distortion: Distortion, views: int = 5) -> np.ndarray:
-    """Write the room in nerfstudio's layout; returns the true ids, [views, HEIGHT, WIDTH] in the photos' pixels."""
-    room = generate(RoomParams(objects=2, views=views, width=480, height=360, held_out=0))
+def write_distorted_room(root: Path, distortion: Distortion) -> np.ndarray:
+    """Write the room in nerfstudio's layout; returns the true ids, [5, HEIGHT, WIDTH] in the photos' pixels."""
+    room = generate(RoomParams(objects=2, views=5, width=480, height=360, held_out=0))
     slopes = rays(distortion)
     frames, ids = [], []
     for k, name in enumerate(room.cameras.names):

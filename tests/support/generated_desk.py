@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from depth_sensor import noisy, with_holes
 
 from ss_flow.flows.generated.composite_room import TABLE, in_a_row, structure, table
 from ss_flow.flows.generated.composites import Composite, Piece, book, brick, cup, paint, picture, printed_box
@@ -17,7 +18,6 @@ from ss_flow.flows.generated.layout import COLORS, HALF_WIDTH, Thing
 from ss_flow.flows.generated.prints import LIFT, lines_of_text, rectangle, sheet
 from ss_flow.flows.generated.render import Renderer
 from ss_flow.flows.generated.room import Room, RoomParams, furnished_room, looking_at, photographed
-from ss_flow.flows.generated.sensor import noisy, with_holes
 from ss_flow.flows.generated.shapes import can, vase
 from ss_flow.tasks.artifacts import Float32, Float64
 from ss_flow.tasks.geometry.cameras import camera_of

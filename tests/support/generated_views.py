@@ -7,19 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Frame
-from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.cameras import Camera, looking
 from ss_flow.tasks.geometry.images import encode_png
 
 
 def looking_at(eye, target) -> np.ndarray:
     """World-to-camera of a camera at `eye`; world y points down."""
     forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross((0, 1, 0), forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
+    return looking(eye, forward, np.array([0.0, -1.0, 0.0]))
 
 
 def _texture(u, v, salt):
@@ -61,10 +56,10 @@ def around(items, view):
     return (items[view], *(item for k, item in enumerate(items) if k != view))
 
 
-def views(eyes, width=160, height=120, focal=150.0, target=(0.0, 0.0, 3.5)):
+def views(eyes, width=160, height=120, focal=150.0):
     """Frames, cameras and the true depth maps of the scene, seen from some places."""
     cameras = [
-        Camera(width, height, focal, focal, width / 2, height / 2, looking_at(np.array(eye, float), np.array(target)))
+        Camera(width, height, focal, focal, width / 2, height / 2, looking_at(np.array(eye, float), (0.0, 0.0, 3.5)))
         for eye in eyes
     ]
     rendered = [render(c) for c in cameras]
@@ -83,11 +78,11 @@ def views(eyes, width=160, height=120, focal=150.0, target=(0.0, 0.0, 3.5)):
     return frames, artifact, [depth for _, depth in rendered]
 
 
-def jittered(cameras, distance, degrees, seed=0):
+def jittered(cameras, distance, degrees):
     """The cameras with poses that are off by so much on (quadratic) average."""
     import cv2
 
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     poses = cameras.world_to_camera.copy()
     for pose in poses:
         off = np.eye(4)

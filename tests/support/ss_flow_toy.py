@@ -238,7 +238,7 @@ def halving(x, depth=0):
     return expand(x, build)
 
 
-def flow(values=(1.0, 2.0, 3.0), limit=100.0, on_error="fail"):
+def flow(values=(1.0, 2.0, 3.0), limit=100.0):
     numbers = source(values=values)
     squares = each(numbers, build=lambda x: clip(square(x), limit=limit), names=[f"n{i}" for i in range(len(values))])
     return {"squares": squares, "total": total(squares)}

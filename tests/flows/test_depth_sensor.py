@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
+from depth_sensor import sensed, structured_light
 
 from ss_flow.flows.generated.room import Views
-from ss_flow.flows.generated.sensor import sensed, structured_light
 from ss_flow.tasks.artifacts import Cameras
 
 
