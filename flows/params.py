@@ -31,6 +31,7 @@ from ss_flow.tasks.splat.reconstruct import ReconstructParams
 from ss_flow.tasks.splat.refine import RefineParams
 from ss_flow.tasks.splat.render_masks import RenderMasksParams
 from ss_flow.tasks.splat.resolve import ResolveParams
+from ss_flow.tasks.split.boards import BoardParams
 from ss_flow.tasks.split.dense import DenseParams
 from ss_flow.tasks.split.dense_splatting import DenseSplattingParams
 from ss_flow.tasks.split.hierarchy import HierarchyParams
@@ -111,6 +112,7 @@ class SplitParams:
     granularity: Fraction = 0.45
     """How far pieces are put together: those that more than this share of the views show as one thing are one instance.
     1 leaves every part on its own, 0.3 gives groups of things."""
+    boards: BoardParams = field(default_factory=BoardParams)
     reprompt: RepromptParams = field(default_factory=RepromptParams)
     reproject: ReprojectParams = field(default_factory=ReprojectParams)
 

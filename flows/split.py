@@ -24,6 +24,7 @@ from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.appearances import appearances
+from ss_flow.tasks.split.boards import part_boards
 from ss_flow.tasks.split.correct import correct, part_masks
 from ss_flow.tasks.split.cut import cut, cut_parts
 from ss_flow.tasks.split.dense import dense
@@ -66,7 +67,7 @@ class Split:
     """The leaves of the tree."""
     tree: Hierarchy
     labels: PointLabels
-    """The instances, which the cut through the tree leaves, as the user corrected them."""
+    """The instances, which the cut through the tree leaves, boards apart, and as the user corrected them."""
     parts: PointParts
     instances: tuple[InstanceMasks, ...]
     """The background first."""
@@ -110,15 +111,17 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
     tree = hierarchy(points, capture.cameras, seen, pieces, counted, params=params.hierarchy)
     labels = cut(pieces, tree, granularity=granularity)
-    shown = masks
+    shown, joined = masks, labels
     nested = find_parts(observed, masks, pieces, params=params.parts)
+    if params.boards.rises and capture.masks is None and capture.clicks is None:  # what the user showed stays
+        labels = part_boards(points, capture.cameras, labels, tree, params=params.boards)
     if capture.corrections is not None:
         by_clicks: list[PointLabels] = []
         if segmenter is not None:
             clicked = _clicked(capture, capture.corrections, embeddings, segmenter, params, apart=True)
             by_clicks = [_labelled(points, seen, clicked, params)]
-        joined = labels
-        labels = correct(points, seen, capture.corrections, pieces, joined, by_clicks, names=capture.things)
+        labels = correct(points, seen, capture.corrections, pieces, labels, by_clicks, names=capture.things)
+    if labels is not joined:
         contained = params.segment.contained
         shown = each(
             seen,

@@ -95,12 +95,15 @@ def correct(
 def part_masks(
     visibility: Visibility, masks: MaskSet, before: PointLabels, after: PointLabels, *, contained: float
 ) -> MaskSet:
-    """The masks of a view, of which those are divided that show an instance as one which `correct` has divided.
+    """The masks of a view, of which those are divided that show as one what `correct` or `part_boards` has divided.
 
-    visibility, masks: of one view. before, after: the instances before they were corrected and since. contained: as
-    `mask_tree` takes it. Such a mask holds mostly points of the one instance, and most points that the view sees of
+    visibility, masks: of one view. before, after: the instances before and since. contained: as `mask_tree` takes it.
+    Such a mask holds mostly points of the one instance, and most points that the view sees of
     several of its things; each of its pixels goes to the thing of the nearest of these points.
     """
+    seen = visibility.point_index
+    if (before.label[seen] == after.label[seen]).all():
+        return masks
     old, new = (paint_labels(visibility, labels.label) for labels in (before, after))
     dense, parts, origin = masks.dense(), list[Bool](), list[int]()
     for row, mask in enumerate(dense):

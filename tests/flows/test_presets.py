@@ -41,6 +41,7 @@ TABLE = {
     "split.segment.max_area": (1.0, 1.0, 0.8),
     "split.segment.speckle": (0.0, 0.0, 0.05),
     "split.propagate.min_label_views": (1, 1, 2),
+    "split.boards.rises": (0.0, 0.0, 0.15),
     "split.granularity": (1.0, 1.0, 0.45),
     # 7
     "split.segment.min_area": (0.0025, 0.0025, 0.0025),
