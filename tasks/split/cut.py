@@ -24,11 +24,11 @@ def cut(labels: PointLabels, tree: Hierarchy, *, granularity: float) -> PointLab
     labels: those that are the leaves of the tree. granularity: pieces on which the views agree more than this are one
     instance (0..1); the highest such node counts, as long as no union in it has less than two thirds of that. So 1
     leaves the labels as they are, and lower values give things, then groups of things. Ids are those of the nodes.
-    Warns of an instance that gets more than half of the labelled points.
+    Warns of an instance that gets more than half of the labelled points, unless it is stuff.
     """
     instance = instances_of(tree, labels.num_labels, granularity)
     highest = max(labels.num_labels, int(tree.node.max(initial=0)))
-    _warn_of_largest(instance[labels.label])
+    _warn_of_largest(instance[labels.label], tree)
     return replace(labels, label=instance[labels.label], match_label=instance[labels.match_label], num_labels=highest)
 
 
@@ -49,10 +49,10 @@ def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) ->
     return PointParts(number[row].astype(np.int32))
 
 
-def _warn_of_largest(label: Int32) -> None:
+def _warn_of_largest(label: Int32, tree: Hierarchy) -> None:
     size = np.bincount(label[label > 0], minlength=1)
     largest = int(size.argmax())
-    if size[largest] > _MOST * size.sum():
+    if size[largest] > _MOST * size.sum() and largest not in tree.node[tree.stuff]:
         warn(
             f"Instance {largest} holds {size[largest] / size.sum():.0%} of the labelled points. Unless it is one thing "
             "that fills the scene, its masks show several things as one: raise split.granularity "

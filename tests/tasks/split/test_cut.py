@@ -55,11 +55,13 @@ def test_labels_left_as_they_are_keep_their_parts():
     assert cut_parts(LABELS, parts, cut(LABELS, TREE, granularity=1.0)).part.tolist() == parts.part.tolist()
 
 
-def test_an_instance_of_most_labelled_points_is_warned_of_and_a_background_of_most_is_not(recwarn):
+def test_an_instance_of_most_labelled_points_is_warned_of_and_a_background_or_a_wall_of_most_is_not(recwarn):
+    most = replace(LABELS, label=np.array([0, 0, 0, 0, 0, 1, 1, 4], np.int32))
     cut(replace(LABELS, label=np.array([0, 0, 0, 0, 0, 1, 2, 4], np.int32)), TREE, granularity=1.0)
+    cut(most, replace(TREE, stuff=TREE.node == 1), granularity=1.0)
     assert not recwarn.list
     with pytest.warns(UserWarning, match="Instance 1 holds 67% of the labelled points"):
-        cut(replace(LABELS, label=np.array([0, 0, 0, 0, 0, 1, 1, 4], np.int32)), TREE, granularity=1.0)
+        cut(most, replace(TREE, stuff=TREE.node == 4), granularity=1.0)
 
 
 @given(st.floats(0, 1), st.floats(0, 1))
