@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
@@ -45,7 +46,7 @@ from ss_flow.flows.params import Params
 from ss_flow.sweep import rows_of
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import capture_name, named_after
-from ss_flow.tasks.deliver.output import check_writable, writing_output
+from ss_flow.tasks.deliver.output import RUN_FILE, check_writable, writing_output
 from ss_flow.tasks.deliver.places import RESULT, check_outside, check_replaceable
 
 BATCH_FILE = "batch.json"
@@ -65,7 +66,8 @@ class Batch:
     out: Path = Path("ss-flow-out")
     """The folder to write: NAME/ for each scene, and batch.json."""
     retry_failed: bool = False
-    """Run only those that the folder's batch.json marks as failed, or does not name."""
+    """Run only those that the folder's batch.json marks as failed or does not name, or that were run with other
+    parameters or up to another step, or whose results are gone."""
     undistorted: bool = False
     """Also write the photos and cameras that the run worked with, without distortion, as a COLMAP workspace."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
@@ -78,8 +80,12 @@ class Batch:
         folders = folder_names(_found(self.scenes, self.list_file))
         check_writable(self.out)
         check_outside(self.out, options.store.location)
-        ended = _ended(self.out / BATCH_FILE, folders) if self.retry_failed else {}
+        asked = digest([settings.flat(params), options.target, self.undistorted])
+        earlier = _earlier(self.out / BATCH_FILE) if self.retry_failed else {}
+        ended = {str(path): earlier[str(path)] for path in folders if _has_ended(earlier.get(str(path)), asked)}
         tell = console(json=options.json)
+        if ended:
+            tell.print(f"{len(ended)} of {len(folders)} scenes have ended already and are left out")
         store = options.store.open_store()
         digests = file_digests(store, verify=options.verify)
         scenes: dict[Path, Prepared] = {}
@@ -107,7 +113,7 @@ class Batch:
                 ]
                 if options.dry_run:
                     return self._plan(list(scenes), errors, run_flows(requests, store, **engine), tell)
-                book = _Book(self.out / BATCH_FILE, list(map(str, folders)), ended, tell)
+                book = _Book(self.out / BATCH_FILE, list(map(str, folders)), ended, asked, tell)
                 for path, words in errors.items():
                     book.add(_row(path, "failed", error=words))
                 places = [self.out / folders[path] if options.delivers else None for path in scenes]
@@ -156,8 +162,11 @@ class Batch:
 class _Book:
     """The rows of batch.json, in the order of the scenes; written, and told of, whenever one is added."""
 
-    def __init__(self, file: Path, scenes: Sequence[str], rows: dict[str, dict[str, Any]], tell: Console) -> None:
-        self._file, self._scenes, self._rows, self._tell = file, scenes, rows, tell
+    def __init__(
+        self, file: Path, scenes: Sequence[str], rows: dict[str, dict[str, Any]], asked: str, tell: Console
+    ) -> None:
+        """asked: a digest of how all scenes are to be run, see `_has_ended`."""
+        self._file, self._scenes, self._rows, self._asked, self._tell = file, scenes, rows, asked, tell
         self._write()
 
     @property
@@ -165,7 +174,7 @@ class _Book:
         return [self._rows[scene] for scene in self._scenes if scene in self._rows]
 
     def add(self, row: dict[str, Any]) -> None:
-        self._rows[row["scene"]] = row
+        self._rows[row["scene"]] = row | {"asked": self._asked}
         self._write()
         place = f"see {row['out']}" if row["out"] else None
         what = "; ".join(filter(None, (row["error"], place))) or f"{row['misses']} results computed"
@@ -300,15 +309,24 @@ def folder_names(scenes: Iterable[Path]) -> dict[Path, str]:
     return names
 
 
-def _ended(file: Path, scenes: Iterable[Path]) -> dict[str, dict[str, Any]]:
-    """The rows of an earlier batch about scenes that did not fail. Raises InputError when batch.json is damaged."""
+def _earlier(file: Path) -> dict[str, dict[str, Any]]:
+    """The rows of an earlier batch, by scene. Raises InputError when batch.json is damaged."""
     try:
-        rows = json.loads(file.read_text(encoding="utf-8"))
-        return {row["scene"]: row for row in rows if row["status"] != "failed" and Path(row["scene"]) in scenes}
+        return {row["scene"]: row for row in json.loads(file.read_text(encoding="utf-8")) if row["status"] in COLOURS}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(f"{file} is damaged ({error}); run the batch without --retry-failed.") from None
+
+
+def _has_ended(row: Mapping[str, Any] | None, asked: str) -> bool:
+    """Whether a scene, by its row of an earlier batch, if any, was run as is asked now, and what came of it is there.
+
+    A run that writes no folder (--until) has what came of it in the store.
+    """
+    if row is None or row["status"] == "failed" or row.get("asked") != asked:
+        return False
+    return row["out"] is None or (Path(row["out"]) / RUN_FILE).is_file()
 
 
 def _table(rows: Sequence[dict[str, Any]], folders: dict[Path, str]) -> Table:

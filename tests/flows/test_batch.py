@@ -189,6 +189,19 @@ def test_an_interrupted_batch_keeps_the_scenes_that_had_ended(warm, den, tmp_pat
     assert (whole.code, whole.document()) == (0, again.document())
 
 
+@pytest.mark.parametrize("before", [["--until", "dense"], ["--set", "masks.share=0"], []])
+def test_a_scene_that_ended_otherwise_than_is_asked_now_or_whose_results_are_gone_is_run(warm, tmp_path, before):
+    out = tmp_path / "batch"
+    assert batch_tiny(warm.store, out, warm.scene, *before).code == 0
+    same = batch_tiny(warm.store, out, warm.scene, *before, "--retry-failed")
+    assert "1 of 1 scenes have ended already" in same.err
+    if not before:
+        shutil.rmtree(out / "room")
+    again = batch_tiny(warm.store, out, warm.scene, "--retry-failed")
+    assert again.code == 0 and "have ended already" not in again.err
+    assert json.loads((out / "room/run.json").read_text())["params"]["splat.masks.share"] > 0
+
+
 def test_a_new_batch_begins_a_new_record(warm, tmp_path):
     out = tmp_path / "batch"
     out.mkdir()
