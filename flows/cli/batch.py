@@ -81,8 +81,11 @@ class Batch:
         check_writable(self.out)
         check_outside(self.out, options.store.location)
         asked = digest([settings.flat(params), options.target, self.undistorted])
-        earlier = _earlier(self.out / BATCH_FILE) if self.retry_failed else {}
-        ended = {str(path): earlier[str(path)] for path in folders if _has_ended(earlier.get(str(path)), asked)}
+        places = {path: self.out.absolute() / name for path, name in folders.items()}
+        earlier = _earlier(self.out / BATCH_FILE, needed=self.retry_failed)
+        others = [row for row in earlier.values() if _stays(row, places)]
+        again = earlier if self.retry_failed else {}
+        ended = {str(path): again[str(path)] for path in folders if _has_ended(again.get(str(path)), asked)}
         tell = console(json=options.json)
         if ended:
             tell.print(f"{len(ended)} of {len(folders)} scenes have ended already and are left out")
@@ -93,7 +96,7 @@ class Batch:
         with digests:
             for path in (path for path in folders if str(path) not in ended):
                 try:
-                    scenes[path] = self._opened(path, self.out / folders[path], params, digests, folders)
+                    scenes[path] = self._opened(path, places[path], params, digests, folders)
                 except Exception as error:  # a fault in one scene must not stop the others
                     errors[path] = _in_words(error)
             if errors and not scenes and not ended:
@@ -113,11 +116,10 @@ class Batch:
                 ]
                 if options.dry_run:
                     return self._plan(list(scenes), errors, run_flows(requests, store, **engine), tell)
-                book = _Book(self.out / BATCH_FILE, list(map(str, folders)), ended, asked, tell)
+                book = _Book(self.out / BATCH_FILE, list(map(str, folders)), ended, others, asked, tell)
                 for path, words in errors.items():
                     book.add(_row(path, "failed", error=words))
-                places = [self.out / folders[path] if options.delivers else None for path in scenes]
-                ready = list(zip(scenes.items(), places, strict=True))
+                ready = [(item, places[item[0]] if options.delivers else None) for item in scenes.items()]
                 with _Finishing(store, book, ready, undistorted=self.undistorted) as finishing:
                     watched = [
                         replace(r, done=partial(finishing.done, position)) for position, r in enumerate(requests)
@@ -163,10 +165,17 @@ class _Book:
     """The rows of batch.json, in the order of the scenes; written, and told of, whenever one is added."""
 
     def __init__(
-        self, file: Path, scenes: Sequence[str], rows: dict[str, dict[str, Any]], asked: str, tell: Console
+        self,
+        file: Path,
+        scenes: Sequence[str],
+        rows: dict[str, dict[str, Any]],
+        others: Sequence[dict[str, Any]],
+        asked: str,
+        tell: Console,
     ) -> None:
-        """asked: a digest of how all scenes are to be run, see `_has_ended`."""
-        self._file, self._scenes, self._rows, self._asked, self._tell = file, scenes, rows, asked, tell
+        """others: rows of scenes that are not of this batch. asked: a digest of how its scenes are to be run."""
+        self._file, self._scenes, self._rows, self._others = file, scenes, rows, others
+        self._asked, self._tell = asked, tell
         self._write()
 
     @property
@@ -183,7 +192,7 @@ class _Book:
 
     def _write(self) -> None:
         with writing_output(self._file):
-            write_atomically(self._file, json.dumps(self.rows, indent=1))
+            write_atomically(self._file, json.dumps([*self._others, *self.rows], indent=1))
 
 
 class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
@@ -309,14 +318,23 @@ def folder_names(scenes: Iterable[Path]) -> dict[Path, str]:
     return names
 
 
-def _earlier(file: Path) -> dict[str, dict[str, Any]]:
-    """The rows of an earlier batch, by scene. Raises InputError when batch.json is damaged."""
+def _earlier(file: Path, *, needed: bool) -> dict[str, dict[str, Any]]:
+    """The rows of earlier batches, by scene. Raises InputError when batch.json is damaged but needed."""
     try:
         return {row["scene"]: row for row in json.loads(file.read_text(encoding="utf-8")) if row["status"] in COLOURS}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, TypeError, KeyError) as error:
+        if not needed:
+            return {}
         raise InputError(f"{file} is damaged ({error}); run the batch without --retry-failed.") from None
+
+
+def _stays(row: Mapping[str, Any], places: Mapping[Path, Path]) -> bool:
+    """Whether the row of an earlier batch is of a scene that is not run now and whose folder is still its own."""
+    if Path(row["scene"]) in places or row.get("out") is None or Path(row["out"]) in places.values():
+        return False
+    return (Path(row["out"]) / RUN_FILE).is_file()
 
 
 def _has_ended(row: Mapping[str, Any] | None, asked: str) -> bool:
