@@ -52,7 +52,9 @@ class Status:
         ended = last if last and last["event"] == "run ended" else None
         state = _state(ended, events)
         done = sum(event["event"] in DONE for event in settled(events))
-        expected = max(done, *(event.get("known", 0) for event in events))
+        # `known` falls again where a result chooses fewer of the others than might have been needed.
+        known = next((event["known"] for event in reversed(events) if "known" in event), 0)
+        expected = done if state == "done" else max(done, known)
         about = {"scene": run.scene, "started": run.header["started"], "state": state}
         document = about | {"done": done, "expected": expected, "steps": steps}
         if self.json:

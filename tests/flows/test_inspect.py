@@ -33,6 +33,16 @@ def test_status_counts_what_each_step_did(tiny):
     assert all(row["expected"] == row["finished"] + row["hit"] for row in document["steps"].values())
 
 
+def test_status_of_a_run_that_ended_lacks_nothing_though_more_was_expected_at_times(warm):
+    run = next(latest_runs(warm.store / "roots/runs"))
+    lines = [json.loads(line) for line in (run.folder / "events.jsonl").read_text().splitlines()]
+    middle = next(event for event in lines if event.get("label") == "split.propagate")
+    middle["known"] = 1000
+    (run.folder / "events.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    document = json.loads(ss_flow("status", "--json", "--cache", warm.store).out)
+    assert document["state"] == "done" and document["done"] == document["expected"] < 1000
+
+
 def test_status_of_a_run_that_was_cut_short_says_how_much_there_is_to_do(warm):
     """Cut the record in the middle of the views, as a kill would."""
     run = next(latest_runs(warm.store / "roots/runs"))
