@@ -143,6 +143,14 @@ def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
     return sorted(runs, key=lambda run: run.scene != runs[0].scene)
 
 
+def not_latest(run: Run, latest: Run) -> str | None:
+    """What to say where something is told of another run than the latest one; None where it is that one."""
+    if run.folder == latest.folder:
+        return None
+    started = time.strftime("%F %T", time.localtime(run.header["started"]))
+    return f"the latest run has no such step; in that of {run.scene}, started {started}:"
+
+
 @dataclass(frozen=True)
 class Graph:
     """Draw what feeds what in the latest run, a box a step, in Mermaid's notation."""
@@ -222,6 +230,8 @@ class CacheShow:
 
             draw_results(store, run or latest_run(store, self.scene), values, self.view, self.png)
         out = console(json=False)
+        if run and (other := not_latest(run, latest_run(store, self.scene))):
+            out.print(escape(other))
         for line in told(values, digests, store, run, asked):
             out.print(escape(line))
         if self.png:

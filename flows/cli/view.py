@@ -88,13 +88,15 @@ class View:
             raise InputError(
                 f"--rerun, --beside, --script and --correct take the output folder of a run, and {self.what} is none."
             )
-        from ss_flow.flows.cli.inspect import results_named
+        from ss_flow.flows.cli.inspect import latest_run, not_latest, results_named
         from ss_flow.flows.describe import maker, told
         from ss_flow.flows.view.artifact import Around, around_of, placed, show, write_artifact_page
         from ss_flow.tasks.artifacts import Gaussians
 
         out, store = console(json=False), self.store.existing_store()
         run, digests, asked = results_named(store, None, self.what)
+        if run and (other := not_latest(run, latest_run(store, None))):
+            out.print(escape(other))
         values = [store.get(digest) for digest in digests]
         made = maker(store, digests[0], run, asked)
         around = around_of(store, made[0]) if made else Around()

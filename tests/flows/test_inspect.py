@@ -67,6 +67,12 @@ def test_why_says_that_nothing_was_known_on_the_first_run(tiny):
     assert one == "split.visibility[0002]: computed for the first time for this scene\n"
 
 
+def test_why_names_the_items_of_a_step_that_has_no_such_one(tiny):
+    refused = ss_flow("why", "reconstruct[7]", "--cache", tiny.store)
+    assert refused.code == 2
+    assert "has no 'reconstruct[7]'; reconstruct has the items 0, 1, 2, 3, 4, 5." in refused.err
+
+
 def test_why_looks_further_back_where_the_latest_run_is_of_something_else(warm):
     """An edit has other steps than the run that it changed."""
     run = next(latest_runs(warm.store / "roots/runs"))
@@ -173,7 +179,12 @@ def test_a_result_is_found_by_the_name_that_until_takes(tiny, name):
 def test_results_of_a_finished_run_are_found_after_one_that_stopped_before_them(warm):
     before = ss_flow("cache", "show", "scene", "--cache", warm.store)
     run_tiny(warm.scene, warm.store, "--until", "dense", out=warm.out)
-    assert ss_flow("cache", "show", "scene", "--cache", warm.store) == before
+    lines = ss_flow("cache", "show", "scene", "--cache", warm.store).out.splitlines(keepends=True)
+    assert lines[0].startswith(f"the latest run has no such step; in that of {warm.scene}, started ")
+    assert "".join(lines[1:]) == before.out
+    page = warm.out.parent / "page.html"
+    viewed = ss_flow("view", "scene", "--html", page, "--cache", warm.store)
+    assert viewed.out.splitlines(keepends=True) == [lines[0], f"{page}\n"]
     assert ss_flow("cache", "pin", "scene", "--cache", warm.store).code == 0
     picture = warm.out.parent / "scene.png"
     assert ss_flow("cache", "show", "scene", "--view", "1", "--png", picture, "--cache", warm.store).code == 0
