@@ -601,6 +601,24 @@ def test_an_interrupt_before_the_command_is_known_ends_as_any_other():
     assert (called.returncode, called.stdout) == (130, "") and called.stderr.startswith("ss-flow: interrupted")
 
 
+def test_a_second_interrupt_does_not_cut_off_the_last_words():
+    before = (
+        "import os, signal\n"
+        "from ss_flow.flows.cli import main as module\n"
+        "def read(arguments):\n"
+        "    raise KeyboardInterrupt\n"
+        "module._read = read\n"
+        "complain = module._complain\n"
+        "def twice(*words, **more):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    complain(*words, **more)\n"
+        "module._complain = twice\n"
+    )
+    called = run_entry(["doctor"], before)
+    assert (called.returncode, called.stdout) == (130, "") and called.stderr.count("\n") == 1
+    assert called.stderr.startswith("ss-flow: interrupted")
+
+
 def test_a_sweep_of_more_rows_than_anybody_waits_for_is_refused(tmp_path):
     values = ["--set", "tau_label=0.5:0.9:200", "--set", "tau_depth=0.1:0.5:100"]
     assert_refused(
