@@ -214,6 +214,14 @@ def write_report(
     write_atomically(file, page)
 
 
+def renew_size(folder: Path, name: str) -> None:
+    """Have run.json say how large a file is that was written anew, so that the next run takes it as whole."""
+    document = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    if name in document.get("files", {}):
+        document["files"][name] = (folder / name).stat().st_size
+        write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
+
+
 def _delivered(folder: Path, content: str) -> dict[str, Any]:
     """What run.json says of when and what was delivered; empty unless that is this content, and no file of it is gone
     or of another size."""
