@@ -102,7 +102,13 @@ class Query:
             shown = [run.store.get(digest) for digest in made["parts"]] if self.parts else None
             answers.append((run.store.get(str(made["query"])), shown))
 
-        run_flows([Request(build, document["scene"], done=read)], run.store, recorded=False)
+        try:
+            run_flows([Request(build, document["scene"], done=read)], run.store, recorded=False)
+        except InputError as error:
+            own = next((name for name in run.names.values() if name.casefold() == self.text.casefold()), None)
+            if own is None:
+                raise
+            raise InputError(f"{error} An instance has this name: export and render take --instance {own!r}.") from None
         found, shown = answers[-1]
         if self.parts and not len(found.instance_id):
             raise InputError(f"no photo shows a part of any instance of {self.result}; leave --parts out.")
