@@ -113,16 +113,17 @@ def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None =
 def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, Any]:
     from ss_flow.tasks.deliver.report import report_html
 
-    results = edit.source.results.digests
+    source, results = edit.source.document, edit.source.results.digests
     made = Results(store, report.values)
     scene: EditedScene = made.one("scene")
     instances = edit.objects.document(edit.source.instances, scene)
     document = {
         "status": "ok",
         "warnings": [{"label": n["label"], "text": text} for n in report.nodes for text in n.get("warnings", ())],
-        "scene": edit.source.document["scene"],
-        "params": edit.source.document["params"],
-        "models": edit.source.document["models"],
+        "scene": source["scene"],
+        "params": source["params"],
+        **{name: source[name] for name in ("preset", "set", "given", "given_scene") if name in source},
+        "models": source["models"],
         "metrics": {},
         "nodes": node_records(report),
         "failures": failure_records(report),

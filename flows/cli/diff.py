@@ -29,7 +29,7 @@ _CHANGED = 0.9
 
 @dataclass(frozen=True)
 class Diff:
-    """Tell what two results differ in: parameters, networks, metrics, steps, and which objects are which.
+    """Tell what two results differ in: files given, parameters, networks, metrics, steps, and which objects are which.
 
     Objects are compared in the masks of the views that both results have; ids need not agree.
     """
@@ -60,10 +60,17 @@ def difference(one: Path, other: Path) -> dict[str, Any]:
         "scenes": [first["scene"], second["scene"]],
         "params": _changed(first["params"], second["params"]),
         "models": _changed(first["models"], second["models"]),
+        "given": _changed(_given(first), _given(second)),
         "metrics": _both(_flat(first["metrics"]), _flat(second["metrics"])),
         "steps": _steps(first["nodes"], second["nodes"]),
         "instances": None if matched is None else _instances(matched, len(views)),
     }
+
+
+def _given(document: dict[str, Any]) -> dict[str, Any]:
+    """The preset and the files that a run was given, besides its capture, by the options that name them."""
+    given = {"preset": document.get("preset"), **document.get("given", {}), "scene": document.get("given_scene")}
+    return {f"--{name}": value for name, value in given.items()}
 
 
 def _changed(first: dict[str, Any], second: dict[str, Any]) -> dict[str, list[Any]]:
@@ -138,7 +145,7 @@ def _instances(found: Correspondence, views: int) -> dict[str, Any]:
 def _tell(document: dict[str, Any], out: Console) -> None:
     if document["scenes"][0] != document["scenes"][1]:
         out.print(escape("scenes: {} and {}".format(*document["scenes"])))
-    for title in ("params", "models"):
+    for title in ("given", "params", "models"):
         for name, (a, b) in document[title].items():
             out.print(escape(f"{name}: {a} -> {b}"))
     if document["metrics"]:

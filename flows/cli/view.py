@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shlex
 import time
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -24,7 +23,7 @@ from ss_flow.flows.cli.context import (
     open_run,
 )
 from ss_flow.flows.cli.query import encoder_name, query_params
-from ss_flow.flows.results import FinishedRun, read_run
+from ss_flow.flows.results import FinishedRun, read_run, run_command
 from ss_flow.tasks.deliver.output import check_named
 
 if TYPE_CHECKING:
@@ -165,13 +164,13 @@ class View:
             out.print(
                 f"The scene has {count:,} Gaussians. If the browser has no GPU: --draw-at-most {_FEW} draws fewer."
             )
-        options = ["--correct", str(hints.absolute()), "--out", str(run.folder.absolute())]
-        again = shlex.join(["ss-flow", "run", run.document["scene"], *options])
+        again = run_command(run.folder, run.document, correct=str(hints.absolute()))
+        rest = "." if "set" in run.document else ", and the run's other options."
         saved = f"Edits are saved in {escape(str(script))} ({len(operations)} so far)."
         try:
             with contextlib.suppress(KeyboardInterrupt):
                 out.print(f"{viewer.address}\nCtrl-C ends it. {saved}")
-                out.print(f"Corrections are made by: {escape(again)}, and the run's other options.")
+                out.print(f"Corrections are made by: {escape(again + rest)}")
                 viewer.load_pictures()
                 _wait()
             if viewer.panel.unsaved:

@@ -285,7 +285,8 @@ def test_a_search_after_its_store_went_away_says_so_and_makes_no_new_one(warm):
     (warm.out / "run.json").write_text(json.dumps(document))
     descriptor = document["results"]["describe"][0]
     shutil.rmtree(warm.store / "objects" / descriptor[:2] / descriptor)
-    assert_refused(ss_flow("query", warm.out, "red"), "no longer holds describe")
+    again = f"ss-flow run {warm.scene} --preset fast --set=.* --out {warm.out} --cache {warm.store}"
+    assert_refused(ss_flow("query", warm.out, "red"), f"no longer holds describe of .*; run it again: `{again}`")
     shutil.rmtree(warm.store)
     assert_refused(ss_flow("query", warm.out, "red"), "there is no store")
     assert not warm.store.exists()

@@ -33,6 +33,18 @@ def test_a_changed_parameter_and_what_it_changed_are_told(warm, tmp_path):
     assert told.code == 0 and "splat.masks.share" in told.out and "agreement" in told.out
 
 
+def test_files_that_were_given_to_one_run_are_told(warm, tmp_path, monkeypatch):
+    other = tmp_path / "other"
+    shutil.copytree(warm.scene / "instance_masks", tmp_path / "masks")
+    monkeypatch.chdir(tmp_path)
+    made = run_tiny(warm.scene, warm.store, "--masks", "masks", "--calibrate", "none", out=other)
+    assert made.document()["given"] == {"masks": str(tmp_path / "masks"), "hints": None, "correct": None}
+    assert made.document()["preset"] == "fast" and made.document()["set"][0] == "capture.calibrate=none"
+    found = ss_flow("diff", warm.out, other, "--json").document()
+    assert found["given"] == {"--masks": [None, str(tmp_path / "masks")]}
+    assert f"--masks: None -> {tmp_path / 'masks'}" in ss_flow("diff", warm.out, other).out
+
+
 def test_results_that_only_have_other_numbers_are_the_same(tiny, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(tiny.out, other)

@@ -11,7 +11,7 @@ import sys
 import urllib.request
 
 import pytest
-from tiny_runs import ss_flow
+from tiny_runs import SHORT, ss_flow
 
 
 def test_without_the_extra_one_sentence_says_which_to_install(tiny, monkeypatch):
@@ -78,10 +78,10 @@ class TestWithTheExtra:
         hints = tmp_path / "h.json"
         asked = ["--correct", os.path.relpath(hints), "--cache", tiny.store, "--port", "0"]
         called = ss_flow("view", tiny.out.name, *asked)
-        command = called.out.partition("made by: ")[2].partition(", and the run's")[0]
-        run, scene, correct, out = (shlex.split(command)[place] for place in (1, 2, 4, 6))
-        assert (run, scene, out) == ("run", str(tiny.scene), str(tiny.out)), called
+        run, scene, _, correct, *options = shlex.split(called.out.partition("made by: ")[2].rstrip(".\n"))[1:]
+        assert (run, scene) == ("run", str(tiny.scene)), called
         assert os.path.isabs(correct) and os.path.samefile(os.path.dirname(correct), tmp_path)
+        assert options == ["--preset", "fast", *SHORT, "--out", str(tiny.out), "--cache", str(tiny.store)]
 
     @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
     def test_it_serves_until_it_is_interrupted_and_that_is_its_good_end(self, tiny, how):
