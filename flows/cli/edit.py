@@ -31,7 +31,7 @@ class EditRun:
     json: bool = False
     """Print one JSON document on stdout, and nothing else there."""
     store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
-    """Where results are kept."""
+    """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
         from ss_flow.flows.edit import open_edit, run_edit

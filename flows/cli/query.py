@@ -66,7 +66,7 @@ class Query:
     json: bool = False
     """Print one JSON document."""
     store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
-    """Where results are kept."""
+    """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
         document = read_run(self.result)

@@ -60,7 +60,7 @@ class View:
     port: int = 8080
     """The port to listen on; the next free one where it is taken."""
     store: tyro.conf.OmitArgPrefixes[StoreOptions] = StoreOptions()
-    """Where results are kept."""
+    """Where results are kept; by default, of an output folder, the store that its run names."""
 
     def run(self) -> int:
         if not 0 <= self.port < 65536:

@@ -288,8 +288,26 @@ def test_a_search_after_its_store_went_away_says_so_and_makes_no_new_one(warm):
     again = f"ss-flow run {warm.scene} --preset fast --set=.* --out {warm.out} --cache {warm.store}"
     assert_refused(ss_flow("query", warm.out, "red"), f"no longer holds describe of .*; run it again: `{again}`")
     shutil.rmtree(warm.store)
-    assert_refused(ss_flow("query", warm.out, "red"), "there is no store")
+    told = f"the results of {warm.out} are in the store {warm.store}, which is not here; name a copy of it with --cache"
+    assert_refused(ss_flow("query", warm.out, "red"), told)
     assert not warm.store.exists()
+
+
+@pytest.mark.parametrize("command", [("query", "red"), ("export", "--format", "coco"), ("edit",), ("render",)])
+def test_a_store_that_was_moved_is_found_where_the_environment_says(command, warm, monkeypatch):
+    moved = warm.store.rename(warm.store.with_name("moved"))
+    script = warm.out.parent / "script.json"
+    script.write_text('{"operations": []}')
+    more = {
+        "edit": [script, "--out", warm.out.parent / "edited"],
+        "export": ["--out", warm.out.parent / "coco.json"],
+        "render": ["--frames", "1", "--what", "labels", "--out", warm.out.parent / "pictures"],
+    }
+    words = (command[0], warm.out, *command[1:], *more.get(command[0], []))
+    assert_refused(ss_flow(*words), f"the results of {warm.out} are in the store {warm.store}, which is not here")
+    monkeypatch.setenv("SS_FLOW_CACHE", str(moved))
+    called = ss_flow(*words)
+    assert called.code == 0, called.err
 
 
 @pytest.mark.parametrize(
