@@ -82,7 +82,7 @@ def open_edit(source: Path, script: Mapping[str, Any], store: Store, folder: Pat
         )
     run = finished_run(source, document, store, _NEEDED)
     begun = Objects.of(run.instances, run.results.one("scene"), run.results.one("cameras"))
-    steps, objects = check(script, begun, folder)
+    steps, objects = check(script, begun, folder, store)
     return Edit(run, rooted(script, folder), steps, objects)
 
 
@@ -119,7 +119,10 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
     instances = edit.objects.document(edit.source.instances, scene)
     document = {
         "status": "ok",
-        "warnings": [{"label": n["label"], "text": text} for n in report.nodes for text in n.get("warnings", ())],
+        "warnings": [
+            *({"label": f"{s.op}[{s.number}]", "text": s.warning} for s in edit.steps if s.warning),
+            *({"label": n["label"], "text": text} for n in report.nodes for text in n.get("warnings", ())),
+        ],
         "scene": source["scene"],
         "params": source["params"],
         **{name: source[name] for name in ("preset", "set", "given", "given_scene") if name in source},

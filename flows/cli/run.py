@@ -133,7 +133,10 @@ def run_scene(
     given: Mapping[str, Path | None] | None = None,
     undistorted: bool = False,
 ) -> int:
-    """Run the DAG on a scene, write the output folder, print what came out. Returns the exit code. given: see `prepare`."""
+    """Run the DAG on a scene, write the output folder, print what came out. Returns the exit code.
+
+    given: see `prepare`.
+    """
     params = settings.apply(params, options.texts)
     engine = options.engine()
     if options.until is None:

@@ -120,6 +120,22 @@ def test_an_object_of_a_run_with_other_axes_comes_upright(warm, tmp_path):
     np.testing.assert_allclose(high[0], scale * high[1], atol=1e-4)
 
 
+def test_an_object_of_a_run_whose_store_is_not_at_hand_is_placed_with_a_warning(warm, tmp_path):
+    own, other = biggest(warm.out), tmp_path / "other"
+    shutil.copytree(warm.out, other)
+    document = json.loads((other / "run.json").read_text())
+    (other / "run.json").write_text(json.dumps(document | {"store": "/nowhere"}))
+    replacing = {"op": "replace", "instance": own, "run": "other", "by": own, "name": "new"}
+    called, _ = edit(warm, replacing)
+    assert called.document()["warnings"] == [], "the store of the edited run has its results"
+    document["results"]["cameras"] = "ab" * 32
+    (other / "run.json").write_text(json.dumps(document))
+    called, place = edit(warm, replacing)
+    (warning,) = called.document()["warnings"]
+    assert warning["label"] == "replace[1]" and warning["text"].startswith("the cameras of other are in no store")
+    assert warning["text"] in (place / "report.html").read_text()
+
+
 def test_a_bad_script_runs_nothing_and_writes_nothing(warm):
     called, place = edit(warm, {"op": "remove", "instances": "no such thing"})
     assert called.code == 2 and not place.exists() and called.out == ""
