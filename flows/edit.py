@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from ss_flow.events import Reporter
 from ss_flow.flows.deliver import failure_records, node_records
 from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check, rooted
-from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run
+from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run, source_in_words
 from ss_flow.graph import labelled
 from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
@@ -77,8 +78,8 @@ def open_edit(source: Path, script: Mapping[str, Any], store: Store, folder: Pat
     document = read_run(source)
     if "edit" in document:
         raise InputError(
-            f"{source} is an edited run; add the operations to its script (edit.script in its {RUN_FILE}) and edit its "
-            f"source, {document['edit']['source']}."
+            f"{source} is an edited run; add the operations to its script (edit.script in its {RUN_FILE}) and edit "
+            f"{source_in_words(source, document)}."
         )
     run = finished_run(source, document, store, _NEEDED)
     begun = Objects.of(run.instances, run.results.one("scene"), run.results.one("cameras"))
@@ -134,6 +135,8 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
         "store": store.location,
         "edit": {
             "source": str(edit.source.folder.resolve()),
+            "source_from_here": os.path.relpath(edit.source.folder.resolve(), out.resolve()),
+            "source_content": source.get("content"),
             "script": edit.script,
             "holes": [_told(step, made) for step in edit.steps if step.leaving],
             "num_filled": int(scene.filled.sum()),

@@ -198,16 +198,39 @@ def _are_digests(value: Any) -> bool:
     return all(isinstance(one, str) and DIGEST.fullmatch(one) for one in several)
 
 
+def source_of(folder: Path, document: Mapping[str, Any]) -> tuple[Path, str]:
+    """The run that an edited run was made of, and what is to be said of it: "" where it is as it was.
+
+    document: the edited run's run.json. The source is looked for where it was, then at the same place as seen from the
+    edited run, since both may have been moved together.
+    """
+    edit = document["edit"]
+    places = [Path(edit["source"]), (folder / edit.get("source_from_here", edit["source"])).resolve()]
+    source = next((place for place in places if (place / RUN_FILE).is_file()), None)
+    if source is None:
+        return places[0], "which is no longer there"
+    made_of = edit.get("source_content")
+    if made_of not in (None, read_run(source).get("content")):
+        return source, "which was run anew since, so that other instances may have its ids"
+    return source, ""
+
+
+def source_in_words(folder: Path, document: Mapping[str, Any]) -> str:
+    """The same in one phrase."""
+    source, remark = source_of(folder, document)
+    return f"its source, {source}, {remark}" if remark else f"its source, {source}"
+
+
 def not_of_an_edit(folder: Path, document: Mapping[str, Any], what: str) -> InputError:
     """What to say where an edited run is asked for something that only its source has. document: its run.json."""
-    source = document["edit"]["source"]
-    return InputError(f"{folder} is an edited run, which has no {what} of its own; take its source, {source}.")
+    source = source_in_words(folder, document)
+    return InputError(f"{folder} is an edited run, which has no {what} of its own; take {source}.")
 
 
 def again(folder: Path, document: Mapping[str, Any]) -> str:
     """What to say of how to get the results of an output folder again. document: its run.json."""
     if "edit" in document:
-        return f"edit {document['edit']['source']} again"
+        return f"edit {source_in_words(folder, document)}, again"
     return f"run it again: `{run_command(folder, document)}`{'' if 'set' in document else ' and its other options'}"
 
 

@@ -27,7 +27,7 @@ from ss_flow.flows.cli.context import (
 )
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.query import NEEDED, described_parts
-from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, read_run
+from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, not_of_an_edit, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
 from ss_flow.tasks.deliver.places import Written, check_replaceable, replacing_own, sizes
 from ss_flow.tasks.models.colour_words import ColourWords, words_ignored
@@ -71,10 +71,7 @@ class Query:
     def run(self) -> int:
         document = read_run(self.result)
         if "edit" in document:
-            raise InputError(
-                f"{self.result} is an edited run, whose objects no photo shows as they are; search its source, "
-                f"{document['edit']['source']}."
-            )
+            raise not_of_an_edit(self.result, document, "photos")
         if self.parts and self.background:
             raise InputError("--background is no part of anything; leave it or --parts out.")
         run = open_run(self.result, self.store, ("describe", *(NEEDED if self.parts else ())))

@@ -23,8 +23,8 @@ from ss_flow.flows.cli.context import (
     open_run,
 )
 from ss_flow.flows.cli.query import encoder_name, query_params
-from ss_flow.flows.results import FinishedRun, read_run, run_command
-from ss_flow.tasks.deliver.output import check_named
+from ss_flow.flows.results import FinishedRun, read_run, run_command, source_of
+from ss_flow.tasks.deliver.output import RUN_FILE, check_named
 
 if TYPE_CHECKING:
     from ss_flow.flows.view.search import Search
@@ -142,13 +142,18 @@ class View:
 
         document = read_run(folder)
         edit = document.get("edit")
-        run = open_run(Path(edit["source"]) if edit else folder, self.store, ("scene", "cameras"))
+        source, remark = source_of(folder, document) if edit else (folder, "")
+        if not (source / RUN_FILE).is_file() and edit:
+            raise InputError(f"{folder} is an edited run, and its source, {source}, is not there; put it back.")
+        run = open_run(source, self.store, ("scene", "cameras"))
         script = self.script or folder.resolve().with_name(f"{folder.resolve().name}.edit.json")
         hints = self.correct or run.folder.resolve().with_name(f"{run.name}.hints.json")
         operations = edit["script"]["operations"] if edit else []
         if script.is_file():
             operations = read_operations(script)
         out = console(json=False)
+        if remark:
+            out.print(f"[yellow]warning[/] {escape(f'{folder} is an edit of {source}, {remark}.')}")
         try:
             search = search_of(run)
         except InputError as error:  # one sees a scene without it

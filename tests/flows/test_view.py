@@ -93,6 +93,20 @@ class TestWithTheExtra:
         assert process.returncode == 0 and not err and "saved in" in told
         assert not (tiny.out.parent / "out.edit.json").exists()
 
+    def test_an_edited_run_whose_source_changed_or_is_gone_says_so(self, warm, tmp_path, monkeypatch):
+        monkeypatch.setattr("ss_flow.flows.cli.view._wait", lambda: None)
+        script, edited = tmp_path / "s.json", tmp_path / "edited"
+        script.write_text('{"operations": []}')
+        assert ss_flow("edit", warm.out, script, "--out", edited, "--cache", warm.store).code == 0
+        record = warm.out / "run.json"
+        record.write_text(json.dumps(json.loads(record.read_text()) | {"content": "ab" * 32}))
+        told = ss_flow("view", edited, "--cache", warm.store, "--port", "0")
+        assert f"warning {edited} is an edit of {warm.out.resolve()}, which was run anew since" in told.out, told.err
+        warm.out.rename(tmp_path / "elsewhere")
+        refused = ss_flow("view", edited, "--cache", warm.store)
+        assert refused.code == 2
+        assert f"{edited} is an edited run, and its source, {warm.out.resolve()}, is not there" in refused.err
+
     def test_an_edited_run_is_gone_on_with(self, warm, tmp_path):
         script, edited = tmp_path / "s.json", tmp_path / "edited"
         script.write_text(json.dumps({"operations": [{"op": "remove", "instances": ["background"]}]}))
