@@ -118,7 +118,7 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
     made = Results(store, report.values)
     scene: EditedScene = made.one("scene")
     instances = edit.objects.document(edit.source.instances, scene)
-    document = {
+    document: dict[str, Any] = {
         "status": "ok",
         "warnings": [
             *({"label": f"{s.op}[{s.number}]", "text": s.warning} for s in edit.steps if s.warning),

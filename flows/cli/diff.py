@@ -29,7 +29,7 @@ _CHANGED = 0.9
 
 @dataclass(frozen=True)
 class Diff:
-    """Tell what two results differ in: files given, parameters, networks, metrics, steps, and which objects are which.
+    """Tell what two results differ in: files given, parameters, networks, metrics, steps, which objects are which.
 
     Objects are compared in the masks of the views that both results have; ids need not agree.
     """

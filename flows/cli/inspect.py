@@ -21,8 +21,9 @@ from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import OptionalPath, PositionalPath, StoreOptions, console
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.describe import told
+from ss_flow.flows.results import read_run
 from ss_flow.runs import DONE, Run, latest_runs, settled
-from ss_flow.tasks.deliver.output import check_named
+from ss_flow.tasks.deliver.output import RUN_FILE, check_named
 from ss_flow.telemetry import trace
 
 Options = tyro.conf.OmitArgPrefixes[StoreOptions]
@@ -131,16 +132,31 @@ def run_with(store: Store, scene: Path | None, name: str) -> tuple[Run | None, l
 
 def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
     """The runs in which to look for a step, in this order: those of the scene; where none is named, of the scene that
-    ran last, and then all others. Each time the latest first.
+    ran last, and then all others. Each time the latest first. scene: a capture, or an output folder: then those runs
+    that came to what it holds.
 
     The very last run may have stopped before the step (`--until`, an interrupt), or be an edit, which has other steps.
     Raises InputError when there is no run.
     """
     runs = list(latest_runs(store.runs, str(scene.resolve()) if scene else None))
+    if not runs and scene and (scene / RUN_FILE).is_file():
+        return _runs_of_output(store, scene)
     if not runs:
         about = f" of {scene}" if scene else ""
         raise InputError(f"the store {store.location} knows no run{about}; `ss-flow run SCENE` makes one.")
     return sorted(runs, key=lambda run: run.scene != runs[0].scene)
+
+
+def _runs_of_output(store: Store, folder: Path) -> list[Run]:
+    """The runs that came to what an output folder holds, the latest first. Raises InputError when there is none."""
+    document = read_run(folder)
+    results = {name: [made] if isinstance(made, str) else made for name, made in document["results"].items()}
+    of_scene = latest_runs(store.runs, str(Path(document["scene"]).resolve()))
+    if runs := [run for run in of_scene if run.results() == results]:
+        return runs
+    raise InputError(
+        f"the store {store.location} has no record of the run that made {folder}; {document['scene']} is its capture."
+    )
 
 
 def not_latest(run: Run, latest: Run) -> str | None:

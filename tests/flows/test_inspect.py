@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 
 import cv2
 import numpy as np
@@ -65,6 +66,23 @@ def test_why_says_that_nothing_was_known_on_the_first_run(tiny):
     assert told == "split.visibility: computed for the first time for this scene (5 of them)\n"
     one = ss_flow("why", "visibility[0002]", "--cache", tiny.store).out
     assert one == "split.visibility[0002]: computed for the first time for this scene\n"
+
+
+def test_the_run_that_made_an_output_is_asked_about_by_its_folder(warm):
+    started = json.loads(ss_flow("status", warm.out, "--json", "--cache", warm.store).out)["started"]
+    other = warm.out.with_name("other")
+    assert run_tiny(warm.scene, warm.store, "--set", "masks.share=0", out=other).code == 0
+    latest = ss_flow("status", warm.scene, "--json", "--cache", warm.store).out
+    assert ss_flow("status", other, "--json", "--cache", warm.store).out == latest
+    assert json.loads(ss_flow("status", warm.out, "--json", "--cache", warm.store).out)["started"] == started
+    told = ss_flow("why", "render_masks", other, "--cache", warm.store).out
+    assert "parameter share" in told
+    assert "for the first time" in ss_flow("why", "render_masks", warm.out, "--cache", warm.store).out
+    for run in latest_runs(warm.store / "roots/runs"):
+        if run.header["started"] == started:
+            shutil.rmtree(run.folder)
+    refused = ss_flow("graph", warm.out, "--cache", warm.store)
+    assert refused.code == 2 and f"no record of the run that made {warm.out}; {warm.scene} is its" in refused.err
 
 
 def test_why_names_the_items_of_a_step_that_has_no_such_one(tiny):
