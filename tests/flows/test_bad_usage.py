@@ -533,7 +533,7 @@ def test_no_file_gets_the_place_of_a_closed_stream(tmp_path):
     before = (
         "import subprocess, sys\n"
         "from ss_flow.flows.cli import main\n"
-        "def opens(arguments):\n"
+        "def opens(arguments, *more):\n"
         "    with open(arguments[0], 'w') as file:\n"
         "        print('noise'), print('noise', file=sys.stderr)\n"
         f"        return subprocess.call([sys.executable, '-c', {child!r}], stdout=file)\n"
