@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,8 +61,10 @@ FALLBACKS = {
 }
 
 
-def run_document(store: Store, scene: SceneFiles, params: Params, networks: Networks, report: Report) -> dict[str, Any]:
-    """The document run.json: what was run, with what, what came of it."""
+def run_document(
+    store: Store, scene: SceneFiles, params: Params, networks: Networks, asked: Mapping[str, Any], report: Report
+) -> dict[str, Any]:
+    """The document run.json: what was run, with what, what came of it. asked: what it says of how it was asked for."""
     wanted = {name: value for name, value in report.values.items() if not isinstance(value, Failure)}
     status = "failed" if len(wanted) < len(report.values) else "degraded" if report.failures else "ok"
     models = {
@@ -79,6 +81,7 @@ def run_document(store: Store, scene: SceneFiles, params: Params, networks: Netw
         "warnings": [{"label": label, "text": text} for text, label in warnings.items()],
         "scene": str(scene.place.absolute()),
         "params": settings.flat(params),
+        **asked,
         "models": models,
         "given_scene": None if scene.given_scene is None else str(scene.given_scene.absolute()),
         "reference_photo": (store.get(wanted["colours"][0]).reference or None) if "colours" in wanted else None,
@@ -217,6 +220,14 @@ def write_report(
     pictures = results.all("report_pictures")
     page = report_html(document, pictures=pictures, instances=instances, insight=insight, comparison=comparison)
     write_atomically(file, page)
+
+
+def renew_size(folder: Path, name: str) -> None:
+    """Have run.json say how large a file is that was written anew, so that the next run takes it as whole."""
+    document = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    if name in document.get("files", {}):
+        document["files"][name] = (folder / name).stat().st_size
+        write_atomically(folder / RUN_FILE, json.dumps(document, indent=1))
 
 
 def _delivered(folder: Path, content: str) -> dict[str, Any]:

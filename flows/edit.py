@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from ss_flow.events import Reporter
 from ss_flow.flows.deliver import failure_records, node_records, write_document
 from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check, rooted
-from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run
+from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run, source_in_words
 from ss_flow.graph import labelled
 from ss_flow.kept_closures import kept_closure
 from ss_flow.resolution import Failure
@@ -75,12 +76,12 @@ def open_edit(source: Path, script: Mapping[str, Any], store: Store, folder: Pat
     document = read_run(source)
     if "edit" in document:
         raise InputError(
-            f"{source} is an edited run; add the operations to its script (edit.script in its {RUN_FILE}) and edit its "
-            f"source, {document['edit']['source']}."
+            f"{source} is an edited run; add the operations to its script (edit.script in its {RUN_FILE}) and edit "
+            f"{source_in_words(source, document)}."
         )
     run = finished_run(source, document, store, _NEEDED)
     begun = Objects.of(run.instances, run.results.one("scene"), run.results.one("cameras"))
-    steps, objects = check(script, begun, folder)
+    steps, objects = check(script, begun, folder, store)
     return Edit(run, rooted(script, folder), steps, objects)
 
 
@@ -111,16 +112,20 @@ def run_edit(edit: Edit, store: Store, out: Path, *, reporter: Reporter | None =
 def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, Any]:
     from ss_flow.tasks.deliver.report import report_html
 
-    results = edit.source.results.digests
+    source, results = edit.source.document, edit.source.results.digests
     made = Results(store, report.values)
     scene: EditedScene = made.one("scene")
     instances = edit.objects.document(edit.source.instances, scene)
-    document = {
+    document: dict[str, Any] = {
         "status": "ok",
-        "warnings": [{"label": n["label"], "text": text} for n in report.nodes for text in n.get("warnings", ())],
-        "scene": edit.source.document["scene"],
-        "params": edit.source.document["params"],
-        "models": edit.source.document["models"],
+        "warnings": [
+            *({"label": f"{s.op}[{s.number}]", "text": s.warning} for s in edit.steps if s.warning),
+            *({"label": n["label"], "text": text} for n in report.nodes for text in n.get("warnings", ())),
+        ],
+        "scene": source["scene"],
+        "params": source["params"],
+        **{name: source[name] for name in ("preset", "set", "given", "given_scene") if name in source},
+        "models": source["models"],
         "metrics": {},
         "nodes": node_records(report),
         "failures": failure_records(report),
@@ -128,6 +133,8 @@ def _deliver(edit: Edit, store: Store, out: Path, report: Report) -> dict[str, A
         "store": store.location,
         "edit": {
             "source": str(edit.source.folder.resolve()),
+            "source_from_here": os.path.relpath(edit.source.folder.resolve(), out.resolve()),
+            "source_content": source.get("content"),
             "script": edit.script,
             "holes": [_told(step, made) for step in edit.steps if step.leaving],
             "num_filled": int(scene.filled.sum()),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows.results import open_finished
 from ss_flow.tasks.artifacts import Cameras, Gaussians
@@ -246,15 +248,15 @@ def _up(cameras: Cameras | None) -> Vector | None:
     return None if cameras is None else vector(up_of(cameras.world_to_camera))
 
 
-def up_of_run(folder: Path) -> Vector | None:
-    """The direction that is up in the photos of a run; None where its store is not at hand, as in a folder that was
-    handed on."""
-    try:
-        run = open_finished(folder)
-        run.require(("cameras",))
-    except InputError:
-        return None
-    return _up(run.results.one("cameras"))
+def up_of_run(folder: Path, store: Store | None) -> Vector | None:
+    """The direction that is up in the photos of a run; None where its results are neither in the store that it names
+    nor in this one, as in a folder that was handed on."""
+    for place in (None, store) if store else (None,):
+        with contextlib.suppress(InputError):
+            run = open_finished(folder, place)
+            run.require(("cameras",))
+            return _up(run.results.one("cameras"))
+    return None
 
 
 def object_of_run(folder: Path, called: int | str) -> tuple[Entry, list[int], Path]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import copy
 import difflib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from ss_flow.cache.canonical import digest_file
+from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows import edit_fields
 from ss_flow.flows.edit_fields import Field, Unfit
@@ -41,13 +42,15 @@ class Step:
     gone: tuple[int, ...] = ()
     """Ids whose dense points are no longer there after it."""
     fill: bool = False
+    warning: str | None = None
 
 
-def check(script: object, objects: Objects, folder: Path) -> tuple[list[Step], Objects]:
+def check(script: object, objects: Objects, folder: Path, store: Store | None = None) -> tuple[list[Step], Objects]:
     """What a script comes to: the steps to run, and the objects afterwards.
 
     script: the document, {"version": 1, "operations": [...]}. objects: those of the scene; they stay as they are.
-    folder: what relative paths in the script start from.
+    folder: what relative paths in the script start from. store: where results of other runs may be, besides where they
+    say.
     Raises InputError for the first fault, naming the operation, the field and what would be right.
     """
     if not isinstance(script, Mapping) or not isinstance(script.get("operations"), list):
@@ -59,7 +62,7 @@ def check(script: object, objects: Objects, folder: Path) -> tuple[list[Step], O
     objects = copy.deepcopy(objects)
     steps = []
     for number, raw in enumerate(script["operations"], 1):
-        step = _step(number, raw, objects, folder)
+        step = _step(number, raw, objects, folder, store)
         steps += [step] if step is not None else []
     return steps, objects
 
@@ -73,7 +76,7 @@ def rooted(script: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return {**script, "operations": operations}
 
 
-def _step(number: int, raw: object, objects: Objects, folder: Path) -> Step | None:
+def _step(number: int, raw: object, objects: Objects, folder: Path, store: Store | None) -> Step | None:
     if not isinstance(raw, Mapping):
         raise InputError(f'operation {number} must be an object such as {{"op": "remove", "instances": [3]}}.')
     op = raw.get("op")
@@ -82,7 +85,7 @@ def _step(number: int, raw: object, objects: Objects, folder: Path) -> Step | No
             f"operation {number}: op is {op!r}; it must be one of {', '.join(_OPERATIONS)}"
             f"{_hint(op, _OPERATIONS) or '.'}"
         )
-    call = _Call(number, op, dict(raw), objects, folder)
+    call = _Call(number, op, dict(raw), objects, folder, store)
     call.take("op", edit_fields.TEXT)
     call.take("comment", edit_fields.TEXT, "")
     step = _OPERATIONS[op](call)
@@ -102,8 +105,10 @@ def _ended(sentence: str) -> str:
 class _Call:
     """One operation while its fields are read; what is wrong is said with its number and the field's name."""
 
-    def __init__(self, number: int, op: str, raw: dict[str, Any], objects: Objects, folder: Path) -> None:
-        self.number, self.op, self.objects, self.folder = number, op, objects, folder
+    def __init__(
+        self, number: int, op: str, raw: dict[str, Any], objects: Objects, folder: Path, store: Store | None
+    ) -> None:
+        self.number, self.op, self.objects, self.folder, self.store = number, op, objects, folder, store
         self._raw, self._known = raw, list[str]()
 
     def take(self, name: str, field: Field[T], default: T = _REQUIRED) -> T:
@@ -236,14 +241,15 @@ def _replace(call: _Call) -> Step:
     call.objects.remove((instance,))
     new_id = call.objects.put_in(entry, parts, call.new_name(entry["name"]))
     ref = FileRef.of(file.absolute(), digest_file)
-    own, theirs = call.objects.up, up_of_run(call.folder / run)
+    own, theirs = call.objects.up, up_of_run(call.folder / run, call.store)
     turn = smallest_turn(theirs, own) if own and theirs else _NO_TURN
+    unturned = f"the cameras of {run} are in no store at hand, so the object is not turned and may not stand upright."
 
     def apply(scene: EditedScene) -> EditedScene:
         other = operations.read_object(file=ref)
         return operations.put_in_place(scene, other, instance=instance, new_id=new_id, scale=scale, turn=turn)
 
-    return call.step(apply, (instance,), fill=fill)
+    return replace(call.step(apply, (instance,), fill=fill), warning=unturned if own and not theirs else None)
 
 
 def _relabel(call: _Call) -> None:

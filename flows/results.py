@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from ss_flow.tasks.deliver.output import RUN_FILE
 from ss_flow.tasks.words import first_of
 
 BACKGROUND = 0
+GIVEN = ("masks", "hints", "correct")
+"""Options of `ss-flow run` that name files beside the capture, as run.json keeps them."""
 _KNOWN = 8
 """Instances that a message names; those whose names hold the word come first."""
 
@@ -97,7 +100,7 @@ class FinishedRun:
             raise not_of_an_edit(self.folder, self.document, ", ".join(never))
         if gone := self.results.missing(needed):
             what = f"the store {self.store.location} no longer holds {', '.join(gone)} of {self.folder}"
-            raise InputError(f"{what}; run it again.")
+            raise InputError(f"{what}; {again(self.folder, self.document)}.")
 
     @property
     def name(self) -> str:
@@ -195,10 +198,54 @@ def _are_digests(value: Any) -> bool:
     return all(isinstance(one, str) and DIGEST.fullmatch(one) for one in several)
 
 
+def source_of(folder: Path, document: Mapping[str, Any]) -> tuple[Path, str]:
+    """The run that an edited run was made of, and what is to be said of it: "" where it is as it was.
+
+    document: the edited run's run.json. The source is looked for where it was, then at the same place as seen from the
+    edited run, since both may have been moved together.
+    """
+    edit = document["edit"]
+    places = [Path(edit["source"]), (folder / edit.get("source_from_here", edit["source"])).resolve()]
+    source = next((place for place in places if (place / RUN_FILE).is_file()), None)
+    if source is None:
+        return places[0], "which is no longer there"
+    made_of = edit.get("source_content")
+    if made_of not in (None, read_run(source).get("content")):
+        return source, "which was run anew since, so that other instances may have its ids"
+    return source, ""
+
+
+def source_in_words(folder: Path, document: Mapping[str, Any]) -> str:
+    """The same in one phrase."""
+    source, remark = source_of(folder, document)
+    return f"its source, {source}, {remark}" if remark else f"its source, {source}"
+
+
 def not_of_an_edit(folder: Path, document: Mapping[str, Any], what: str) -> InputError:
     """What to say where an edited run is asked for something that only its source has. document: its run.json."""
-    source = document["edit"]["source"]
-    return InputError(f"{folder} is an edited run, which has no {what} of its own; take its source, {source}.")
+    source = source_in_words(folder, document)
+    return InputError(f"{folder} is an edited run, which has no {what} of its own; take {source}.")
+
+
+def again(folder: Path, document: Mapping[str, Any]) -> str:
+    """What to say of how to get the results of an output folder again. document: its run.json."""
+    if "edit" in document:
+        return f"edit {source_in_words(folder, document)}, again"
+    return f"run it again: `{run_command(folder, document)}`{'' if 'set' in document else ' and its other options'}"
+
+
+def run_command(folder: Path, document: Mapping[str, Any], **given: str) -> str:
+    """The command that makes the output folder of a run again, from wherever one stands.
+
+    document: its run.json. given: files to name in the place of those that were given to it, by option.
+    """
+    files = document.get("given", {}) | {"scene": document.get("given_scene")} | given
+    words = ["ss-flow", "run", document["scene"]]
+    words += [word for name, path in files.items() if path for word in (f"--{name}", path)]
+    words += ["--preset", document["preset"]] if "preset" in document else []
+    words += [f"--set={text}" for text in document.get("set", ())]
+    words += ["--undistorted"] if any(name.startswith("undistorted/") for name in document.get("files", {})) else []
+    return shlex.join([*words, "--out", str(folder.absolute()), "--cache", document["store"]])
 
 
 def open_finished(folder: str | Path, store: Store | None = None) -> FinishedRun:

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.file_digests import FileDigests
 from ss_flow.cache.files import write_atomically
@@ -44,7 +45,7 @@ from ss_flow.flows.params import Params
 from ss_flow.sweep import rows_of
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import capture_name, named_after
-from ss_flow.tasks.deliver.output import check_writable, writing_output
+from ss_flow.tasks.deliver.output import RUN_FILE, check_writable, writing_output
 from ss_flow.tasks.deliver.places import RESULT, check_outside, check_replaceable
 
 BATCH_FILE = "batch.json"
@@ -64,7 +65,8 @@ class Batch:
     out: Path = Path("ss-flow-out")
     """The folder to write: NAME/ for each scene, and batch.json."""
     retry_failed: bool = False
-    """Run only those that the folder's batch.json marks as failed, or does not name."""
+    """Run only those that the folder's batch.json marks as failed or does not name, or that were run with other
+    parameters or up to another step, or whose results are gone."""
     undistorted: bool = False
     """Also write the photos and cameras that the run worked with, without distortion, as a COLMAP workspace."""
     execution: tyro.conf.OmitArgPrefixes[RunOptions] = RunOptions()
@@ -77,8 +79,15 @@ class Batch:
         folders = folder_names(_found(self.scenes, self.list_file))
         check_writable(self.out)
         check_outside(self.out, options.store.location)
-        ended = _ended(self.out / BATCH_FILE, folders) if self.retry_failed else {}
+        asked = digest([settings.flat(params), options.target, self.undistorted])
+        places = {path: self.out.absolute() / name for path, name in folders.items()}
+        earlier = _earlier(self.out / BATCH_FILE, needed=self.retry_failed)
+        others = [row for row in earlier.values() if _stays(row, places)]
+        again = earlier if self.retry_failed else {}
+        ended = {str(path): again[str(path)] for path in folders if _has_ended(again.get(str(path)), asked)}
         tell = console(json=options.json)
+        if ended:
+            tell.print(f"{len(ended)} of {len(folders)} scenes have ended already and are left out")
         store = options.store.open_store()
         digests = file_digests(store, verify=options.verify)
         scenes: dict[Path, Prepared] = {}
@@ -86,7 +95,7 @@ class Batch:
         with digests:
             for path in (path for path in folders if str(path) not in ended):
                 try:
-                    scenes[path] = self._opened(path, self.out / folders[path], params, digests, folders)
+                    scenes[path] = self._opened(path, places[path], params, digests, folders)
                 except Exception as error:  # a fault in one scene must not stop the others
                     errors[path] = _in_words(error)
             if errors and not scenes and not ended:
@@ -100,11 +109,10 @@ class Batch:
                 ]
                 if options.dry_run:
                     return self._plan(list(scenes), errors, run_flows(requests, store, **engine), tell)
-                book = _Book(self.out / BATCH_FILE, list(map(str, folders)), ended, tell)
+                book = _Book(self.out / BATCH_FILE, list(map(str, folders)), ended, others, asked, tell)
                 for path, words in errors.items():
                     book.add(_row(path, "failed", error=words))
-                places = [self.out / folders[path] if options.delivers else None for path in scenes]
-                ready = list(zip(scenes.items(), places, strict=True))
+                ready = [(item, places[item[0]] if options.delivers else None) for item in scenes.items()]
                 with _Finishing(store, book, ready, undistorted=self.undistorted) as finishing:
                     watched = [
                         replace(r, done=partial(finishing.done, position)) for position, r in enumerate(requests)
@@ -149,8 +157,18 @@ class Batch:
 class _Book:
     """The rows of batch.json, in the order of the scenes; written, and told of, whenever one is added."""
 
-    def __init__(self, file: Path, scenes: Sequence[str], rows: dict[str, dict[str, Any]], tell: Console) -> None:
-        self._file, self._scenes, self._rows, self._tell = file, scenes, rows, tell
+    def __init__(
+        self,
+        file: Path,
+        scenes: Sequence[str],
+        rows: dict[str, dict[str, Any]],
+        others: Sequence[dict[str, Any]],
+        asked: str,
+        tell: Console,
+    ) -> None:
+        """others: rows of scenes that are not of this batch. asked: a digest of how its scenes are to be run."""
+        self._file, self._scenes, self._rows, self._others = file, scenes, rows, others
+        self._asked, self._tell = asked, tell
         self._write()
 
     @property
@@ -158,7 +176,7 @@ class _Book:
         return [self._rows[scene] for scene in self._scenes if scene in self._rows]
 
     def add(self, row: dict[str, Any]) -> None:
-        self._rows[row["scene"]] = row
+        self._rows[row["scene"]] = row | {"asked": self._asked}
         self._write()
         place = f"see {row['out']}" if row["out"] else None
         what = "; ".join(filter(None, (row["error"], place))) or f"{row['misses']} results computed"
@@ -167,7 +185,7 @@ class _Book:
 
     def _write(self) -> None:
         with writing_output(self._file):
-            write_atomically(self._file, json.dumps(self.rows, indent=1))
+            write_atomically(self._file, json.dumps([*self._others, *self.rows], indent=1))
 
 
 class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
@@ -293,15 +311,33 @@ def folder_names(scenes: Iterable[Path]) -> dict[Path, str]:
     return names
 
 
-def _ended(file: Path, scenes: Iterable[Path]) -> dict[str, dict[str, Any]]:
-    """The rows of an earlier batch about scenes that did not fail. Raises InputError when batch.json is damaged."""
+def _earlier(file: Path, *, needed: bool) -> dict[str, dict[str, Any]]:
+    """The rows of earlier batches, by scene. Raises InputError when batch.json is damaged but needed."""
     try:
-        rows = json.loads(file.read_text(encoding="utf-8"))
-        return {row["scene"]: row for row in rows if row["status"] != "failed" and Path(row["scene"]) in scenes}
+        return {row["scene"]: row for row in json.loads(file.read_text(encoding="utf-8")) if row["status"] in COLOURS}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, TypeError, KeyError) as error:
+        if not needed:
+            return {}
         raise InputError(f"{file} is damaged ({error}); run the batch without --retry-failed.") from None
+
+
+def _stays(row: Mapping[str, Any], places: Mapping[Path, Path]) -> bool:
+    """Whether the row of an earlier batch is of a scene that is not run now and whose folder is still its own."""
+    if Path(row["scene"]) in places or row.get("out") is None or Path(row["out"]) in places.values():
+        return False
+    return (Path(row["out"]) / RUN_FILE).is_file()
+
+
+def _has_ended(row: Mapping[str, Any] | None, asked: str) -> bool:
+    """Whether a scene, by its row of an earlier batch, if any, was run as is asked now, and what came of it is there.
+
+    A run that writes no folder (--until) has what came of it in the store.
+    """
+    if row is None or row["status"] == "failed" or row.get("asked") != asked:
+        return False
+    return row["out"] is None or (Path(row["out"]) / RUN_FILE).is_file()
 
 
 def _table(rows: Sequence[dict[str, Any]], folders: dict[Path, str]) -> Table:

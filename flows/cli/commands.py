@@ -59,7 +59,7 @@ lo:hi:nlog the same evenly in the logarithm. What variants share is computed onc
     "graph": Entry("inspect:Graph", "Draw what feeds what in the latest run, a box a step, in Mermaid's notation."),
     "diff": Entry(
         "diff:Diff",
-        """Tell what two results differ in: parameters, networks, metrics, steps, and which objects are which.
+        """Tell what two results differ in: files given, parameters, networks, metrics, steps, which objects are which.
 
 Objects are compared in the masks of the views that both results have; ids need not agree.""",
     ),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Annotated
+from typing import IO, Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -17,7 +18,7 @@ from ss_flow.cache.files import user_cache
 from ss_flow.cache.location import is_url, open_store
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
-from ss_flow.flows.results import FinishedRun, finished_run, read_run
+from ss_flow.flows.results import FinishedRun, Results, finished_run, read_run
 from ss_flow.task import FileRef, Reference
 from ss_flow.tasks.models import catalogue
 
@@ -137,14 +138,33 @@ def references(digests: FileDigests) -> Reference:
 
 
 def open_run(folder: Path, options: StoreOptions, needed: Sequence[str]) -> FinishedRun:
-    """A finished run by its output folder, with the store that it names, unless the options name one.
+    """A finished run by its output folder, with the store that it names, unless the options name one. Where that is not
+    here, as after it was moved, the store of this machine is taken if it holds what is needed.
 
     needed: the results that the store must still hold.
     Raises InputError when the folder is not that of a run or is damaged, or a result is gone.
     """
     document = read_run(folder)
-    chosen = options if options.cache else StoreOptions(document["store"])
-    return finished_run(folder, document, chosen.existing_store(), needed)
+    named = StoreOptions(document["store"])
+    if options.cache:
+        store = options.existing_store()
+    elif isinstance(named.location, Path) and not named.location.exists():
+        store = _store_here(folder, document, needed)
+    else:
+        store = named.existing_store()
+    return finished_run(folder, document, store, needed)
+
+
+def _store_here(folder: Path, document: Mapping[str, Any], needed: Sequence[str]) -> Store:
+    """The store of this machine. Raises InputError unless it holds the results of a folder whose own is not here."""
+    with contextlib.suppress(InputError):
+        store = StoreOptions().existing_store()
+        if not Results(store, document["results"]).missing(needed or ("scene",)):
+            return store
+    raise InputError(
+        f"the results of {folder} are in the store {document['store']}, which is not here; name a copy of it with "
+        f"--cache or SS_FLOW_CACHE, or run {document['scene']} again."
+    )
 
 
 class _Words(Console):

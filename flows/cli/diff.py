@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ _CHANGED = 0.9
 
 @dataclass(frozen=True)
 class Diff:
-    """Tell what two results differ in: parameters, networks, metrics, steps, and which objects are which.
+    """Tell what two results differ in: files given, parameters, networks, metrics, steps, which objects are which.
 
     Objects are compared in the masks of the views that both results have; ids need not agree.
     """
@@ -53,17 +53,24 @@ class Diff:
 def difference(one: Path, other: Path) -> dict[str, Any]:
     """What two output folders of runs differ in. Raises InputError where one is none, or is damaged."""
     first, second = read_run(one), read_run(other)
-    views = _views_of_both(one, other)
+    views = [] if _of_other_photos(first, second) else _views_of_both(one, other)
     matched = correspondence(_id_images(views)) if views else None
     return {
         "runs": [str(one), str(other)],
         "scenes": [first["scene"], second["scene"]],
         "params": _changed(first["params"], second["params"]),
         "models": _changed(first["models"], second["models"]),
+        "given": _changed(_given(first), _given(second)),
         "metrics": _both(_flat(first["metrics"]), _flat(second["metrics"])),
         "steps": _steps(first["nodes"], second["nodes"]),
         "instances": None if matched is None else _instances(matched, len(views)),
     }
+
+
+def _given(document: dict[str, Any]) -> dict[str, Any]:
+    """The preset and the files that a run was given, besides its capture, by the options that name them."""
+    given = {"preset": document.get("preset"), **document.get("given", {}), "scene": document.get("given_scene")}
+    return {f"--{name}": value for name, value in given.items()}
 
 
 def _changed(first: dict[str, Any], second: dict[str, Any]) -> dict[str, list[Any]]:
@@ -80,20 +87,35 @@ def _flat(metrics: dict[str, dict[str, float]]) -> dict[str, float]:
 
 
 def _steps(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """By step: nodes with the same result in both, with another one, or in one run only; and seconds of computation."""
-    sides = [{(node["step"], str(node["item"])): node for node in nodes} for nodes in (first, second)]
-    steps: dict[str, dict[str, Any]] = defaultdict(
-        lambda: {"same": 0, "different": 0, "only_first": 0, "only_second": 0, "seconds": [0.0, 0.0]}
-    )
-    for label in {**sides[0], **sides[1]}:
-        row, a, b = steps[label[0]], sides[0].get(label), sides[1].get(label)
-        for side, node in enumerate((a, b)):
-            row["seconds"][side] += node["seconds"] if node else 0.0
-        if a and b:
-            row["same" if a["outputs"] == b["outputs"] else "different"] += 1
-        else:
-            row["only_first" if a else "only_second"] += 1
-    return dict(steps)
+    """By step: nodes with the same result in both, with another one, or in one run only; and seconds of computation.
+
+    Nodes are paired by what they gave, not by their items: where an object comes or goes, others get other numbers.
+    """
+    results: tuple[dict[str, Counter[tuple[str, ...]]], ...] = (defaultdict(Counter), defaultdict(Counter))
+    seconds: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
+    for side, nodes in enumerate((first, second)):
+        for node in nodes:
+            results[side][node["step"]][tuple(node["outputs"])] += 1
+            seconds[node["step"]][side] += node["seconds"]
+    steps = {}
+    for step in seconds:
+        a, b = (side[step] for side in results)
+        same, only_a, only_b = ((a & b).total(), (a - b).total(), (b - a).total())
+        steps[step] = {
+            "same": same,
+            "different": (different := min(only_a, only_b)),
+            "only_first": only_a - different,
+            "only_second": only_b - different,
+            "seconds": seconds[step],
+        }
+    return steps
+
+
+def _of_other_photos(first: dict[str, Any], second: dict[str, Any]) -> bool:
+    """Whether two results are of other photos, though views may go by the same names: no photo of one capture is one of
+    the other's."""
+    photos = [set(document["results"].get("ingest", ())) for document in (first, second)]
+    return first["scene"] != second["scene"] and photos[0].isdisjoint(photos[1])
 
 
 def _views_of_both(first: Path, second: Path) -> list[tuple[Path, Path]]:
@@ -123,7 +145,7 @@ def _instances(found: Correspondence, views: int) -> dict[str, Any]:
 def _tell(document: dict[str, Any], out: Console) -> None:
     if document["scenes"][0] != document["scenes"][1]:
         out.print(escape("scenes: {} and {}".format(*document["scenes"])))
-    for title in ("params", "models"):
+    for title in ("given", "params", "models"):
         for name, (a, b) in document[title].items():
             out.print(escape(f"{name}: {a} -> {b}"))
     if document["metrics"]:
@@ -140,7 +162,9 @@ def _tell(document: dict[str, Any], out: Console) -> None:
     found = document["instances"]
     if found is None:
         unmasked = [run for run in document["runs"] if not (Path(run) / "masks").is_dir()]
-        why = f"{unmasked[0]} has no masks" if unmasked else "the two results have no view of the same name"
+        views = _views_of_both(*map(Path, document["runs"]))
+        why = "the two are of other photos" if views else "the two results have no view of the same name"
+        why = f"{unmasked[0]} has no masks" if unmasked else why
         out.print(escape(f"objects: not compared; {why}."))
         return
     what = f"mean IoU over {found['views']} views; an object without a partner counts 0"

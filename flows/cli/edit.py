@@ -31,7 +31,7 @@ class EditRun:
     json: bool = False
     """Print one JSON document on stdout, and nothing else there."""
     store: InStore = StoreOptions()
-    """Where results are kept."""
+    """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
         from ss_flow.flows.edit import open_edit, run_edit
@@ -60,6 +60,8 @@ def _read_script(file: Path) -> Any:
 
 
 def _tell(document: dict[str, Any], folder: Path, out: Console) -> None:
+    for warning in document["warnings"]:
+        out.print(f"[yellow]warning[/] {escape(warning['label'])}: {escape(warning['text'])}")
     for hole in document["edit"]["holes"]:
         after = hole.get("open_after_filling")
         filled = f"; after filling {after} are still open" if after is not None else ""

@@ -60,7 +60,7 @@ class Export:
     json: bool = False
     """Print one JSON document."""
     store: InStore = StoreOptions()
-    """Where results are kept."""
+    """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
         workspace = self.format in formats.WORKSPACES

@@ -21,8 +21,9 @@ from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import InStore, OptionalPath, PositionalPath, StoreOptions, console
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.describe import told
+from ss_flow.flows.results import read_run
 from ss_flow.runs import DONE, Run, latest_runs, settled
-from ss_flow.tasks.deliver.output import check_named
+from ss_flow.tasks.deliver.output import RUN_FILE, check_named
 from ss_flow.telemetry import trace
 
 
@@ -50,7 +51,9 @@ class Status:
         ended = last if last and last["event"] == "run ended" else None
         state = _state(ended, events)
         done = sum(event["event"] in DONE for event in settled(events))
-        expected = max(done, *(event.get("known", 0) for event in events))
+        # `known` falls again where a result chooses fewer of the others than might have been needed.
+        known = next((event["known"] for event in reversed(events) if "known" in event), 0)
+        expected = done if state == "done" else max(done, known)
         about = {"scene": run.scene, "started": run.header["started"], "state": state}
         document = about | {"done": done, "expected": expected, "steps": steps}
         if self.json:
@@ -127,16 +130,39 @@ def run_with(store: Store, scene: Path | None, name: str) -> tuple[Run | None, l
 
 def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
     """The runs in which to look for a step, in this order: those of the scene; where none is named, of the scene that
-    ran last, and then all others. Each time the latest first.
+    ran last, and then all others. Each time the latest first. scene: a capture, or an output folder: then those runs
+    that came to what it holds.
 
     The very last run may have stopped before the step (`--until`, an interrupt), or be an edit, which has other steps.
     Raises InputError when there is no run.
     """
     runs = list(latest_runs(store.runs, str(scene.resolve()) if scene else None))
+    if not runs and scene and (scene / RUN_FILE).is_file():
+        return _runs_of_output(store, scene)
     if not runs:
         about = f" of {scene}" if scene else ""
         raise InputError(f"the store {store.location} knows no run{about}; `ss-flow run SCENE` makes one.")
     return sorted(runs, key=lambda run: run.scene != runs[0].scene)
+
+
+def _runs_of_output(store: Store, folder: Path) -> list[Run]:
+    """The runs that came to what an output folder holds, the latest first. Raises InputError when there is none."""
+    document = read_run(folder)
+    results = {name: [made] if isinstance(made, str) else made for name, made in document["results"].items()}
+    of_scene = latest_runs(store.runs, str(Path(document["scene"]).resolve()))
+    if runs := [run for run in of_scene if run.results() == results]:
+        return runs
+    raise InputError(
+        f"the store {store.location} has no record of the run that made {folder}; {document['scene']} is its capture."
+    )
+
+
+def not_latest(run: Run, latest: Run) -> str | None:
+    """What to say where something is told of another run than the latest one; None where it is that one."""
+    if run.folder == latest.folder:
+        return None
+    started = time.strftime("%F %T", time.localtime(run.header["started"]))
+    return f"the latest run has no such step; in that of {run.scene}, started {started}:"
 
 
 @dataclass(frozen=True)
@@ -224,6 +250,8 @@ class CacheShow:
             self.png.parent.mkdir(parents=True, exist_ok=True)
             self.png.write_bytes(picture)
         out = console(json=False)
+        if run and (other := not_latest(run, latest_run(store, self.scene))):
+            out.print(escape(other))
         for line in told(values, digests, store, run, asked):
             out.print(escape(line))
         if self.png:

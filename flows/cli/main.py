@@ -13,6 +13,7 @@ import os
 import signal
 import stat
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -29,8 +30,8 @@ from ss_flow.errors import ExecutorLost, InputError, OutputFailure  # noqa: E402
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
-def main(arguments: list[str]) -> int:
-    """Run one command; return the exit code."""
+def main(arguments: list[str], interrupted: Callable[[], object] = lambda: None) -> int:
+    """Run one command; return the exit code. interrupted: called first thing after an interrupt."""
     if arguments == ["--version"]:
         from importlib.metadata import version
 
@@ -47,6 +48,7 @@ def main(arguments: list[str]) -> int:
         _complain(str(error))
         return BAD_INPUT
     except KeyboardInterrupt:
+        interrupted()
         _complain("interrupted; what was finished is kept, and the next run goes on from it.", style="yellow")
         return INTERRUPTED
     except Gone as error:
@@ -161,6 +163,12 @@ def _hung_up(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+def _end_undisturbed() -> None:
+    """After Ctrl-C another one has nothing to stop, but would cut off the last words."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def entry() -> None:
     """The console script."""
     if os.name == "nt":
@@ -173,7 +181,7 @@ def entry() -> None:
     # Hardly anything here is in a cycle: search for cycles less often than after every 700 objects more.
     gc.set_threshold(20_000)
     try:
-        code = main(sys.argv[1:])
+        code = main(sys.argv[1:], _end_undisturbed)
     finally:
         _written_out(sys.stdout)
         _written_out(sys.stderr)

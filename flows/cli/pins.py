@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +21,9 @@ from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import InStore, OptionalPath, PositionalText, StoreOptions, console
 from ss_flow.flows.cli.inspect import run_with
 from ss_flow.flows.cli.telling import print_table
-from ss_flow.runs import Run, latest_runs
+from ss_flow.flows.results import read_run
+from ss_flow.runs import latest_runs
+from ss_flow.tasks.deliver.output import RUN_FILE
 
 
 @dataclass(frozen=True)
@@ -28,8 +31,8 @@ class CachePin:
     """Keep results from being deleted by `cache gc`; without a name, list what is pinned."""
 
     what: PositionalText = None
-    """A step (propagate, segment[0003]) of the latest run that got to it, the first characters of a digest, or a scene:
-    then all of its latest run."""
+    """A step (propagate, segment[0003]) of the latest run that got to it, the first characters of a digest, an
+    output folder: then all that it was made of; or a scene: then all of its latest run."""
     scene: OptionalPath = None
     """The scene that the step is of; the one that ran last, when left out."""
     json: bool = False
@@ -51,28 +54,41 @@ class CachePin:
     def _pin(self, store: Store, what: str) -> Pin:
         run, nodes = run_with(store, self.scene, what)
         if run:
-            return _pin_results(store, what, run, nodes)
+            return _pin_results(store, what, run.scene, nodes)
         found = store.find(what)
         if len(found) == 1:
             makers = [key for key, action in Survey.of(store).actions.items() if found[0] in action.outputs]
             return pin(store, found[0], "", makers, found)
         if found:
             raise InputError(f"{what!r} stands for {len(found)} results; give more of the digest.")
+        if (Path(what) / RUN_FILE).is_file():
+            return _pin_output(store, Path(what))
         run = next(latest_runs(store.runs, str(Path(what).resolve())), None)
         if run is None:
             raise InputError(
-                f"{what!r} is neither a step of the latest runs, nor a digest, nor a scene that was run; "
-                "`ss-flow cache ls` lists what there is."
+                f"{what!r} is neither a step of the latest runs, nor a digest, nor an output folder, nor a scene that "
+                "was run; `ss-flow cache ls` lists what there is."
             )
-        return _pin_results(store, run.scene, run, run.nodes())
+        return _pin_results(store, run.scene, run.scene, run.nodes())
 
 
-def _pin_results(store: Store, what: str, run: Run, nodes: list[dict[str, Any]]) -> Pin:
+def _pin_output(store: Store, folder: Path) -> Pin:
+    """All that an output folder was made of, whether or not there is a record of its run; of an edit, also what it has
+    of its source."""
+    document = read_run(folder)
+    made = [digest for one in document["results"].values() for digest in ([one] if isinstance(one, str) else one)]
+    scene = str(Path(document["scene"]).resolve())
+    return _pin_results(store, str(folder.resolve()), scene, document["nodes"], dict.fromkeys(made))
+
+
+def _pin_results(
+    store: Store, what: str, scene: str, nodes: Iterable[Mapping[str, Any]], objects: Iterable[str] = ()
+) -> Pin:
     # Looking them up counts as a use, so that a `cache gc` that runs at the same time leaves them alone.
     keys = [key for key in dict.fromkeys(node["key"] for node in nodes) if store.action(key) is not None]
     if not keys:
-        raise InputError(f"the results of {what!r} are no longer in the store; run {run.scene} again first.")
-    return pin(store, what, run.scene, keys, ())
+        raise InputError(f"the results of {what!r} are no longer in the store; run {scene} again first.")
+    return pin(store, what, scene, keys, [digest for digest in objects if digest in store])
 
 
 @dataclass(frozen=True)

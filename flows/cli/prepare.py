@@ -22,6 +22,7 @@ from ss_flow.flows.capture import Capture, capture, turned
 from ss_flow.flows.cli.context import InStore, OptionalText, StoreOptions, choose_model, choose_patches, references
 from ss_flow.flows.deliver import deliver, remarks, run_document
 from ss_flow.flows.params import Params
+from ss_flow.flows.results import GIVEN
 from ss_flow.flows.split import Networks
 from ss_flow.flows.split_splat import LEADS_TO, LEADS_TO_CAMERAS, split_splat
 from ss_flow.graph import Call, Flow, Gather, Node, gather, nodes_by_step
@@ -113,6 +114,8 @@ class Prepared:
     scene: SceneFiles
     params: Params
     networks: Networks
+    asked: Mapping[str, Any]
+    """What run.json says of how the run was asked for, besides the parameters."""
     build: Callable[[], dict[str, Any]]
     """Adds the DAG to a flow; returns its results by step. Raises InputError when it cannot be."""
 
@@ -139,11 +142,18 @@ class Prepared:
 
 
 def prepare(
-    scene: SceneFiles, params: Params, options: RunOptions, digests: FileDigests, *, text: str | None = None
+    scene: SceneFiles,
+    params: Params,
+    options: RunOptions,
+    digests: FileDigests,
+    *,
+    text: str | None = None,
+    given: Mapping[str, Path | None] | None = None,
 ) -> Prepared:
     """Choose the networks of an opened scene and say how its DAG is built.
 
-    text: what to search the result for, as one more step, "query".
+    text: what to search the result for, as one more step, "query". given: the files beside the capture that were named,
+    by the options that named them.
     Raises InputError when a network cannot be used.
     """
     if scene.kind == "stray":
@@ -186,7 +196,9 @@ def prepare(
         _check_item(str(options.until), node)
         return results | {target: node}
 
-    return Prepared(scene, params, networks, build)
+    named = {name: None if path is None else str(path.absolute()) for name, path in (given or {}).items()}
+    asked = {"preset": options.preset, "set": options.texts, "given": dict.fromkeys(GIVEN) | named}
+    return Prepared(scene, params, networks, asked, build)
 
 
 def tell_remarks(scenes: Iterable[Prepared], out: Console) -> None:
@@ -229,7 +241,7 @@ def finish(
     failed_input = next((f.error for f in report.failures if isinstance(f.error, InputError)), None)
     if failed_input is not None and any(isinstance(v, Failure) for v in report.values.values()):
         raise failed_input
-    document = run_document(store, prepared.scene, prepared.params, prepared.networks, report)
+    document = run_document(store, prepared.scene, prepared.params, prepared.networks, prepared.asked, report)
     if out is not None and document["status"] != "failed":
         deliver(out, store, document, prepared.scene, undistorted=undistorted)
     return document

@@ -27,7 +27,7 @@ from ss_flow.flows.cli.context import (
 )
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.query import NEEDED, described_parts
-from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, read_run
+from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, not_of_an_edit, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
 from ss_flow.tasks.deliver.places import Written, check_replaceable, replacing_own, sizes
 from ss_flow.tasks.models.catalogue import Model
@@ -67,15 +67,12 @@ class Query:
     json: bool = False
     """Print one JSON document."""
     store: InStore = StoreOptions()
-    """Where results are kept."""
+    """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
         document = read_run(self.result)
         if "edit" in document:
-            raise InputError(
-                f"{self.result} is an edited run, whose objects no photo shows as they are; search its source, "
-                f"{document['edit']['source']}."
-            )
+            raise not_of_an_edit(self.result, document, "photos")
         if self.parts and self.background:
             raise InputError("--background is no part of anything; leave it or --parts out.")
         run = open_run(self.result, self.store, ("describe", *(NEEDED if self.parts else ())))
@@ -102,7 +99,13 @@ class Query:
             shown = [run.store.get(digest) for digest in made["parts"]] if self.parts else None
             answers.append((run.store.get(str(made["query"])), shown))
 
-        run_flows([Request(build, document["scene"], done=read)], run.store, recorded=False)
+        try:
+            run_flows([Request(build, document["scene"], done=read)], run.store, recorded=False)
+        except InputError as error:
+            own = next((name for name in run.names.values() if name.casefold() == self.text.casefold()), None)
+            if own is None:
+                raise
+            raise InputError(f"{error} An instance has this name: export and render take --instance {own!r}.") from None
         found, shown = answers[-1]
         if self.parts and not len(found.instance_id):
             raise InputError(f"no photo shows a part of any instance of {self.result}; leave --parts out.")

@@ -63,7 +63,7 @@ class Render:
     json: bool = False
     """Print one JSON document."""
     store: InStore = StoreOptions()
-    """Where results are kept."""
+    """Where results are kept; by default the store that the run names."""
 
     def run(self) -> int:
         self._check_numbers()

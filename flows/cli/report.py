@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from ss_flow.flows.cli.context import InStore, OptionalPath, StoreOptions, console, open_run
 from ss_flow.flows.cli.diff import changes, difference
-from ss_flow.flows.deliver import write_report
+from ss_flow.flows.deliver import renew_size, write_report
 from ss_flow.tasks.deliver.output import check_file
 from ss_flow.tasks.deliver.report import Comparison
 
@@ -35,6 +35,7 @@ class WriteReport:
         check_file(file, "change who may write there")
         comparison = None if self.beside is None else _comparison(self.beside, self.result)
         write_report(file, run.results, run.document, run.instances, comparison)
+        renew_size(self.result, file.name)
         console(json=False).print(escape(str(file)))
         return 0
 

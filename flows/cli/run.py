@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -63,10 +64,9 @@ class Run:
 
     def run(self) -> int:
         params = settings.preset(Params(), self.execution.preset)
-        if self.calibrate != "auto":
-            params = settings.apply(params, [f"capture.calibrate={self.calibrate}"])
-        if self.refine_poses:
-            params = settings.apply(params, ["capture.refine_poses=always"])
+        calibrate = [f"capture.calibrate={self.calibrate}"] if self.calibrate != "auto" else []
+        texts = (*calibrate, *["capture.refine_poses=always"] * self.refine_poses)
+        options = replace(self.execution, assignments=(texts, *self.execution.assignments))
         out = self.out or Path("ss-flow-out") / capture_name(self.capture)
         scene = open_scene(self.capture, self.masks, self.hints, self.correct)
         if self.scene is not None:
@@ -77,7 +77,8 @@ class Run:
                     f"{self.scene}; give the capture with the poses that it was trained with, such as COLMAP's folder."
                 )
             scene = replace(scene, given_scene=self.scene)
-        return run_scene(scene, out, params, self.execution, undistorted=self.undistorted)
+        given = {"masks": self.masks, "hints": self.hints, "correct": self.correct}
+        return run_scene(scene, out, params, options, given=given, undistorted=self.undistorted)
 
 
 @dataclass(frozen=True)
@@ -123,15 +124,26 @@ class Demo:
         return 0
 
 
-def run_scene(scene: SceneFiles, out: Path, params: Params, options: RunOptions, *, undistorted: bool = False) -> int:
-    """Run the DAG on a scene, write the output folder, print what came out. Returns the exit code."""
+def run_scene(
+    scene: SceneFiles,
+    out: Path,
+    params: Params,
+    options: RunOptions,
+    *,
+    given: Mapping[str, Path | None] | None = None,
+    undistorted: bool = False,
+) -> int:
+    """Run the DAG on a scene, write the output folder, print what came out. Returns the exit code.
+
+    given: see `prepare`.
+    """
     params = settings.apply(params, options.texts)
     engine = options.engine()
     if options.until is None:
         check_replaceable(out, RESULT, options.store.location, scene.files())
     store = options.store.open_store()
     digests = file_digests(store, verify=options.verify)
-    prepared = prepare(scene, params, options, digests)
+    prepared = prepare(scene, params, options, digests, given=given)
     console_out = console(json=options.json)
     documents: list[dict[str, Any]] = []
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shlex
 import time
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -23,8 +22,8 @@ from ss_flow.flows.cli.context import (
     open_run,
 )
 from ss_flow.flows.cli.query import encoder_of, query_params
-from ss_flow.flows.results import FinishedRun, read_run
-from ss_flow.tasks.deliver.output import check_named
+from ss_flow.flows.results import FinishedRun, read_run, run_command, source_of
+from ss_flow.tasks.deliver.output import RUN_FILE, check_named
 
 if TYPE_CHECKING:
     from ss_flow.flows.view.search import Search
@@ -60,7 +59,7 @@ class View:
     port: int = 8080
     """The port to listen on; the next free one where it is taken."""
     store: InStore = StoreOptions()
-    """Where results are kept."""
+    """Where results are kept; by default, of an output folder, the store that its run names."""
 
     def run(self) -> int:
         if not 0 <= self.port < 65536:
@@ -87,13 +86,15 @@ class View:
             raise InputError(
                 f"--rerun, --beside, --script and --correct take the output folder of a run, and {self.what} is none."
             )
-        from ss_flow.flows.cli.inspect import results_named
+        from ss_flow.flows.cli.inspect import latest_run, not_latest, results_named
         from ss_flow.flows.describe import maker, told
         from ss_flow.flows.view.artifact import Around, around_of, placed, show, write_artifact_page
         from ss_flow.tasks.artifacts import Gaussians
 
         out, store = console(json=False), self.store.existing_store()
         run, digests, asked = results_named(store, None, self.what)
+        if run and (other := not_latest(run, latest_run(store, None))):
+            out.print(escape(other))
         values = [store.get(digest) for digest in digests]
         made = maker(store, digests[0], run, asked)
         around = around_of(store, made[0]) if made else Around()
@@ -140,13 +141,18 @@ class View:
 
         document = read_run(folder)
         edit = document.get("edit")
-        run = open_run(Path(edit["source"]) if edit else folder, self.store, ("scene", "cameras"))
+        source, remark = source_of(folder, document) if edit else (folder, "")
+        if not (source / RUN_FILE).is_file() and edit:
+            raise InputError(f"{folder} is an edited run, and its source, {source}, is not there; put it back.")
+        run = open_run(source, self.store, ("scene", "cameras"))
         script = self.script or folder.resolve().with_name(f"{folder.resolve().name}.edit.json")
         hints = self.correct or run.folder.resolve().with_name(f"{run.name}.hints.json")
         operations = edit["script"]["operations"] if edit else []
         if script.is_file():
             operations = read_operations(script)
         out = console(json=False)
+        if remark:
+            out.print(f"[yellow]warning[/] {escape(f'{folder} is an edit of {source}, {remark}.')}")
         try:
             search = search_of(run)
         except InputError as error:  # one sees a scene without it
@@ -162,13 +168,13 @@ class View:
             out.print(
                 f"The scene has {count:,} Gaussians. If the browser has no GPU: --draw-at-most {_FEW} draws fewer."
             )
-        options = ["--correct", str(hints.absolute()), "--out", str(run.folder.absolute())]
-        again = shlex.join(["ss-flow", "run", run.document["scene"], *options])
+        again = run_command(run.folder, run.document, correct=str(hints.absolute()))
+        rest = "." if "set" in run.document else ", and the run's other options."
         saved = f"Edits are saved in {escape(str(script))} ({len(operations)} so far)."
         try:
             with contextlib.suppress(KeyboardInterrupt):
                 out.print(f"{viewer.address}\nCtrl-C ends it. {saved}")
-                out.print(f"Corrections are made by: {escape(again)}, and the run's other options.")
+                out.print(f"Corrections are made by: {escape(again + rest)}")
                 viewer.load_pictures()
                 _wait()
             if viewer.panel.unsaved:

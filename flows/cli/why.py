@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -13,9 +12,14 @@ from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.explain import part_of, since_last
 from ss_flow.flows.cli.context import InStore, PositionalPath, StoreOptions, console
-from ss_flow.flows.cli.inspect import named, runs_to_ask
+from ss_flow.flows.cli.inspect import named, not_latest, runs_to_ask
 from ss_flow.runs import DONE, PreviousKeys, Run, latest_runs
 from ss_flow.sweep import scene_of
+from ss_flow.tasks.capture.scene_files import natural_key
+from ss_flow.tasks.words import first_of
+
+_ITEMS = 8
+"""Items of a step that a message names."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +41,10 @@ class Why:
             if asked := named(run, nodes, self.step):
                 break
         else:
-            known = ", ".join(sorted({n["step"] for n in _tried(runs[0])}))
-            raise InputError(f"the latest run of {runs[0].scene} has no step {self.step!r}; it has {known}.")
+            raise _unknown(self.step, runs[0])
         out = console(json=False)
-        if run is not runs[0]:
-            started = time.strftime("%F %T", time.localtime(run.header["started"]))
-            out.print(escape(f"the latest run has no such step; in that of {run.scene}, started {started}:"))
+        if other := not_latest(run, runs[0]):
+            out.print(escape(other))
         reason_of = Reasons(store, run)
         computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
         reasons: dict[str, list[dict[str, Any]]] = {}
@@ -58,6 +60,16 @@ class Why:
             for cause in _causes(these[0], nodes, reason_of):
                 out.print(escape(f"  because {cause}"))
         return 0
+
+
+def _unknown(name: str, run: Run) -> InputError:
+    """What to say of a step, or an item of one, that no run has. run: the latest."""
+    nodes, step = _tried(run), name.partition("[")[0]
+    if step != name and (items := [n["item"] for n in named(run, nodes, step) if n["item"]]):
+        known = first_of(sorted(dict.fromkeys(items), key=natural_key), _ITEMS)
+        return InputError(f"the latest run of {run.scene} has no {name!r}; {step} has the items {known}.")
+    known = ", ".join(sorted({n["step"] for n in nodes}))
+    return InputError(f"the latest run of {run.scene} has no step {name!r}; it has {known}.")
 
 
 def _tried(run: Run) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.cache.files import write_atomically
+from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows.edit_objects import Objects
 from ss_flow.flows.edit_script import Step, check
@@ -64,9 +65,11 @@ class Session:
         folder: Path,
         operations: Sequence[Operation] = (),
         cameras: Cameras | None = None,
+        store: Store | None = None,
     ) -> None:
         """instances: the document instances.json. folder: what relative paths in operations start from. operations:
-        those of a script to go on with. cameras: they tell what is upright, for objects of other runs.
+        those of a script to go on with. cameras: they tell what is upright, for objects of other runs, whose results
+        may be in this store.
 
         Raises InputError when an operation is refused.
         """
@@ -76,7 +79,7 @@ class Session:
             for instance, rows in rows_by_label(scene.instance_id).items()
         }
         self._begun = Objects.of(instances, scene, cameras)
-        self._folder = folder
+        self._folder, self._store = folder, store
         self._states = [State((), self._begun, pieces, len(scene))]
         self._place = 0
         self.selected: tuple[int, ...] = ()
@@ -148,7 +151,7 @@ class Session:
 
     def _after(self, state: State, operation: Operation) -> State:
         done = (*state.done, operation)
-        steps, objects = check({"operations": list(done)}, self._begun, self._folder)
+        steps, objects = check({"operations": list(done)}, self._begun, self._folder, self._store)
         step = steps[-1] if steps and steps[-1].number == len(done) else None
         if step is None:
             return State(done, objects, state.pieces, state.next_row)

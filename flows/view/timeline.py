@@ -13,7 +13,7 @@ import numpy as np
 
 from ss_flow.cache.errors import Gone
 from ss_flow.errors import InputError
-from ss_flow.flows.results import FinishedRun
+from ss_flow.flows.results import FinishedRun, again
 from ss_flow.flows.view.artifact import around_results
 from ss_flow.flows.view.drawing import (
     add_gaussians,
@@ -160,7 +160,8 @@ class Timeline:
         self._scene = scene
         self.stages = stages(run, share)
         if not self.stages:
-            raise InputError(f"the store {run.store.location} holds no stage of {run.folder} any more; run it again.")
+            what = f"the store {run.store.location} holds no stage of {run.folder} any more"
+            raise InputError(f"{what}; {again(run.folder, run.document)}.")
         self._sides = [{stage.name: stage for stage in self.stages}]
         scene.add_frame(f"{_ROOT}/0", show_axes=False)
         if beside is not None:

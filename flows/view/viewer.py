@@ -39,7 +39,7 @@ class Viewer:
         Raises InputError for an operation that is refused, and when it cannot listen there.
         """
         scene, cameras = run.results.one("scene"), run.results.one("cameras")
-        session = Session(scene, run.instances, script.parent, operations, cameras)
+        session = Session(scene, run.instances, script.parent, operations, cameras, run.store)
         self._run = run
         self.server, self.address = start(host, port, run.name)
         look_from(self.server, start_view(cameras, scene.means))

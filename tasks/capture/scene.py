@@ -273,7 +273,9 @@ def _some_by_name(folder: Path, names: Sequence[str]) -> tuple[Path | None, ...]
     files = [file for place in sorted(folder.glob("**/")) for file in files_in(place, _MASK_SUFFIXES)]
     # As `view_names` has it where photos lie in several folders.
     found = by_name(["_".join([*file.parent.relative_to(folder).parts, file.stem]) for file in files], files)
-    matched = tuple(found.get(name) for name in names)
+    # A Mac may write the same letters otherwise than who named the photos.
+    alike = {unicodedata.normalize("NFC", name): file for name, file in found.items()}
+    matched = tuple(found.get(name) or alike.get(unicodedata.normalize("NFC", name)) for name in names)
     _check_exist([file for file in matched if file is not None])
     if not any(matched):
         raise InputError(f"{folder} holds no image named after a view; {names[0]}.png, for one, is expected.")

@@ -285,10 +285,29 @@ def test_a_search_after_its_store_went_away_says_so_and_makes_no_new_one(warm):
     (warm.out / "run.json").write_text(json.dumps(document))
     descriptor = document["results"]["describe"][0]
     shutil.rmtree(warm.store / "objects" / descriptor[:2] / descriptor)
-    assert_refused(ss_flow("query", warm.out, "red"), "no longer holds describe")
+    again = f"ss-flow run {warm.scene} --preset fast --set=.* --out {warm.out} --cache {warm.store}"
+    assert_refused(ss_flow("query", warm.out, "red"), f"no longer holds describe of .*; run it again: `{again}`")
     shutil.rmtree(warm.store)
-    assert_refused(ss_flow("query", warm.out, "red"), "there is no store")
+    told = f"the results of {warm.out} are in the store {warm.store}, which is not here; name a copy of it with --cache"
+    assert_refused(ss_flow("query", warm.out, "red"), told)
     assert not warm.store.exists()
+
+
+@pytest.mark.parametrize("command", [("query", "red"), ("export", "--format", "coco"), ("edit",), ("render",)])
+def test_a_store_that_was_moved_is_found_where_the_environment_says(command, warm, monkeypatch):
+    moved = warm.store.rename(warm.store.with_name("moved"))
+    script = warm.out.parent / "script.json"
+    script.write_text('{"operations": []}')
+    more = {
+        "edit": [script, "--out", warm.out.parent / "edited"],
+        "export": ["--out", warm.out.parent / "coco.json"],
+        "render": ["--frames", "1", "--what", "labels", "--out", warm.out.parent / "pictures"],
+    }
+    words = (command[0], warm.out, *command[1:], *more.get(command[0], []))
+    assert_refused(ss_flow(*words), f"the results of {warm.out} are in the store {warm.store}, which is not here")
+    monkeypatch.setenv("SS_FLOW_CACHE", str(moved))
+    called = ss_flow(*words)
+    assert called.code == 0, called.err
 
 
 @pytest.mark.parametrize(
@@ -514,7 +533,7 @@ def test_no_file_gets_the_place_of_a_closed_stream(tmp_path):
     before = (
         "import subprocess, sys\n"
         "from ss_flow.flows.cli import main\n"
-        "def opens(arguments):\n"
+        "def opens(arguments, *more):\n"
         "    with open(arguments[0], 'w') as file:\n"
         "        print('noise'), print('noise', file=sys.stderr)\n"
         f"        return subprocess.call([sys.executable, '-c', {child!r}], stdout=file)\n"
@@ -599,6 +618,24 @@ def test_an_interrupt_before_the_command_is_known_ends_as_any_other():
     )
     called = run_entry(["doctor"], before)
     assert (called.returncode, called.stdout) == (130, "") and called.stderr.startswith("ss-flow: interrupted")
+
+
+def test_a_second_interrupt_does_not_cut_off_the_last_words():
+    before = (
+        "import os, signal\n"
+        "from ss_flow.flows.cli import main as module\n"
+        "def read(arguments):\n"
+        "    raise KeyboardInterrupt\n"
+        "module._read = read\n"
+        "complain = module._complain\n"
+        "def twice(*words, **more):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    complain(*words, **more)\n"
+        "module._complain = twice\n"
+    )
+    called = run_entry(["doctor"], before)
+    assert (called.returncode, called.stdout) == (130, "") and called.stderr.count("\n") == 1
+    assert called.stderr.startswith("ss-flow: interrupted")
 
 
 def test_a_sweep_of_more_rows_than_anybody_waits_for_is_refused(tmp_path):

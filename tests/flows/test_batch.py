@@ -189,7 +189,34 @@ def test_an_interrupted_batch_keeps_the_scenes_that_had_ended(warm, den, tmp_pat
     assert (whole.code, whole.document()) == (0, again.document())
 
 
-def test_a_new_batch_begins_a_new_record(warm, tmp_path):
+@pytest.mark.parametrize("before", [["--until", "dense"], ["--set", "masks.share=0"], []])
+def test_a_scene_that_ended_otherwise_than_is_asked_now_or_whose_results_are_gone_is_run(warm, tmp_path, before):
+    out = tmp_path / "batch"
+    assert batch_tiny(warm.store, out, warm.scene, *before).code == 0
+    same = batch_tiny(warm.store, out, warm.scene, *before, "--retry-failed")
+    assert "1 of 1 scenes have ended already" in same.err
+    if not before:
+        shutil.rmtree(out / "room")
+    again = batch_tiny(warm.store, out, warm.scene, "--retry-failed")
+    assert again.code == 0 and "have ended already" not in again.err
+    assert json.loads((out / "room/run.json").read_text())["params"]["splat.masks.share"] > 0
+
+
+def test_a_scene_that_is_run_alone_leaves_the_rows_of_the_others(warm, den, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first = batch_tiny(warm.store, Path("batch"), warm.scene, den).document()
+    assert [row["out"] for row in first] == [str(tmp_path / "batch" / name) for name in ("room", "den")]
+    monkeypatch.chdir(tmp_path / "batch")
+    alone = batch_tiny(warm.store, Path(), den).document()
+    assert [row["scene"] for row in alone] == [str(den)]
+    record = tmp_path / "batch/batch.json"
+    assert json.loads(record.read_text()) == [first[0], *alone]
+    assert batch_tiny(warm.store, Path(), warm.scene, den, "--retry-failed").document() == [first[0], *alone]
+    shutil.rmtree(tmp_path / "batch/room")
+    assert batch_tiny(warm.store, Path(), den).document() == json.loads(record.read_text())
+
+
+def test_rows_of_scenes_that_have_no_folder_here_are_left_out_of_a_new_record(warm, tmp_path):
     out = tmp_path / "batch"
     out.mkdir()
     (out / "batch.json").write_text(json.dumps([{"scene": "/elsewhere", "status": "ok"}]))

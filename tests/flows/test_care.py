@@ -232,9 +232,23 @@ def test_pins_are_named_by_step_by_digest_or_by_scene(warm):
     assert ss_flow("cache", "unpin", "dense", "--scene", warm.scene, "--cache", warm.store).code == 0
 
 
+def test_a_pinned_output_stays_usable_when_other_runs_of_its_capture_are_kept(warm):
+    other = warm.out.with_name("other")
+    run_tiny(warm.scene, warm.store, "--set", "masks.share=0", out=other)
+    age_all(warm.store)
+    assert ss_flow("cache", "pin", warm.out, "--cache", warm.store).code == 0
+    (pinned,) = json.loads(ss_flow("cache", "pin", "--json", "--cache", warm.store).out)
+    assert (pinned["what"], pinned["scene"]) == (str(warm.out), str(warm.scene))
+    gone = removed(gc(warm.store, "--keep-runs", "0"))
+    assert "records of runs" in gone and entries(warm.store)[0] == keys_of(warm.called)
+    coco = ["--format", "coco", "--out", warm.out.with_name("coco.json")]
+    assert [ss_flow("export", out, *coco).code for out in (warm.out, other)] == [0, 2]
+    assert ss_flow("cache", "unpin", warm.out, "--cache", warm.store).code == 0
+
+
 def test_a_pin_of_what_is_not_there_is_refused(warm):
     unknown = ss_flow("cache", "pin", "nonsense", "--cache", warm.store)
-    assert unknown.code == 2 and "is neither a step of the latest runs, nor a digest, nor a scene" in unknown.err
+    assert unknown.code == 2 and "is neither a step of the latest runs, nor a digest, nor an output" in unknown.err
     for place in ("actions", "objects"):
         for folder in (warm.store / place).iterdir():
             folder.rename(warm.store / "tmp" / f"{place}{folder.name}")

@@ -120,6 +120,22 @@ def test_an_object_of_a_run_with_other_axes_comes_upright(warm, tmp_path):
     np.testing.assert_allclose(high[0], scale * high[1], atol=1e-4)
 
 
+def test_an_object_of_a_run_whose_store_is_not_at_hand_is_placed_with_a_warning(warm, tmp_path):
+    own, other = biggest(warm.out), tmp_path / "other"
+    shutil.copytree(warm.out, other)
+    document = json.loads((other / "run.json").read_text())
+    (other / "run.json").write_text(json.dumps(document | {"store": "/nowhere"}))
+    replacing = {"op": "replace", "instance": own, "run": "other", "by": own, "name": "new"}
+    called, _ = edit(warm, replacing)
+    assert called.document()["warnings"] == [], "the store of the edited run has its results"
+    document["results"]["cameras"] = "ab" * 32
+    (other / "run.json").write_text(json.dumps(document))
+    called, place = edit(warm, replacing)
+    (warning,) = called.document()["warnings"]
+    assert warning["label"] == "replace[1]" and warning["text"].startswith("the cameras of other are in no store")
+    assert warning["text"] in (place / "report.html").read_text()
+
+
 def test_a_bad_script_runs_nothing_and_writes_nothing(warm):
     called, place = edit(warm, {"op": "remove", "instances": "no such thing"})
     assert called.code == 2 and not place.exists() and called.out == ""
@@ -151,7 +167,19 @@ def test_an_edited_run_is_edited_through_its_script(warm):
     called = ss_flow("edit", place, place.with_suffix(".json"), "--out", place.parent / "x", "--cache", warm.store)
     assert called.code == 2 and "add the operations to its script" in called.err
     asked = ss_flow("query", place, "red", "--cache", warm.store)
-    assert asked.code == 2 and f"search its source, {warm.out.resolve()}" in asked.err
+    assert asked.code == 2 and f"take its source, {warm.out.resolve()}." in asked.err
+
+
+def test_of_an_edit_s_source_it_is_told_where_it_lies_now_and_whether_it_was_run_anew(warm, tmp_path):
+    _, place = edit(warm)
+    record = warm.out / "run.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"content": "ab" * 32}))
+    anew = ss_flow("query", place, "red")
+    assert f"take its source, {warm.out.resolve()}, which was run anew since, so that" in anew.err
+    shutil.move(warm.out, tmp_path / "moved" / "out")
+    assert f"{warm.out.resolve()}, which is no longer there." in ss_flow("query", place, "red").err
+    place = shutil.move(place, tmp_path / "moved" / "edited")
+    assert f"{tmp_path}/moved/out, which was run anew since" in ss_flow("query", place, "red").err
 
 
 def test_an_edited_run_is_exported_but_for_what_its_photos_do_not_show(warm):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 
 import cv2
 import numpy as np
@@ -33,6 +34,16 @@ def test_status_counts_what_each_step_did(tiny):
     assert all(row["expected"] == row["finished"] + row["hit"] for row in document["steps"].values())
 
 
+def test_status_of_a_run_that_ended_lacks_nothing_though_more_was_expected_at_times(warm):
+    run = next(latest_runs(warm.store / "roots/runs"))
+    lines = [json.loads(line) for line in (run.folder / "events.jsonl").read_text().splitlines()]
+    middle = next(event for event in lines if event.get("label") == "split.propagate")
+    middle["known"] = 1000
+    (run.folder / "events.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    document = json.loads(ss_flow("status", "--json", "--cache", warm.store).out)
+    assert document["state"] == "done" and document["done"] == document["expected"] < 1000
+
+
 def test_status_of_a_run_that_was_cut_short_says_how_much_there_is_to_do(warm):
     """Cut the record in the middle of the views, as a kill would."""
     run = next(latest_runs(warm.store / "roots/runs"))
@@ -55,6 +66,29 @@ def test_why_says_that_nothing_was_known_on_the_first_run(tiny):
     assert told == "split.visibility: computed for the first time for this scene (5 of them)\n"
     one = ss_flow("why", "visibility[0002]", "--cache", tiny.store).out
     assert one == "split.visibility[0002]: computed for the first time for this scene\n"
+
+
+def test_the_run_that_made_an_output_is_asked_about_by_its_folder(warm):
+    started = json.loads(ss_flow("status", warm.out, "--json", "--cache", warm.store).out)["started"]
+    other = warm.out.with_name("other")
+    assert run_tiny(warm.scene, warm.store, "--set", "masks.share=0", out=other).code == 0
+    latest = ss_flow("status", warm.scene, "--json", "--cache", warm.store).out
+    assert ss_flow("status", other, "--json", "--cache", warm.store).out == latest
+    assert json.loads(ss_flow("status", warm.out, "--json", "--cache", warm.store).out)["started"] == started
+    told = ss_flow("why", "render_masks", other, "--cache", warm.store).out
+    assert "parameter share" in told
+    assert "for the first time" in ss_flow("why", "render_masks", warm.out, "--cache", warm.store).out
+    for run in latest_runs(warm.store / "roots/runs"):
+        if run.header["started"] == started:
+            shutil.rmtree(run.folder)
+    refused = ss_flow("graph", warm.out, "--cache", warm.store)
+    assert refused.code == 2 and f"no record of the run that made {warm.out}; {warm.scene} is its" in refused.err
+
+
+def test_why_names_the_items_of_a_step_that_has_no_such_one(tiny):
+    refused = ss_flow("why", "reconstruct[7]", "--cache", tiny.store)
+    assert refused.code == 2
+    assert "has no 'reconstruct[7]'; reconstruct has the items 0, 1, 2, 3, 4, 5." in refused.err
 
 
 def test_why_looks_further_back_where_the_latest_run_is_of_something_else(warm):
@@ -163,7 +197,12 @@ def test_a_result_is_found_by_the_name_that_until_takes(tiny, name):
 def test_results_of_a_finished_run_are_found_after_one_that_stopped_before_them(warm):
     before = ss_flow("cache", "show", "scene", "--cache", warm.store)
     run_tiny(warm.scene, warm.store, "--until", "dense", out=warm.out)
-    assert ss_flow("cache", "show", "scene", "--cache", warm.store) == before
+    lines = ss_flow("cache", "show", "scene", "--cache", warm.store).out.splitlines(keepends=True)
+    assert lines[0].startswith(f"the latest run has no such step; in that of {warm.scene}, started ")
+    assert "".join(lines[1:]) == before.out
+    page = warm.out.parent / "page.html"
+    viewed = ss_flow("view", "scene", "--html", page, "--cache", warm.store)
+    assert viewed.out.splitlines(keepends=True) == [lines[0], f"{page}\n"]
     assert ss_flow("cache", "pin", "scene", "--cache", warm.store).code == 0
     picture = warm.out.parent / "scene.png"
     assert ss_flow("cache", "show", "scene", "--view", "1", "--png", picture, "--cache", warm.store).code == 0

@@ -54,6 +54,17 @@ def test_the_object_of_a_colour_is_found(tiny):
     assert found >= 2
 
 
+def test_a_text_that_is_an_instance_s_own_name_and_cannot_be_searched_for_is_said_to_be_one(warm):
+    file = warm.out / "instances.json"
+    document = json.loads(file.read_text())
+    document["instances"][0] |= {"name": "Sofa", "named_by": "hints"}
+    file.write_text(json.dumps(document))
+    answer = ss_flow("query", warm.out, "sofa", "--cache", warm.store)
+    assert answer.code == 2 and "names no colour" in answer.err
+    assert "An instance has this name: export and render take --instance 'Sofa'." in answer.err
+    assert "An instance" not in ss_flow("query", warm.out, "couch", "--cache", warm.store).err
+
+
 def test_a_search_works_on_the_store_that_the_run_names(tiny):
     assert ss_flow("query", tiny.out, "red", "--json").code == 0
 

@@ -38,6 +38,8 @@ def test_another_run_is_compared_with_in_the_report(warm, tmp_path):
     assert f"<code>{setting}</code></td><td>10</td><td>20</td>" in section
     assert "(after Split)" not in section and "figures are the same in both" in section, "nothing else was changed"
     assert "agree with a mean IoU of" in section
+    again = run_tiny(warm.scene, warm.store, out=warm.out)
+    assert again.computed() == {} and file.read_text() == html, "a run that changes nothing leaves it"
     assert ss_flow("report", warm.out).code == 0 and "Compared with" not in file.read_text()
     answer = ss_flow("report", warm.out, "--beside", tmp_path / "nowhere")
     assert answer.code == 2 and answer.err.count("\n") == 1

@@ -11,7 +11,7 @@ import sys
 import urllib.request
 
 import pytest
-from tiny_runs import ss_flow
+from tiny_runs import SHORT, ss_flow
 
 
 def test_without_the_extra_one_sentence_says_which_to_install(tiny, monkeypatch):
@@ -78,10 +78,10 @@ class TestWithTheExtra:
         hints = tmp_path / "h.json"
         asked = ["--correct", os.path.relpath(hints), "--cache", tiny.store, "--port", "0"]
         called = ss_flow("view", tiny.out.name, *asked)
-        command = called.out.partition("made by: ")[2].partition(", and the run's")[0]
-        run, scene, correct, out = (shlex.split(command)[place] for place in (1, 2, 4, 6))
-        assert (run, scene, out) == ("run", str(tiny.scene), str(tiny.out)), called
+        run, scene, _, correct, *options = shlex.split(called.out.partition("made by: ")[2].rstrip(".\n"))[1:]
+        assert (run, scene) == ("run", str(tiny.scene)), called
         assert os.path.isabs(correct) and os.path.samefile(os.path.dirname(correct), tmp_path)
+        assert options == ["--preset", "fast", *SHORT, "--out", str(tiny.out), "--cache", str(tiny.store)]
 
     @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
     def test_it_serves_until_it_is_interrupted_and_that_is_its_good_end(self, tiny, how):
@@ -92,6 +92,20 @@ class TestWithTheExtra:
         _, err = process.communicate(timeout=60)
         assert process.returncode == 0 and not err and "saved in" in told
         assert not (tiny.out.parent / "out.edit.json").exists()
+
+    def test_an_edited_run_whose_source_changed_or_is_gone_says_so(self, warm, tmp_path, monkeypatch):
+        monkeypatch.setattr("ss_flow.flows.cli.view._wait", lambda: None)
+        script, edited = tmp_path / "s.json", tmp_path / "edited"
+        script.write_text('{"operations": []}')
+        assert ss_flow("edit", warm.out, script, "--out", edited, "--cache", warm.store).code == 0
+        record = warm.out / "run.json"
+        record.write_text(json.dumps(json.loads(record.read_text()) | {"content": "ab" * 32}))
+        told = ss_flow("view", edited, "--cache", warm.store, "--port", "0")
+        assert f"warning {edited} is an edit of {warm.out.resolve()}, which was run anew since" in told.out, told.err
+        warm.out.rename(tmp_path / "elsewhere")
+        refused = ss_flow("view", edited, "--cache", warm.store)
+        assert refused.code == 2
+        assert f"{edited} is an edited run, and its source, {warm.out.resolve()}, is not there" in refused.err
 
     def test_an_edited_run_is_gone_on_with(self, warm, tmp_path):
         script, edited = tmp_path / "s.json", tmp_path / "edited"

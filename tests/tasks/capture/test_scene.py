@@ -2,6 +2,7 @@ import json
 import shutil
 import sys
 import time
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 
@@ -500,3 +501,12 @@ def test_runs_of_a_file_are_recorded_under_it_and_those_of_a_folder_under_the_fo
     folder = made.nerfstudio(tmp_path / "posed")
     assert open_scene(folder / "transforms.json").place == folder / "transforms.json"
     assert open_scene(folder).place == folder
+
+
+def test_masks_belong_to_their_photos_whichever_way_their_names_write_an_accent(tmp_path):
+    composed, apart = (unicodedata.normalize(form, "Küche") for form in ("NFC", "NFD"))
+    made.write(tmp_path / f"{composed}.jpg", np.zeros((24, 32, 3), np.uint8))
+    for folder in ("instance", "instance_masks"):
+        made.write(tmp_path / folder / f"{apart}.png", np.zeros((24, 32), np.uint16))
+    scene = open_scene(tmp_path)
+    assert [file.name for file in (*scene.ground_truth, *scene.ready_masks)] == [f"{apart}.png"] * 2
