@@ -17,7 +17,7 @@ def box_diagonal(points: Float32 | Float64, trim: float = 0.005) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def thinned(points: Float32, enough: int) -> Float64:
+def thinned(points: Float32 | Float64, enough: int) -> Float64:
     """Every n-th of the points [N, 3], so that at least `enough` are left, or all, but less than twice as many."""
     return points[:: max(1, len(points) // enough)].astype(np.float64)
 
