@@ -133,9 +133,7 @@ def adjusted(
             break
         error = max(error / 2, params.last_error)
     mapper.end_reconstruction(False)
-    rows = [
-        number - 1 for number in sorted(model.reg_image_ids()) if model.image(number).num_points3D >= params.min_points
-    ]
+    rows = [number - 1 for number in sorted(model.reg_image_ids()) if _points(model, number) >= params.min_points]
     if len(rows) < _LEAST_PHOTOS:
         raise Unrefinable(f"fewer than {_LEAST_PHOTOS} photos see {params.min_points} points in common with others")
     poses = np.stack([np.vstack([model.image(row + 1).cam_from_world().matrix(), (0, 0, 0, 1)]) for row in rows])
@@ -215,6 +213,10 @@ def _tell(given: Cameras, found: Adjusted) -> None:
         f"degrees (at most {turned.max():.2f}); points are seen {found.error_after:.2f} pixels off their place instead "
         f"of {found.error_before:.2f} (medians)."
     )
+
+
+def _points(model: Any, number: int) -> int:
+    return int(model.image(number).num_points3D)
 
 
 def _median_error(model: Any) -> float:
