@@ -55,7 +55,7 @@ def splat_growth(axes: Axes) -> None:
     axes.plot(x, y, "o")
     for row, right, up in zip(rows, x, y, strict=True):
         axes.annotate(row[0], (right, up), xytext=(6, -12), textcoords="offset points")
-    axes.set(xlabel="instances", ylabel="seconds, two workers", xlim=(0, 330), ylim=(0, 420))
+    axes.set(xlabel="instances", ylabel="seconds, two workers", xlim=(0, 260), ylim=(0, 240))
 
 
 def engine(axes: Axes) -> None:

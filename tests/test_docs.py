@@ -82,7 +82,7 @@ def test_the_plots_are_drawn_from_the_tables_of_the_pages(tmp_path):
     drawn = plots.draw(tmp_path)
     assert [path.name for path in drawn] == [f"{plot.__name__}.svg" for plot in plots.PLOTS]
     assert set(re.findall(r"\(images/(\w+\.svg)\)", page)) == {path.name for path in drawn}
-    assert plots.table("measurements/splat.md", "Time and memory")[1][:3] == ["room 50", "54", "106 s"]
+    assert plots.table("measurements/splat.md", "Time and memory")[1][:3] == ["room 50", "54", "108 s"]
     with pytest.raises(ValueError, match="no table under 'Nothing'"):
         plots.table("engine.md", "Nothing")
 
