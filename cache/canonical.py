@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,11 @@ DIGEST = re.compile(r"[0-9a-f]{64}")
 """What a digest looks like."""
 _LENGTH = struct.Struct("<Q").pack
 _FLOAT = struct.Struct("<d").pack
+
+
+def digests_of(value: str | Iterable[str]) -> list[str]:
+    """The digests of a list, or of one artifact, which stands for itself."""
+    return [value] if isinstance(value, str) else list(value)
 
 
 def digest(value: Any) -> str:

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.cache.canonical import DIGEST
+from ss_flow.cache.canonical import DIGEST, digests_of
 from ss_flow.cache.location import is_url, open_store
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
@@ -70,7 +70,7 @@ class Results:
             if name not in self.digests:
                 return False
             value = self.digests[name]
-            return all(digest in self.store for digest in ([value] if isinstance(value, str) else value))
+            return all(digest in self.store for digest in digests_of(value))
 
         return [name for name in names if not held(name)]
 
@@ -146,8 +146,7 @@ class FinishedRun:
         if name not in self.results.digests:
             raise InputError(f"{self.folder} has no result {name!r}; it has {', '.join(self.results.digests)}.")
         self.require([name])
-        found = self.results.digests[name]
-        return [found] if isinstance(found, str) else list(found)
+        return digests_of(self.results.digests[name])
 
     def artifact(self, name: str) -> Any:
         """A result by its name in run.json, as "propagate": an artifact, or a list. Raises as `digests` does."""

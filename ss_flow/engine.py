@@ -11,6 +11,7 @@ from typing import Any
 
 import psutil
 
+from ss_flow.cache.canonical import digests_of
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure, writing
 from ss_flow.cache.store import Store
@@ -19,7 +20,7 @@ from ss_flow.errors import InputError
 from ss_flow.events import Record, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
 from ss_flow.graph import Flow, Node
-from ss_flow.keys import Value, digests_of
+from ss_flow.keys import Value
 from ss_flow.resolution import Failure
 from ss_flow.runs import PreviousKeys, Run, latest_runs, settled, start_run
 from ss_flow.scheduler import Listening, Scheduler

@@ -28,11 +28,6 @@ Value = tuple[str, ...] | str
 """What an input resolves to: one digest, or the digests of a list."""
 
 
-def digests_of(value: Value) -> list[str]:
-    """The digests of an input, of one artifact too."""
-    return [value] if isinstance(value, str) else list(value)
-
-
 @dataclass(frozen=True)
 class Recipe:
     """What all calls of a task have in common."""

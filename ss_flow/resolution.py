@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ss_flow.cache.canonical import digests_of
 from ss_flow.graph import Call, Expand, Flow, Gather, Item, Node, Otherwise, Pick, Stored
-from ss_flow.keys import Value, digests_of
+from ss_flow.keys import Value
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from typing import Any
 
+from ss_flow.cache.canonical import digests_of
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.store import Action, Store
@@ -27,7 +28,7 @@ from ss_flow.explain import changed_items, part_of, since_last
 from ss_flow.graph import Call, Flow, Node, Stored
 from ss_flow.jobs import Job, Queue, Tokens
 from ss_flow.kept_closures import kept_closure
-from ss_flow.keys import Components, Keys, Value, digests_of
+from ss_flow.keys import Components, Keys, Value
 from ss_flow.resolution import Failure, NotRun, Resolution
 from ss_flow.task import Resources
 

@@ -15,6 +15,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
+from ss_flow.cache.canonical import digests_of
 from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
@@ -148,7 +149,7 @@ def runs_to_ask(store: Store, scene: Path | None) -> list[Run]:
 def _runs_of_output(store: Store, folder: Path) -> list[Run]:
     """The runs that came to what an output folder holds, the latest first. Raises InputError when there is none."""
     document = read_run(folder)
-    results = {name: [made] if isinstance(made, str) else made for name, made in document["results"].items()}
+    results = {name: digests_of(made) for name, made in document["results"].items()}
     of_scene = latest_runs(store.runs, str(Path(document["scene"]).resolve()))
     if runs := [run for run in of_scene if run.results() == results]:
         return runs

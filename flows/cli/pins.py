@@ -14,6 +14,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
+from ss_flow.cache.canonical import digests_of
 from ss_flow.cache.pins import Pin, pin, read_pins, unpin
 from ss_flow.cache.store import Store
 from ss_flow.cache.survey import Survey
@@ -76,7 +77,7 @@ def _pin_output(store: Store, folder: Path) -> Pin:
     """All that an output folder was made of, whether or not there is a record of its run; of an edit, also what it has
     of its source."""
     document = read_run(folder)
-    made = [digest for one in document["results"].values() for digest in ([one] if isinstance(one, str) else one)]
+    made = [digest for value in document["results"].values() for digest in digests_of(value)]
     scene = str(Path(document["scene"]).resolve())
     return _pin_results(store, str(folder.resolve()), scene, document["nodes"], dict.fromkeys(made))
 

@@ -64,8 +64,8 @@ class Run:
 
     def run(self) -> int:
         params = settings.preset(Params(), self.execution.preset)
-        calibrate = [f"capture.calibrate={self.calibrate}"] if self.calibrate != "auto" else []
-        texts = (*calibrate, *["capture.refine_poses=always"] * self.refine_poses)
+        calibrate = (f"capture.calibrate={self.calibrate}",) if self.calibrate != "auto" else ()
+        texts = calibrate + (("capture.refine_poses=always",) if self.refine_poses else ())
         options = replace(self.execution, assignments=(texts, *self.execution.assignments))
         out = self.out or Path("ss-flow-out") / capture_name(self.capture)
         scene = open_scene(self.capture, self.masks, self.hints, self.correct)

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Cameras, Float32, Float64
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64
 from ss_flow.tasks.geometry.cameras import centers_of
+
+Plane = tuple[Float64, Float64]
+"""A point of it [3], and its unit normal [3]."""
+_FEW = 10
+"""Points that a plane is not fitted to."""
 
 
 def box_diagonal(points: Float32 | Float64, trim: float = 0.005) -> float:
@@ -22,13 +27,29 @@ def thinned(points: Float32 | Float64, enough: int) -> Float64:
     return points[:: max(1, len(points) // enough)].astype(np.float64)
 
 
-def plane_through(points: Float64) -> tuple[Float64, Float64]:
+def plane_through(points: Float64) -> Plane:
     """The plane with the least squared distances from points [N, 3]: their mean, and its unit normal."""
     centre = points.mean(axis=0)
     return centre, np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
 
 
-def plane_of_most(points: Float64, thickness: float, rounds: int) -> tuple[Float64, Float64]:
+def on_plane(points: Float64, plane: Plane, thickness: float) -> Bool:
+    """[N] which points [N, 3] lie on a plane, at most so far from it."""
+    centre, normal = plane
+    return np.asarray(np.abs((points - centre) @ normal) <= thickness)
+
+
+def refitted(points: Float64, plane: Plane, thickness: float, rounds: int) -> Plane:
+    """A plane after so many fits, each to the points [N, 3] that lie on the last one; none where hardly any do."""
+    for _ in range(rounds):
+        near = on_plane(points, plane, thickness)
+        if near.sum() < _FEW:
+            break
+        plane = plane_through(points[near])
+    return plane
+
+
+def plane_of_most(points: Float64, thickness: float, rounds: int) -> Plane:
     """The plane that most points [N, 3] lie on, which the others do not draw away: a point of it, and its unit normal.
 
     thickness: how far from the plane a point still lies on it. rounds: fits, each to the points on the plane of the

@@ -14,7 +14,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
+from ss_flow.tasks.geometry.shape import Plane, box_diagonal, middle_of, refitted, thinned, towards
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.touching import TouchingParams
@@ -44,9 +44,6 @@ _FEET = (0.1, 0.3)
 """A board surrounds what rises from it up to these shares of the height of that."""
 _OUTLINE = 0.9
 """Share of the points of a foot, in one direction, that lie within its outline."""
-
-Plane = tuple[Float64, Float64]
-"""A point of it [3], and its unit normal [3] towards the cameras."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +156,8 @@ class _Relief:
 
 
 def _planes(places: Float64, thickness: float, eye: Float64) -> Iterator[Plane]:
-    """The planes that may be a board: of those through three of the points [N, 3], drawn from a fixed seed, the ones
-    that most points lie on and few behind, and from which enough points rise."""
+    """The planes that may be a board, with normals towards the eye: of those through three of the points [N, 3], drawn
+    from a fixed seed, the ones that most points lie on and few behind, and from which enough points rise."""
     corner = places[np.random.default_rng(0).integers(0, len(places), (_TRIPLES, 3))]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     length = np.linalg.norm(normal, axis=1)
@@ -170,9 +167,7 @@ def _planes(places: Float64, thickness: float, eye: Float64) -> Iterator[Plane]:
     on, behind = (np.abs(height) <= thickness).mean(axis=0), (height < -thickness).mean(axis=0)
     rough = np.flatnonzero((on >= _SHARE / 2) & (behind <= 2 * _BEHIND))  # fitting may mend as much
     for row in rough[np.argsort(-on[rough], kind="stable")][:_BEST]:
-        middle, across = centre[row], normal[row]
-        for _ in range(_ROUNDS):
-            middle, across = plane_through(places[np.abs((places - middle) @ across) <= thickness])
+        middle, across = refitted(places, (centre[row], normal[row]), thickness, _ROUNDS)
         across = towards(across, middle, eye)
         above = (places - middle) @ across
         enough = min((np.abs(above) <= thickness).mean(), (above > thickness).mean()) >= _SHARE

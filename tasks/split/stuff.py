@@ -8,7 +8,17 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_of_most, plane_through, thinned, towards
+from ss_flow.tasks.geometry.shape import (
+    Plane,
+    box_diagonal,
+    middle_of,
+    on_plane,
+    plane_of_most,
+    plane_through,
+    refitted,
+    thinned,
+    towards,
+)
 from ss_flow.tasks.ranges import Count, Fraction
 
 _ROUNDS = 4
@@ -61,37 +71,26 @@ def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params
     return stuff
 
 
-def _planes(places: Float64, thickness: float, params: StuffParams) -> list[tuple[Float64, Float64]]:
+def _planes(places: Float64, thickness: float, params: StuffParams) -> list[Plane]:
     """The planes that enough of some points [N, 3] lie on: one, or else one after the other, each with as many as it
     can of those that are left; none if there would have to be too many."""
     one = plane_of_most(places, thickness, _ROUNDS)
-    if _near(places, one, thickness).mean() >= params.flat:
+    if on_plane(places, one, thickness).mean() >= params.flat:
         return [one]
-    planes: list[tuple[Float64, Float64]] = []
+    planes: list[Plane] = []
     rest = places
     while 1 < params.planes > len(planes) and len(rest) > (1 - params.flat) * len(places):
         planes.append(_largest_plane(rest, thickness))
-        rest = rest[~_near(rest, planes[-1], thickness)]
+        rest = rest[~on_plane(rest, planes[-1], thickness)]
     return planes if len(rest) <= (1 - params.flat) * len(places) else []
 
 
-def _largest_plane(places: Float64, thickness: float) -> tuple[Float64, Float64]:
+def _largest_plane(places: Float64, thickness: float) -> Plane:
     """The plane, of those through small patches of some points [N, 3], that most of the points lie on."""
     from scipy.spatial import cKDTree
 
     count = max(len(places) // _PATCHES, min(_FEW, len(places)))
     _, near = cKDTree(places).query(places[:: max(1, len(places) // _PATCHES)], k=count)
     patches = [plane_through(places[rows]) for rows in np.reshape(near, (-1, count))]
-    best = max(patches, key=lambda plane: _near(places, plane, thickness).sum())
-    for _ in range(_ROUNDS):
-        near = _near(places, best, thickness)
-        if near.sum() < _FEW:
-            break
-        best = plane_through(places[near])
-    return best
-
-
-def _near(places: Float64, plane: tuple[Float64, Float64], thickness: float) -> Bool:
-    """[N] which points lie on a plane."""
-    centre, normal = plane
-    return np.asarray(np.abs((places - centre) @ normal) <= thickness)
+    best = max(patches, key=lambda plane: on_plane(places, plane, thickness).sum())
+    return refitted(places, best, thickness, _ROUNDS)
