@@ -107,7 +107,7 @@ def hierarchy(
     """
     leaves = np.unique(labels.label[labels.label > 0]).astype(np.int32)
     ends = borders(labels.label, points, TouchingParams())
-    surface = lit_surfaces(points, cameras, labels.label, ends, params.shadows)
+    surface = lit_surfaces(points, cameras, visibility, labels.label, ends, params.shadows)
     _, surface_of = np.unique(surface[leaves], return_inverse=True)
     is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)

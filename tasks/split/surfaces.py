@@ -1,19 +1,23 @@
-"""Which labels are one surface: parted by a shadow, or by nothing that can be seen. Beyond Split&Splat.
+"""Which labels are one surface: parted by a shadow, by what stands on it, or by nothing at all. Beyond Split&Splat.
 
-A segmenter cuts at a hard shadow as at the edge of a print (`shadows` tells them apart). And where the colour does not
-change at all from one label to the other, the views' masks end somewhere, but nothing ends there.
+A segmenter cuts at a hard shadow as at the edge of a print (`shadows` tells them apart). Where the colour does not
+change at all from one label to the other, the views' masks end somewhere, but nothing ends there. And a flat surface
+goes on under what stands on it (`gaps`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Cameras, Float64, Int32, PointCloud
-from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_of_most, thinned
+from ss_flow.tasks.artifacts import Cameras, Float64, Int32, PointCloud, Visibility
+from ss_flow.tasks.geometry.clustering import rows_by_label
+from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, on_plane, plane_of_most, thinned, towards
 from ss_flow.tasks.ranges import Count, Fraction
+from ss_flow.tasks.split.gaps import Gaps
 from ss_flow.tasks.split.shadows import OTHER, Touches, bright, find_shadows, find_touches, logarithms
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.smoothing import smooth
@@ -30,6 +34,13 @@ _ENOUGH = 2000
 _ROUNDS = 8
 _FILLED = 30
 """How often points without a label take that of their neighbours, to tell which labels touch."""
+_FLAT = 0.9
+"""Share of the points of each of two labels that do not touch that must lie on one plane."""
+_FEW = 100
+"""Points below which a label that touches no other has no plane."""
+
+Meeting = dict[tuple[int, int], bool | None]
+"""Which surfaces touch: see `_meeting`."""
 
 
 @dataclass(frozen=True)
@@ -55,57 +66,138 @@ class ShadowParams:
     not in it. At least the cloud's spacing."""
     min_points: Count = 10
     """Points on both sides at which two labels must touch."""
+    gap: Fraction = 0.3
+    """Longest gap that what lies or stands on a surface leaves between two pieces of it, as a share of the extent of
+    the smaller one; 0 = they must touch."""
 
 
-def lit_surfaces(cloud: PointCloud, cameras: Cameras, label: Int32, ends: Borders, params: ShadowParams) -> Int32:
+def lit_surfaces(
+    cloud: PointCloud,
+    cameras: Cameras,
+    visibility: Sequence[Visibility],
+    label: Int32,
+    ends: Borders,
+    params: ShadowParams,
+) -> Int32:
     """[L + 1] the lowest label of the surface that each label is a piece of; itself where it is all of one.
 
-    label: [N] of the cloud's points, 0 = none; ends: their borders. Round by round, the labels are united that lie in
-    one plane and touch without an edge where light alone, or nothing, tells them apart: those that do so along the
-    largest share of a border first, each once a round.
+    visibility: of all views. label: [N] of the cloud's points, 0 = none; ends: their borders. Round by round, the
+    labels are united that lie in one plane and touch without an edge where light alone, or nothing, tells them apart:
+    those that do so along the largest share of a border first, each once a round. When none are left, those of one
+    colour that lie in one plane and touch nowhere, but between which the views see only what is on it.
     """
-    surface = np.arange(int(label.max(initial=0)) + 1, dtype=np.int32)
     if not params.agreement or not label.any():
-        return surface
+        return np.arange(int(label.max(initial=0)) + 1, dtype=np.int32)
+    found = _Surfaces(cloud, Gaps(cloud, cameras, visibility), label, params)
     eye = middle_of(cameras)
     shadows = find_shadows(cloud, label, ends, eye, min_points=params.min_points, repeats=params.repeats)
     # Between the things that stand on a table, and along shadows, its points have no label: masks do not agree there.
     filled = smooth(label, label == 0, cloud.points, cloud.spacing, _FILLED)
     touches = find_touches(cloud, label, filled, eye, shadows)
-    bins, brightness = bins_of(cloud.colors), logarithms(cloud.colors)
     while True:
-        taken: set[int] = set()
-        for a, b, stays in _meeting(touches, surface, filled, params):
-            if taken & {a, b}:
-                continue
-            of = surface[label]
-            rows = np.flatnonzero(of == a), np.flatnonzero(of == b)
-            if (stays or _of_one_color(bins, brightness, rows, params)) and _in_one_plane(cloud, *rows, params):
-                taken |= {a, b}
-                surface[surface == b] = a
-        if not taken:
-            return surface
+        meeting = _meeting(touches, found.surface, filled, params)
+        if not found.unite(found.touching(meeting)) and not found.unite(found.apart(meeting, eye)):
+            return found.surface
 
 
-def _of_one_color(
-    bins: Int32, brightness: Float64, rows: tuple[NDArray[np.intp], NDArray[np.intp]], params: ShadowParams
-) -> bool:
-    """Whether two sets of points have the same colours all over; black tells nothing.
+class _Surfaces:
+    """What surfaces the labels of a cloud are pieces of, as far as that is found.
 
-    bins: [N] of all points' colours; brightness: [N, 3] their logarithms.
+    surface: [L + 1] the lowest label of each label's.
     """
-    if params.colors == 1:
-        return False
-    first, second = (np.median(brightness[part], axis=0) for part in rows)
-    if (np.abs(first - second) >= OTHER).any() or not bright(first[None])[0]:
-        return False
-    spread = TouchingParams().color_spread
-    return likeness(*(histogram(bins[part], spread) for part in rows)) >= params.colors
+
+    def __init__(self, cloud: PointCloud, gaps: Gaps, label: Int32, params: ShadowParams) -> None:
+        self.surface = np.arange(int(label.max()) + 1, dtype=np.int32)
+        self._cloud = cloud
+        self._gaps = gaps
+        self._label = label
+        self._params = params
+        self._bins, self._brightness = bins_of(cloud.colors), logarithms(cloud.colors)
+        self._taken = set[int]()
+
+    def unite(self, pairs: Iterable[tuple[int, int]]) -> bool:
+        """Make each pair of surfaces one; no surface may occur twice. Returns whether there were any."""
+        self._taken = set()
+        for a, b in pairs:
+            self._taken |= {a, b}
+            self.surface[self.surface == max(a, b)] = min(a, b)
+        return bool(self._taken)
+
+    def touching(self, meeting: Meeting) -> Iterator[tuple[int, int]]:
+        """Pairs that light alone, or nothing, tells apart where they touch, each surface once."""
+        rows_of = rows_by_label(self.surface[self._label])
+        for (a, b), stays in meeting.items():
+            if stays is not None and not self._taken & {a, b}:
+                rows = rows_of[a], rows_of[b]
+                if (stays or self._of_one_color(rows)) and self._common_plane(rows, self._params.flat):
+                    yield a, b
+
+    def apart(self, meeting: Meeting, eye: Float64) -> Iterator[tuple[int, int]]:
+        """Pairs of one colour in one plane that do not touch but for what lies or stands between them, each surface
+        once. eye: [3] the middle of the cameras."""
+        of = self.surface[self._label]
+        rows_of = rows_by_label(of)
+        for larger, smaller, longest in self._near(rows_of) if self._params.gap else ():
+            if self._taken & {larger, smaller} or (min(larger, smaller), max(larger, smaller)) in meeting:
+                continue
+            rows = rows_of[larger], rows_of[smaller]
+            plane = self._common_plane(rows, _FLAT)
+            if plane is None or not self._of_one_color(rows):
+                continue
+            centre, normal, thickness = plane
+            faces = centre, towards(normal, centre, eye)
+            color = np.median(self._brightness[np.concatenate(rows)], axis=0)
+            alike = np.asarray((np.abs(self._brightness - color) < OTHER).all(axis=1))
+            if self._gaps.bridged(of, larger, smaller, faces, alike, thickness=thickness, longest=longest):
+                yield larger, smaller
+
+    def _near(self, rows_of: dict[int, NDArray[np.intp]]) -> list[tuple[int, int, float]]:
+        """The pairs of flat surfaces between whose boxes the gap is not too long, the larger one first in each, and the
+        largest first; with each, how long a gap may be."""
+        names, boxes, longest = list[int](), list[Float64](), list[float]()
+        for name in sorted(rows_of.keys() - {0}, key=lambda name: (-len(rows_of[name]), name)):
+            rows = rows_of[name]
+            if len(rows) >= _FEW and self._common_plane((rows, rows), _FLAT) is not None:
+                places = self._cloud.points[rows].astype(np.float64)
+                names.append(name)
+                boxes.append(np.stack([places.min(axis=0), places.max(axis=0)]))
+                longest.append(self._params.gap * box_diagonal(places, _TRIM))
+        if not names:
+            return []
+        low, high = np.stack(boxes, axis=1)
+        between = np.linalg.norm(np.maximum(low[:, None] - high, low - high[:, None]).clip(0), axis=2)
+        pairs = np.argwhere(np.triu(between <= np.array(longest), 1))
+        return [(names[a], names[b], longest[b]) for a, b in pairs.tolist()]
+
+    def _of_one_color(self, rows: tuple[NDArray[np.intp], NDArray[np.intp]]) -> bool:
+        """Whether two sets of points have the same colours all over; black tells nothing."""
+        if self._params.colors == 1:
+            return False
+        first, second = (np.median(self._brightness[part], axis=0) for part in rows)
+        if (np.abs(first - second) >= OTHER).any() or not bright(first[None])[0]:
+            return False
+        spread = TouchingParams().color_spread
+        return likeness(*(histogram(self._bins[part], spread) for part in rows)) >= self._params.colors
+
+    def _common_plane(
+        self, rows: tuple[NDArray[np.intp], NDArray[np.intp]], flat: float
+    ) -> tuple[Float64, Float64, float] | None:
+        """The plane of the larger of two sets of points, on which most of each lies, with its thickness; None if not.
+
+        flat: how much of each.
+        """
+        larger, smaller = (thinned(self._cloud.points[part], _ENOUGH) for part in sorted(rows, key=len, reverse=True))
+        thickness = max(self._params.thickness * box_diagonal(smaller, _TRIM), self._cloud.spacing)
+        plane = plane_of_most(larger, thickness, _ROUNDS)
+        if any(on_plane(part, plane, thickness).mean() < flat for part in (larger, smaller)):
+            return None
+        return *plane, thickness
 
 
-def _meeting(touches: Touches, surface: Int32, label: Int32, params: ShadowParams) -> list[tuple[int, int, bool]]:
-    """The pairs of surfaces that may be one, those that touch along the largest share of a border first; and of each
-    whether light alone tells them apart there. Otherwise their own points touch.
+def _meeting(touches: Touches, surface: Int32, label: Int32, params: ShadowParams) -> Meeting:
+    """The pairs of surfaces that touch, lower one first, those that do so along the largest share of a border first:
+    whether light alone tells them apart there, or None where a border shows. If not light alone, their own points
+    touch.
 
     surface: [L + 1] of each label. label: [N] of the points.
     """
@@ -118,19 +210,11 @@ def _meeting(touches: Touches, surface: Int32, label: Int32, params: ShadowParam
     found = []
     for number, (low, high) in enumerate(pairs.T.tolist()):
         here = kept[of.ravel() == number]
+        share = max(len(np.unique(touches.point[here[a[here] == name]])) / max(length[name], 1) for name in (low, high))
+        if len(here) < params.min_points or share < params.contact:
+            continue
         alike = touches.alike[here].mean()
         stays = bool(alike >= params.alike)
-        if alike < min(_OPEN, params.alike) or (here if stays else here[touches.known[here]]).size < params.min_points:
-            continue
-        share = max(len(np.unique(touches.point[here[a[here] == name]])) / max(length[name], 1) for name in (low, high))
-        if share >= params.contact:
-            found.append((-share, low, high, stays))
-    return [(low, high, stays) for _, low, high, stays in sorted(found)]
-
-
-def _in_one_plane(cloud: PointCloud, a: NDArray[np.intp], b: NDArray[np.intp], params: ShadowParams) -> bool:
-    """Whether most of two sets of points (rows) lies on the plane of the larger one."""
-    larger, smaller = (thinned(cloud.points[part], _ENOUGH) for part in sorted((a, b), key=len, reverse=True))
-    thickness = max(params.thickness * box_diagonal(smaller, _TRIM), cloud.spacing)
-    centre, normal = plane_of_most(larger, thickness, _ROUNDS)
-    return all((np.abs((part - centre) @ normal) <= thickness).mean() >= params.flat for part in (larger, smaller))
+        if stays or touches.known[here].sum() >= params.min_points:
+            found.append((-share, low, high, stays if alike >= min(_OPEN, params.alike) else None))
+    return {(low, high): stays for _, low, high, stays in sorted(found, key=lambda pair: pair[:3])}

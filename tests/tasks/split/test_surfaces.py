@@ -1,47 +1,18 @@
 import numpy as np
 import pytest
+from flat_patches import BROWN, GREY, RED, SHADE, WHITE, Patch, patch, scene
 
-from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import Hierarchy, PointLabels
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
-
-STEP = 0.02
-SHADE = np.array([0.5, 0.53, 0.58])
-"""What a shadow leaves of R, G and B, linear light."""
-BROWN, GREY, WHITE, RED = (
-    np.array(color) for color in ((0.3, 0.16, 0.08), (0.25, 0.26, 0.27), (0.8, 0.8, 0.8), (0.5, 0.1, 0.1))
-)
-Patch = tuple[np.ndarray, np.ndarray]
-
-
-def patch(color: np.ndarray, x: float, y: float, z: float = 0.0, width: float = 0.5) -> Patch:
-    """A horizontal rectangle, half a metre deep, with a corner at a place: points and linear colours."""
-    u, v = np.meshgrid(np.arange(0, width, STEP), np.arange(0, 0.5, STEP))
-    places = np.stack([x + u.ravel(), y + v.ravel(), np.full(u.size, z)], axis=1)
-    return places, np.tile(color, (len(places), 1))
-
-
-def scene(*patches: Patch, unlabelled: int = 0) -> tuple[PointCloud, Cameras, np.ndarray]:
-    """Patches seen from above by a grainy camera, and their points' labels, 1.. in their order; the last ones have
-    none."""
-    light = np.concatenate([color for _, color in patches])
-    light = light * np.random.default_rng(0).normal(1, 0.02, (len(light), 1))
-    colors = np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8)
-    places = np.concatenate([places for places, _ in patches]).astype(np.float32)
-    label = np.repeat(np.arange(1, len(patches) + 1, dtype=np.int32), [len(color) for _, color in patches])
-    label[label > len(patches) - unlabelled] = 0
-    pose = np.diag([1.0, -1, -1, 1])
-    pose[:3, 3] = (0.5, 0.5, 3)
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
-    return PointCloud(places, colors, 1.0, STEP), cameras, label
 
 
 def surfaces(*patches: Patch, unlabelled: int = 0, **changes) -> list[int]:
     """The surface of each labelled patch."""
     cloud, cameras, label = scene(*patches, unlabelled=unlabelled)
     params = ShadowParams(**{"repeats": 1, **changes})
-    return lit_surfaces(cloud, cameras, label, borders(label, cloud, TouchingParams()), params)[1:].tolist()
+    return lit_surfaces(cloud, cameras, [], label, borders(label, cloud, TouchingParams()), params)[1:].tolist()
 
 
 def floor(shade: np.ndarray = SHADE) -> list[Patch]:
