@@ -2,9 +2,9 @@
 
 A segmenter shows the box, its faces and the label printed on it, and often the box with what stands beside it. The
 level that is a thing is the one that the views repeat: most views which see two pieces of it have a mask with just
-these pieces, and the segmenter is as sure of that mask as of those of the pieces. Three things are known without masks:
+these pieces, and the segmenter is as sure of that mask as of those of the pieces. Four things are known without masks:
 what light alone or nothing parts is one surface, what touches nothing but walls and floors stands alone, and what meets
-in a convex edge are faces of one thing, unless the views deny it. Beyond Split&Splat.
+in a convex edge, or lies in another's surface, is of one thing, unless the views deny it. Beyond Split&Splat.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import (
@@ -32,6 +33,8 @@ from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.agreement import View, agreement_of, ramp, views_of
 from ss_flow.tasks.split.edges import convex_edges
+from ss_flow.tasks.split.inlays import Inlays, find_inlays
+from ss_flow.tasks.split.looks import Looks
 from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
@@ -87,6 +90,9 @@ class HierarchyParams:
     """Agreement that two pieces have at least where they meet in a convex edge, as the faces of a box do, and half of
     the views that see both hold them under one mask. Just above the default of `split.granularity`, so that what the
     views show as one comes first. 0 = convex edges are not looked for."""
+    inlaid: Fraction = 0.46
+    """The same where one piece lies in the plane of the other, which is all round it, as a picture in its mount. 0 =
+    not looked for."""
 
 
 @task(name="split.hierarchy")
@@ -107,7 +113,8 @@ def hierarchy(
     """
     leaves = np.unique(labels.label[labels.label > 0]).astype(np.int32)
     ends = borders(labels.label, points, TouchingParams())
-    surface = lit_surfaces(points, cameras, visibility, labels.label, ends, params.shadows)
+    looks = Looks(points, cameras, visibility)
+    surface = lit_surfaces(looks, labels.label, ends, params.shadows)
     _, surface_of = np.unique(surface[leaves], return_inverse=True)
     is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)
@@ -116,8 +123,9 @@ def hierarchy(
     edges = np.zeros((len(leaves), len(leaves)), bool)
     if params.convex:
         edges = convex_edges(points, cameras, visibility, labels.label, ends)
+    inlays = find_inlays(looks, labels.label, ~is_stuff & (params.inlaid > 0))
     own: list[tuple[int, ...]] = [(row,) for row in range(len(leaves))]
-    pieces = _Pieces(views_of(leaves, tallies), is_stuff, contact, edges, own, mounds, sheets, params)
+    pieces = _Pieces(views_of(leaves, tallies), is_stuff, contact, edges, own, mounds, sheets, inlays, params)
     node, parent, agreement, stuff = leaves.tolist(), [0] * len(leaves), [1.0] * len(leaves), is_stuff.tolist()
     top = list(range(len(leaves)))  # the tree's row of each piece
     lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
@@ -157,6 +165,7 @@ class _Pieces:
     """G x the labels (rows) that each is made of."""
     mounds: Mounds
     sheets: Sheets
+    inlays: Inlays
     params: HierarchyParams
 
     @functools.cached_property
@@ -186,8 +195,8 @@ class _Pieces:
     def best_unions(self) -> list[tuple[tuple[int, ...], float]]:
         """The sets of pieces to unite now, each with its agreement: of sets that share a piece, the best alone."""
         sets, group = self._sets()
-        faces = self._faces()
-        unshown = sorted(faces - set(sets))
+        presumed = self._presumed()
+        unshown = sorted(presumed.keys() - set(sets))
         sets, group = sets + unshown, group + [False] * len(unshown)
         if not sets:
             return []
@@ -199,7 +208,7 @@ class _Pieces:
             self.counted, member, doubt=params.doubt, prior=params.prior, prior_agreement=params.prior_agreement
         )
         agreement += (1 - agreement) * params.alone * self._alone(member)
-        least = np.where([members in faces for members in sets], params.convex, 0)
+        least = [presumed.get(members, 0.0) for members in sets]
         agreement = np.maximum(agreement * np.where(group, _ON_TOP, 1.0), least).astype(np.float64).round(6)
         taken: set[int] = set()
         chosen = []
@@ -229,15 +238,28 @@ class _Pieces:
         sets = [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
         return sets, [bool(on_top[members]) for members in sets]
 
-    def _faces(self) -> set[tuple[int, ...]]:
-        """The pairs of things that meet in a convex edge, and that the views do not deny to be one."""
-        a, b = np.nonzero(np.triu(self.edges) & ~self.stuff & ~self.stuff[:, None])
+    def _presumed(self) -> dict[tuple[int, ...], float]:
+        """The pairs of things that are faces of one, or of which one lies in the other, unless the views deny it; with
+        the agreement that each has at least."""
+        lying = [
+            (min(inner, outer), max(inner, outer))
+            for inner, outer in self.inlays.pairs(self.labels)
+            if self.sheets.lies_in(self.labels[inner], self.labels[outer])
+        ]
+        faces = self._together(self.counted, np.argwhere(np.triu(self.edges)))
+        inlaid = self._together(self.views, np.array(lying, np.intp).reshape(-1, 2))
+        least = dict.fromkeys(inlaid, self.params.inlaid)
+        return least | {pair: max(self.params.convex, least.get(pair, 0)) for pair in faces}
+
+    def _together(self, views: list[View], pairs: NDArray[np.intp]) -> list[tuple[int, ...]]:
+        """Those of some pairs [P, 2] that are things, and that half of the views which see both hold under one mask."""
+        a, b = pairs[~self.stuff[pairs].any(axis=1)].T
         both, together = np.zeros((2, len(a)))
-        for view in self.counted:
+        for view in views:
             both += (view.seen[a] > 0) & (view.seen[b] > 0)
             together += (view.shows[:, a] & view.shows[:, b]).any(axis=0)
         one = (together > 0) & (together >= _TOGETHER * both)
-        return set(zip(a[one].tolist(), b[one].tolist(), strict=True))
+        return list(zip(a[one].tolist(), b[one].tolist(), strict=True))
 
     def _standing(self, members: tuple[int, ...]) -> set[int]:
         """Which of these pieces stand on the others."""

@@ -26,6 +26,8 @@ _THICKNESS = 2.0
 """Distance from the plane up to which they do, in multiples of the cloud's spacing."""
 _RISES = 3.0
 """Distance, in the same, that what stands on a sheet rises from it at least."""
+_MOSTLY = 0.8
+"""Share of the points that touch something at which a piece must go on into that without an edge, to lie in it."""
 _TRIM = 0.02
 """Share of the points, on every side, that an extent leaves out."""
 _ENOUGH = 2000
@@ -67,6 +69,11 @@ class Sheets:
                 rises = np.quantile(np.abs((other - centre) @ normal), 0.9)
                 stands[i] |= bool(rises >= max(self.height * box_diagonal(other, _TRIM), _RISES * self.points.spacing))
         return stands
+
+    def lies_in(self, piece: tuple[int, ...], other: tuple[int, ...]) -> bool:
+        """Whether a piece, some labels (rows), goes on without an edge into another one, mostly, where they touch."""
+        here = np.ix_(piece, other)
+        return bool(self.smooth[here].sum() >= max(_MOSTLY * self.meets[here].sum(), 1))
 
     def _flat_ones_joined(self, pieces: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
         """The pieces by number, those as one that go on into each other in one plane: a page may be in pieces."""

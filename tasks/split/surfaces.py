@@ -7,17 +7,18 @@ goes on under what stands on it (`gaps`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Cameras, Float64, Int32, PointCloud, Visibility
+from ss_flow.tasks.artifacts import Float64, Int32
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, on_plane, plane_of_most, thinned, towards
 from ss_flow.tasks.ranges import Count, Fraction
-from ss_flow.tasks.split.gaps import Gaps
+from ss_flow.tasks.split.gaps import bridged
+from ss_flow.tasks.split.looks import Looks
 from ss_flow.tasks.split.shadows import OTHER, Touches, bright, find_shadows, find_touches, logarithms
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.smoothing import smooth
@@ -71,25 +72,18 @@ class ShadowParams:
     the smaller one; 0 = they must touch."""
 
 
-def lit_surfaces(
-    cloud: PointCloud,
-    cameras: Cameras,
-    visibility: Sequence[Visibility],
-    label: Int32,
-    ends: Borders,
-    params: ShadowParams,
-) -> Int32:
+def lit_surfaces(looks: Looks, label: Int32, ends: Borders, params: ShadowParams) -> Int32:
     """[L + 1] the lowest label of the surface that each label is a piece of; itself where it is all of one.
 
-    visibility: of all views. label: [N] of the cloud's points, 0 = none; ends: their borders. Round by round, the
-    labels are united that lie in one plane and touch without an edge where light alone, or nothing, tells them apart:
-    those that do so along the largest share of a border first, each once a round. When none are left, those of one
-    colour that lie in one plane and touch nowhere, but between which the views see only what is on it.
+    label: [N] of the cloud's points, 0 = none; ends: their borders. Round by round, the labels are united that lie
+    in one plane and touch without an edge where light alone, or nothing, tells them apart: those that do so along
+    the largest share of a border first, each once a round. When none are left, those of one colour that lie in one
+    plane and touch nowhere, but between which the views see only what is on it.
     """
     if not params.agreement or not label.any():
         return np.arange(int(label.max(initial=0)) + 1, dtype=np.int32)
-    found = _Surfaces(cloud, Gaps(cloud, cameras, visibility), label, params)
-    eye = middle_of(cameras)
+    cloud, eye = looks.cloud, middle_of(looks.cameras)
+    found = _Surfaces(looks, label, params)
     shadows = find_shadows(cloud, label, ends, eye, min_points=params.min_points, repeats=params.repeats)
     # Between the things that stand on a table, and along shadows, its points have no label: masks do not agree there.
     filled = smooth(label, label == 0, cloud.points, cloud.spacing, _FILLED)
@@ -106,10 +100,10 @@ class _Surfaces:
     surface: [L + 1] the lowest label of each label's.
     """
 
-    def __init__(self, cloud: PointCloud, gaps: Gaps, label: Int32, params: ShadowParams) -> None:
+    def __init__(self, looks: Looks, label: Int32, params: ShadowParams) -> None:
         self.surface = np.arange(int(label.max()) + 1, dtype=np.int32)
-        self._cloud = cloud
-        self._gaps = gaps
+        self._looks = looks
+        self._cloud = cloud = looks.cloud
         self._label = label
         self._params = params
         self._bins, self._brightness = bins_of(cloud.colors), logarithms(cloud.colors)
@@ -148,7 +142,7 @@ class _Surfaces:
             faces = centre, towards(normal, centre, eye)
             color = np.median(self._brightness[np.concatenate(rows)], axis=0)
             alike = np.asarray((np.abs(self._brightness - color) < OTHER).all(axis=1))
-            if self._gaps.bridged(of, larger, smaller, faces, alike, thickness=thickness, longest=longest):
+            if bridged(self._looks, of, larger, smaller, faces, alike, thickness=thickness, longest=longest):
                 yield larger, smaller
 
     def _near(self, rows_of: dict[int, NDArray[np.intp]]) -> list[tuple[int, int, float]]:

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from flat_patches import BROWN, GREY, RED, SHADE, WHITE, Patch, patch, scene, views_of
 
+from ss_flow.tasks.split.looks import Looks
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
@@ -14,7 +15,7 @@ def surfaces(*patches: Patch, unlabelled: int = 0, eyes=ABOVE, **changes) -> lis
     cloud, _, label = scene(*patches, unlabelled=unlabelled)
     cameras, visibility = views_of(cloud, *eyes)
     ends = borders(label, cloud, TouchingParams())
-    return lit_surfaces(cloud, cameras, visibility, label, ends, ShadowParams(**changes))[1:].tolist()
+    return lit_surfaces(Looks(cloud, cameras, visibility), label, ends, ShadowParams(**changes))[1:].tolist()
 
 
 def halves(gap: float = 0.16, color: np.ndarray = BROWN) -> list[Patch]:

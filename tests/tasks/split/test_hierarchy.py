@@ -6,7 +6,9 @@ from hypothesis import strategies as st
 from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels, Tally
 from ss_flow.tasks.split import hierarchy as module
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+from ss_flow.tasks.split.inlays import Inlays
 from ss_flow.tasks.split.mounds import Mounds
+from ss_flow.tasks.split.sheets import Sheets
 from ss_flow.tasks.split.stuff import StuffParams
 
 NO_BORDERS = np.zeros((9, 9), np.int32)
@@ -195,9 +197,9 @@ def test_what_touches_nothing_else_is_one_thing_rather():
     assert agreement_beside(0.0) == pytest.approx(0.5)
 
 
-def known(monkeypatch, *, stuff=(), touching=(), convex=(), on_top=()) -> None:
-    """What their places tell of three labels: which are stuff, which touch at 50 points of each or meet in a convex
-    edge, and whether 3 stands on the other two, which surround it."""
+def known(monkeypatch, *, stuff=(), touching=(), convex=(), inlaid=(), on_top=()) -> None:
+    """What their places tell of three labels: which are stuff, which touch at 50 points of each, meet in a convex edge
+    or lie in the other, and whether 3 stands on the other two, which surround it."""
 
     def pairs(of, value):
         table = np.zeros((3, 3), np.float32)
@@ -211,10 +213,12 @@ def known(monkeypatch, *, stuff=(), touching=(), convex=(), on_top=()) -> None:
         "find_stuff": np.isin([1, 2, 3], stuff),
         "find_contact": pairs(touching, 50),
         "convex_edges": pairs(convex, 1) > 0,
+        "find_inlays": Inlays(np.full(3, 100.0), np.full(3, 20.0), 20 * pairs(inlaid, 1).astype(np.float64)),
         "find_mounds": mounds,
     }
     for name, value in told.items():
         monkeypatch.setattr(module, name, lambda *_, value=value, **__: value)
+    monkeypatch.setattr(Sheets, "lies_in", lambda *_: bool(inlaid))
 
 
 def test_a_thing_and_stuff_are_never_united_and_a_union_of_stuff_is_stuff(monkeypatch):
@@ -238,11 +242,34 @@ def test_where_pieces_of_a_union_touch_each_other_tells_nothing_about_what_it_is
     assert unions(tree(views, 3)) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.5}
 
 
-@pytest.mark.parametrize(("stuff", "are_faces"), [([], True), ([1], False), ([2], False), ([1, 2], False)])
-def test_walls_that_meet_in_a_convex_edge_are_no_faces_of_a_thing(monkeypatch, stuff, are_faces):
-    known(monkeypatch, stuff=stuff, convex=[(1, 2)])
+@pytest.mark.parametrize("how", ["convex", "inlaid"])
+@pytest.mark.parametrize(("stuff", "are_one"), [([], True), ([1], False), ([2], False), ([1, 2], False)])
+def test_faces_and_what_lies_in_another_are_one_but_walls_are_not(monkeypatch, how, stuff, are_one):
+    known(monkeypatch, stuff=stuff, **{how: [(1, 2)]})
     view = tally([({1, 2, 3}, 0.5), ({1}, 0.9), ({2}, 0.9), ({3}, 0.9)], {1, 2, 3})
-    assert unions(tree([view], 3)) == ({frozenset({1, 2}): 0.46} if are_faces else {})
+    assert unions(tree([view], 3)) == ({frozenset({1, 2}): 0.46} if are_one else {})
+    other = {"convex": "inlaid", "inlaid": "convex"}[how]
+    assert unions(tree([view], 3, **{how: 0.4, other: 0.3})) == ({frozenset({1, 2}): 0.4} if are_one else {})
+
+
+@pytest.mark.parametrize("how", ["convex", "inlaid"])
+def test_that_they_are_one_half_of_the_views_must_show_in_some_mask(monkeypatch, how):
+    known(monkeypatch, **{how: [(1, 2)]})
+    apart = [tally([({1}, 0.9), ({2}, 0.9)], {1, 2}, points) for points in (90, 95)]
+    together = [
+        tally([({1, 2, 3}, 0.5), ({1}, 0.9), ({2}, 0.9), ({3}, 0.9)], {1, 2, 3}, points) for points in (100, 80)
+    ]
+    assert unions(tree([*apart, *together], 3)) == {frozenset({1, 2}): 0.46}
+    assert unions(tree([*apart, together[0]], 3)) == {}
+
+
+def test_a_picture_lies_in_its_mount_when_that_is_one(monkeypatch):
+    known(monkeypatch, inlaid=[(1, 2)])
+    around = np.zeros((3, 3))
+    around[2, :2] = 10  # half of what is around 3 is 1, and half 2
+    monkeypatch.setattr(module, "find_inlays", lambda *_: Inlays(np.full(3, 100.0), np.array([0, 0, 20.0]), around))
+    view = tally([({1, 2}, 0.9), ({1, 2, 3}, 0.5), ({1}, 0.9), ({2}, 0.9), ({3}, 0.9)], {1, 2, 3})
+    assert unions(tree([view], 3)) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.46}
 
 
 def test_a_mask_of_a_seat_and_the_bag_on_it_shows_the_seat_and_a_group(monkeypatch):

@@ -143,3 +143,10 @@ def test_views_that_show_page_and_mug_as_one_show_a_group(flush, agreement):
     tree = hierarchy(cloud, cameras, [], labels, [view], params=HierarchyParams(prior=0.0, flush=flush))
     assert tree.parent.tolist() == [0, 4, 4, 0]
     assert tree.agreement[3] == pytest.approx(agreement)
+
+
+def test_a_page_lies_in_its_table_and_a_mug_does_not():
+    sheets = on_table()
+    assert sheets.lies_in((PAGE,), (TABLE,)) and not sheets.lies_in((MUG,), (PAGE,))
+    assert not on_table(page=0.05).lies_in((PAGE,), (TABLE,))
+    assert not sheets.lies_in((MUG,), (TABLE,))  # they do not touch

@@ -4,6 +4,7 @@ from flat_patches import BROWN, GREY, RED, SHADE, WHITE, Patch, patch, scene
 
 from ss_flow.tasks.artifacts import Hierarchy, PointLabels
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+from ss_flow.tasks.split.looks import Looks
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
@@ -12,7 +13,7 @@ def surfaces(*patches: Patch, unlabelled: int = 0, **changes) -> list[int]:
     """The surface of each labelled patch."""
     cloud, cameras, label = scene(*patches, unlabelled=unlabelled)
     params = ShadowParams(**{"repeats": 1, **changes})
-    return lit_surfaces(cloud, cameras, [], label, borders(label, cloud, TouchingParams()), params)[1:].tolist()
+    return lit_surfaces(Looks(cloud, cameras, []), label, borders(label, cloud, TouchingParams()), params)[1:].tolist()
 
 
 def floor(shade: np.ndarray = SHADE) -> list[Patch]:

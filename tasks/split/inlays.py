@@ -1,0 +1,133 @@
+"""What lies in the surface of another thing, all round it: a picture in its mount, a screen in its frame.
+
+It has an outline of its own in every photo, and so has what it lies in. A page lies in a table as well; but there few
+views have one mask for both, and the page is small. Beyond Split&Splat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ss_flow.tasks.artifacts import Bool, Float64, Int32
+from ss_flow.tasks.geometry.clustering import rows_by_label
+from ss_flow.tasks.geometry.shape import Plane, middle_of, on_plane, plane_of_most, thinned, towards
+from ss_flow.tasks.split.looks import Looks
+
+_FEW = 100
+"""Points below which a label has no outline."""
+_ENOUGH = 2000
+"""At least so many points of a label, and less than twice as many, tell its plane."""
+_THICKNESS, _ROUNDS = 3.0, 4
+"""Distance from a plane up to which points lie on it, in spacings; and how often it is fitted to those."""
+_FLAT = 0.8
+"""Share of the points of a label that must do so."""
+_CELL = 2.0
+"""Side of the squares in its plane that show where a label is, in spacings."""
+_BESIDE = (2, 4)
+"""Squares beyond its outline between which one looks for what is around it."""
+_MOST = 150
+"""Squares around a label at which views look, at least so many where there are, and less than twice as many."""
+_SEEN = 12
+"""Of them, how many some view must see."""
+_AROUND = 0.8
+"""Share of these at which views mostly see the other thing."""
+_SHARE = 0.1
+"""Share of the points of both that lie within at least: more than a page on a table."""
+
+
+@dataclass(frozen=True)
+class Inlays:
+    """What views see around labels, in their planes; L labels, those that occur, ascending."""
+
+    size: Float64
+    """[L] points."""
+    places: Float64
+    """[L] places around each that some view sees, or looks at in vain."""
+    shown: Float64
+    """[L, L] those at which views mostly see each label."""
+
+    def pairs(self, pieces: Sequence[tuple[int, ...]]) -> list[tuple[int, int]]:
+        """Which pieces, each some labels (rows), lie in which other one: (inner, outer) by number."""
+        member = np.zeros((len(pieces), len(self.size)))
+        for row, labels in enumerate(pieces):
+            member[row, list(labels)] = 1
+        shown, size = member @ self.shown @ member.T, member @ self.size
+        places = member @ self.places - np.diag(shown)  # between the labels of a piece is not around it
+        np.fill_diagonal(shown, 0)
+        found = (shown >= _AROUND * places[:, None]) & (places[:, None] >= _SEEN)
+        found &= size[:, None] >= _SHARE * (size[:, None] + size)
+        return [(inner, outer) for inner, outer in np.argwhere(found).tolist()]
+
+
+def find_inlays(looks: Looks, label: Int32, asked: Bool) -> Inlays:
+    """What views see around those labels of a cloud that are flat.
+
+    label: [N] of its points, 0 = none. asked: [L] whether one wants to know it of each. Where all that is seen rises
+    from the label's plane, that is hidden, and tells nothing; where what is seen lies behind it, nothing is around.
+    """
+    names, size = np.unique(label[label > 0], return_counts=True)
+    rows_of, cloud, eye = rows_by_label(label), looks.cloud, middle_of(looks.cameras)
+    thickness = _THICKNESS * cloud.spacing
+    own, places, planes = list[int](), list[Float64](), list[Float64]()
+    for row in np.flatnonzero(asked & (size >= _FEW)).tolist():
+        points = cloud.points[rows_of[int(names[row])]].astype(np.float64)
+        centre, normal = plane_of_most(thinned(points, _ENOUGH), thickness, _ROUNDS)
+        if on_plane(points, (centre, normal), thickness).mean() >= _FLAT:
+            own.append(row)
+            places.append(_beside(points, (centre, normal), _CELL * cloud.spacing))
+            planes.append(np.stack([centre, towards(normal, centre, eye)]))
+    count, shown = np.zeros(len(names)), np.zeros((len(names), len(names)))
+    if own:
+        of = np.repeat(np.arange(len(own)), [len(some) for some in places])
+        told, most = _seen_at(looks, label, np.concatenate(places), np.stack(planes)[of], thickness)
+        around, labelled = np.array(own)[of], told & (most > 0)
+        np.add.at(count, around[told], 1)
+        np.add.at(shown, (around[labelled], np.searchsorted(names, most[labelled])), 1)
+    return Inlays(size.astype(np.float64), count, shown)
+
+
+def _beside(points: Float64, plane: Plane, cell: float) -> Float64:
+    """[P, 3] places on a plane around points [N, 3], some way beyond their outline. cell: side of the squares that tell
+    the outline, world units."""
+    from scipy.ndimage import binary_dilation
+
+    centre, normal = plane
+    axes = np.linalg.svd(normal[None])[2][1:]
+    flat = (points - centre) @ axes.T
+    near, far = _BESIDE
+    corner = flat.min(axis=0) - (far + 1) * cell
+    square = ((flat - corner) / cell).astype(np.intp)
+    covered = np.zeros(square.max(axis=0) + far + 2, bool)
+    covered[tuple(square.T)] = True
+    ring = np.argwhere(binary_dilation(covered, iterations=far) & ~binary_dilation(covered, iterations=near))
+    ring = ring[:: max(1, len(ring) // _MOST)]
+    return np.asarray(centre + ((ring + 0.5) * cell + corner) @ axes)
+
+
+def _seen_at(
+    looks: Looks, label: Int32, places: Float64, planes: Float64, thickness: float
+) -> tuple[Bool, NDArray[np.intp]]:
+    """[P] whether views tell what is at places, and [P] the label that most see there, 0 for none.
+
+    places: [P, 3]. planes: [P, 2, 3] point and normal, towards the cameras, of the plane of each.
+    """
+    span = int(label.max()) + 1
+    looked, hidden, found = np.zeros(len(places), bool), np.zeros(len(places), bool), [np.zeros(0, np.intp)]
+    for view in range(len(looks.visibility)):
+        place, point = looks.at(view, places)
+        looked[place] = True
+        place, point = place[point >= 0], point[point >= 0]
+        height = ((looks.cloud.points[point] - planes[place, 0]) * planes[place, 1]).sum(axis=1)
+        hidden[place[height > thickness]] = True
+        flat = np.abs(height) <= thickness
+        found.append(place[flat] * span + label[point[flat]])
+    pair, times = np.unique(np.concatenate(found), return_counts=True)
+    order = np.lexsort((times, pair // span))  # the last of each place is the label of most
+    most = np.zeros(len(places), np.intp)
+    most[pair[order] // span] = pair[order] % span
+    hidden[pair // span] = False
+    return looked & ~hidden, most
