@@ -166,3 +166,7 @@ class PreviousKeys:
                 found.setdefault(event["label"], []).append(event["key"])
             self._keys = found | self._keys
         return self._keys.get(label, ())
+
+    def have(self, key: str) -> bool:
+        """Whether a key is among those of any label, in the runs that were read so far."""
+        return any(key in keys for keys in self._keys.values())

@@ -49,7 +49,8 @@ class Why:
         computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
         reasons: dict[str, list[dict[str, Any]]] = {}
         for node in computed or asked:
-            reasons.setdefault(reason_of(node), []).append(node)
+            moved = not computed and reason_of.only_moved(node)
+            reasons.setdefault("" if moved else reason_of(node), []).append(node)
         if reasons.keys() == {""}:
             out.print(f"{asked[0]['step']}: reused; nothing that it depends on changed")
         for reason, these in [one for one in reasons.items() if one[0]][:5]:
@@ -97,6 +98,11 @@ class Reasons:
             return "what changed is not known: its record is no longer in the store"
         now = record.components
         return since_last(known, now, part_of(self._store, now["code"]), self._store)
+
+    def only_moved(self, node: dict[str, Any]) -> bool:
+        """Whether the run before had the same result as another item of the step: items without names of their own are
+        called by number, which a photo more or less before them changes."""
+        return bool(self._known(node["label"])) and self._known.have(node["key"])
 
 
 def _causes(node: dict[str, Any], nodes: list[dict[str, Any]], reason_of: Reasons) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
@@ -15,7 +15,7 @@ from ss_flow.task import FileRef, Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Frame, MaskSet
 from ss_flow.tasks.capture.id_images import frame_pixels
 from ss_flow.tasks.capture.lens import Lens
-from ss_flow.tasks.capture.scene_files import is_number, read_json
+from ss_flow.tasks.capture.scene_files import finder, is_number, read_json
 from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.words import first_of
 
@@ -70,7 +70,7 @@ def coco_masks(
     return tuple(result)
 
 
-def _contents(path: Path, names: Collection[str]) -> tuple[dict[str, dict[str, Any]], dict[Any, list[dict[str, Any]]]]:
+def _contents(path: Path, names: Iterable[str]) -> tuple[dict[str, dict[str, Any]], dict[Any, list[dict[str, Any]]]]:
     """The images of a COCO file by their views, and its annotations, crowds left out, by their image's id."""
     document = read_json(path)
     if not isinstance(document, dict) or not all(_is_table(document.get(key)) for key in ("images", "annotations")):
@@ -79,10 +79,11 @@ def _contents(path: Path, names: Collection[str]) -> tuple[dict[str, dict[str, A
         )
     images: dict[str, dict[str, Any]] = {}
     ids = set()
+    called = finder(names)
     for image in document["images"]:
         if not _is_id(image.get("id")) or not isinstance(image.get("file_name"), str):
             raise InputError(f"{path} lists an image without an `id` or a `file_name`; both are needed.")
-        view = _view(PureWindowsPath(image["file_name"]), names)  # whose separators are those of every system
+        view = _view(PureWindowsPath(image["file_name"]), called)  # whose separators are those of every system
         if view in images or image["id"] in ids:
             raise InputError(
                 f"{path} lists two images with the id {image['id']!r} or the stem {view!r}; both must be unique."
@@ -112,11 +113,11 @@ def _contents(path: Path, names: Collection[str]) -> tuple[dict[str, dict[str, A
     return images, annotations
 
 
-def _view(file: PurePath, names: Collection[str]) -> str:
+def _view(file: PurePath, called: Callable[[str], str | None]) -> str:
     """The view that a file belongs to: one called by its path or by the end of it, else by its stem."""
     parts = [*file.parent.parts, file.stem]
     ends = ("_".join(parts[place:]) for place in range(len(parts)))
-    return next((end for end in ends if end in names), file.stem)
+    return next(filter(None, map(called, ends)), file.stem)
 
 
 def _is_table(rows: Any) -> bool:

@@ -12,7 +12,7 @@ from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Clicks, Float64, Frame
 from ss_flow.tasks.capture.lens import Lens, photo_lens, undistorted
-from ss_flow.tasks.capture.scene_files import Hint, Hints, Point, is_number, read_json
+from ss_flow.tasks.capture.scene_files import Hint, Hints, Point, finder, is_number, read_json
 from ss_flow.tasks.words import first_of
 
 
@@ -26,12 +26,12 @@ def read_hints(path: Path, views: tuple[str, ...]) -> Hints:
         raise InputError(
             f"{path} holds no hints; an object of the form {{view: {{object: [[x, y], ...]}}}} is expected."
         )
-    unknown = [view for view in document if view not in views]
-    if unknown:
-        raise InputError(f"{path} has hints for {unknown[0]!r}, which is no view of the scene; {views[0]!r} is one.")
     labels: dict[str, int] = {}
     hints = []
+    called = finder(views)
     for view, objects in document.items():
+        if (own := called(view)) is None:
+            raise InputError(f"{path} has hints for {view!r}, which is no view of the scene; {views[0]!r} is one.")
         for name, given in objects.items():
             where = f"the hint for {name!r} in view {view!r} of {path}"
             if not name.strip():
@@ -44,7 +44,7 @@ def read_hints(path: Path, views: tuple[str, ...]) -> Hints:
                     "the object, `out`."
                 )
             label = labels.setdefault(name, len(labels) + 1)
-            hints.append(Hint(view, label, *(_points(given.get(key, []), where) for key in ("in", "out"))))
+            hints.append(Hint(own, label, *(_points(given.get(key, []), where) for key in ("in", "out"))))
     if not hints:
         raise InputError(f"{path} holds no hints; at least one point in one view is needed.")
     return Hints(path, tuple(labels), tuple(hints))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +25,9 @@ from ss_flow.tasks.capture.scene_files import (
     SceneFiles,
     by_name,
     files_in,
+    finder,
     read_json,
+    spelt,
 )
 
 ACCEPTED = (
@@ -258,7 +259,7 @@ def _alike(file: Path, names: Iterable[str]) -> str | None:
     """A name that differs from a file's in capitals, in how accents are stored, or else in the ending only."""
 
     def plain(name: str) -> str:
-        return unicodedata.normalize("NFC", name).casefold()
+        return spelt(name).casefold()
 
     known = [name for name in sorted(names) if Path(name).suffix.lower() in PHOTO_SUFFIXES]
     same = [name for name in known if plain(name) == plain(file.name)]
@@ -273,9 +274,8 @@ def _some_by_name(folder: Path, names: Sequence[str]) -> tuple[Path | None, ...]
     files = [file for place in sorted(folder.glob("**/")) for file in files_in(place, _MASK_SUFFIXES)]
     # As `view_names` has it where photos lie in several folders.
     found = by_name(["_".join([*file.parent.relative_to(folder).parts, file.stem]) for file in files], files)
-    # A Mac may write the same letters otherwise than who named the photos.
-    alike = {unicodedata.normalize("NFC", name): file for name, file in found.items()}
-    matched = tuple(found.get(name) or alike.get(unicodedata.normalize("NFC", name)) for name in names)
+    called = finder(found)
+    matched = tuple(found[own] if (own := called(name)) else None for name in names)
     _check_exist([file for file in matched if file is not None])
     if not any(matched):
         raise InputError(f"{folder} holds no image named after a view; {names[0]}.png, for one, is expected.")

@@ -7,8 +7,9 @@ import json
 import math
 import os
 import re
+import unicodedata
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
@@ -229,6 +230,17 @@ def by_name(names: Sequence[str], paths: Sequence[Path]) -> dict[str, Path]:
             raise InputError(f"{found[name]} and {path} both belong to view {name}; every view needs its own stem.")
         found[name] = path
     return found
+
+
+def spelt(name: str) -> str:
+    """A name with each accent in one piece with its letter: a Mac may write the same letters otherwise."""
+    return unicodedata.normalize("NFC", name)
+
+
+def finder(names: Iterable[str]) -> Callable[[str], str | None]:
+    """Says which of some names another is, whichever way both write accents: the same one, else one spelt alike."""
+    known = {spelt(name): name for name in names} | {name: name for name in names}
+    return lambda name: known.get(name) or known.get(spelt(name))
 
 
 def view_names(photos: Sequence[PurePath], left_out: Sequence[PurePath] = ()) -> dict[PurePath, str]:

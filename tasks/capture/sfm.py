@@ -39,7 +39,8 @@ class MappingParams:
     """How cameras are found from matches."""
 
     mapper: Literal["incremental", "global"] = "incremental"
-    """COLMAP's mapper: "incremental" places one photo after the other, "global" all at once (GLOMAP), in less time."""
+    """COLMAP's mapper: "incremental" places one photo after the other, "global" all at once (GLOMAP): as exactly
+    on 50 photos, in twice the time."""
     min_pose_matches: Count = 15
     """So many points must confirm a photo's pose (COLMAP's own default is 30)."""
     min_start_angle: Angle = 16.0

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 from ss_flow.cache.files import UNFINISHED
 from ss_flow.cache.location import is_url
 from ss_flow.errors import InputError
+from ss_flow.tasks.capture.scene_files import spelt
 from ss_flow.tasks.deliver.output import OWN_FILES, OWN_FOLDERS, RUN_FILE, check_place, replacing
 
 _LITTER = re.compile(rf"\.DS_Store|Thumbs\.db|desktop\.ini|\._.*|{UNFINISHED.pattern}")
@@ -97,18 +97,13 @@ def others(folder: Path, kind: Written) -> list[str]:
     own = {kind.mark, *kind.unlisted, *map(_name, listed or ())}
     if listed is None:  # by an older version
         own |= {name for name in names if name in OWN_FILES or name.partition("/")[0] in OWN_FOLDERS}
-    own = set(map(_spelt, own))
-    return [name for name in names if _spelt(name) not in own and not _LITTER.fullmatch(name.rpartition("/")[2])]
+    own = set(map(spelt, own))
+    return [name for name in names if spelt(name) not in own and not _LITTER.fullmatch(name.rpartition("/")[2])]
 
 
 def _name(entry: Any) -> str:
     """The file that an entry of a list of files names."""
     return str(entry.get("file") if isinstance(entry, dict) else entry)
-
-
-def _spelt(name: str) -> str:
-    """A file name with its accents as one, whichever way the disk that it was on has them."""
-    return unicodedata.normalize("NFC", name)
 
 
 def _files(folder: Path) -> list[str]:

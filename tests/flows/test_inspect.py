@@ -15,7 +15,7 @@ from tiny_runs import run_tiny, ss_flow
 
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
-from ss_flow.graph import labelled
+from ss_flow.graph import each, labelled
 from ss_flow.runs import latest_runs
 from ss_flow.tasks import artifacts
 
@@ -151,6 +151,24 @@ def test_why_says_what_changed_of_results_that_an_earlier_run_had(tmp_path):
     assert told("half") == ["ss_flow_toy.half: input x changed", *changed]
     run(2.0)
     assert told("square") == ["ss_flow_toy.square: reused; nothing that it depends on changed"]
+
+
+def test_why_says_that_nothing_changed_of_items_that_only_have_another_number(tmp_path):
+    store = Store(tmp_path / "store")
+
+    def run(*values):
+        run_flow(lambda: {"all": toy.total(each(toy.source(values=values), build=toy.square))}, store, scene="/t")
+
+    run(1.0, 2.0, 3.0)
+    run(1.0, 3.0)
+    assert ss_flow("why", "square", "--cache", store.root).out == (
+        "ss_flow_toy.square: reused; nothing that it depends on changed\n"
+    )
+    assert ss_flow("why", "total", "--cache", store.root).out.splitlines() == [
+        "ss_flow_toy.total: input xs changed (3 -> 2 items)",
+        "  because ss_flow_toy.square: input x changed",
+        "  because ss_flow_toy.source: parameter values [1.0, 2.0, 3.0] -> [1.0, 3.0]",
+    ]
 
 
 def test_the_graph_is_mermaid_with_a_box_a_step_and_what_feeds_it(tiny):

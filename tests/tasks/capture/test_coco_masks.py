@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import unicodedata
 from pathlib import Path
 
 import capture_folders as made
@@ -177,6 +178,13 @@ def test_views_that_are_called_by_their_path_are_known_by_it(tmp_path):
     (tmp_path / "masks.json").write_text(json.dumps(document))
     found = coco_masks(views, made.cameras_of(views), names=names, file=ref(tmp_path / "masks.json"))
     assert [len(masks) for masks in found] == [1, 0, 0]
+
+
+def test_a_view_is_known_whichever_way_file_names_write_an_accent(tmp_path):
+    composed, apart = (unicodedata.normalize(form, "Küche") for form in ("NFC", "NFD"))
+    made.write(tmp_path / f"{composed}.jpg", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    (kitchen,) = read(tmp_path, coco({f"{apart}.jpg": [rectangle(0, 0, 8, 8)]}))
+    assert (kitchen.name, len(kitchen)) == (composed, 1)
 
 
 def test_crowd_regions_are_left_out_with_a_warning(tmp_path):

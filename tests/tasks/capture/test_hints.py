@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import unicodedata
 from pathlib import Path
 
 import capture_folders as made
@@ -39,6 +40,16 @@ def test_each_view_gets_its_own_points_and_objects_are_numbered_as_they_come(tmp
     assert ten.label.tolist() == [1, 1, 2, 2, 2] and ten.inside.tolist() == [1, 1, 1, 0, 0]
     assert ten.points.tolist() == [[3, 4], [5.5, 6], [20, 10], [1, 1], [2, 2]]
     assert eleven.points.shape == (0, 2) and len(eleven.label) == len(eleven.inside) == 0
+
+
+def test_a_view_is_known_whichever_way_its_name_writes_an_accent(tmp_path):
+    composed, apart = (unicodedata.normalize(form, "Küche") for form in ("NFC", "NFD"))
+    for name in (composed, apart):
+        folder = tmp_path / name.encode().hex()
+        made.write(folder / f"{name}.jpg", np.zeros((24, 32, 3), np.uint8))
+        for written in (composed, apart):
+            (kitchen,) = read(folder, {written: {"sofa": [[3, 4]]}})
+            assert (kitchen.name, kitchen.points.tolist()) == (name, [[3, 4]])
 
 
 def test_points_follow_a_photo_that_is_scaled_down(tmp_path):
