@@ -60,6 +60,8 @@ class Collected:
     """What is no result: how many, and the bytes where they are known."""
     left: Tally
     """Actions that stay, and the bytes of all actions and objects that do."""
+    keys: frozenset[str]
+    """Those of the actions that went."""
 
 
 def collect(
@@ -109,7 +111,8 @@ def collect(
         others["temporary files"].count += store.sweep_temporaries()
     others["stale claims"].count += claims.sweep(dry=dry)
     left = Tally(len(plan.staying), plan.bytes)
-    return Collected(results, {what: tally for what, tally in others.items() if tally.count}, left)
+    gone = frozenset(plan.survey.actions) - plan.staying
+    return Collected(results, {what: tally for what, tally in others.items() if tally.count}, left, gone)
 
 
 class _Plan:

@@ -17,16 +17,15 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import Gone, StoreFailure
 from ss_flow.cache.file_digests import FileDigests
-from ss_flow.cache.files import write_atomically
 from ss_flow.cache.store import Store
 from ss_flow.engine import Report, Request, run_flows
 from ss_flow.errors import InputError, OutputFailure
 from ss_flow.flows import settings
+from ss_flow.flows.cli.batch_rows import BATCH_FILE, Book, earlier_rows, has_ended, row_of, stays, table_of
 from ss_flow.flows.cli.context import console, file_digests
 from ss_flow.flows.cli.prepare import (
     Prefixed,
@@ -42,14 +41,10 @@ from ss_flow.flows.cli.telling import hits_of, plan_in_words, print_table, would
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.measures import measures
 from ss_flow.flows.params import Params
-from ss_flow.sweep import rows_of
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import capture_name, named_after
-from ss_flow.tasks.deliver.output import RUN_FILE, check_writable, writing_output
+from ss_flow.tasks.deliver.output import check_writable
 from ss_flow.tasks.deliver.places import RESULT, check_outside, check_replaceable
-
-BATCH_FILE = "batch.json"
-COLOURS = {"ok": "green", "degraded": "yellow", "failed": "red"}
 
 
 @dataclass(frozen=True)
@@ -81,10 +76,10 @@ class Batch:
         check_outside(self.out, options.store.location)
         asked = digest([settings.flat(params), options.target, self.undistorted])
         places = {path: self.out.absolute() / name for path, name in folders.items()}
-        earlier = _earlier(self.out / BATCH_FILE, needed=self.retry_failed)
-        others = [row for row in earlier.values() if _stays(row, places)]
+        earlier = earlier_rows(self.out / BATCH_FILE, needed=self.retry_failed)
+        others = [row for row in earlier.values() if stays(row, places)]
         again = earlier if self.retry_failed else {}
-        ended = {str(path): again[str(path)] for path in folders if _has_ended(again.get(str(path)), asked)}
+        ended = {str(path): again[str(path)] for path in folders if has_ended(again.get(str(path)), asked)}
         tell = console(json=options.json)
         if ended:
             tell.print(f"{len(ended)} of {len(folders)} scenes have ended already and are left out")
@@ -109,9 +104,9 @@ class Batch:
                 ]
                 if options.dry_run:
                     return self._plan(list(scenes), errors, run_flows(requests, store, **engine), tell)
-                book = _Book(self.out / BATCH_FILE, list(map(str, folders)), ended, others, asked, tell)
+                book = Book(self.out / BATCH_FILE, list(map(str, folders)), ended, others, asked, tell)
                 for path, words in errors.items():
-                    book.add(_row(path, "failed", error=words))
+                    book.add(row_of(path, "failed", error=words))
                 ready = [(item, places[item[0]] if options.delivers else None) for item in scenes.items()]
                 with _Finishing(store, book, ready, undistorted=self.undistorted) as finishing:
                     watched = [
@@ -123,7 +118,7 @@ class Batch:
         if options.json:
             print(json.dumps(book.rows))
         else:
-            print_table(_table(book.rows, folders), tell)
+            print_table(table_of(book.rows, folders), tell)
         if not options.delivers:
             tell.print(escape(f"{options.stops_early}: only {self.out / BATCH_FILE} is written"))
         return STATUS_EXIT["ok" if all(row["status"] == "ok" for row in book.rows) else "degraded"]
@@ -154,40 +149,6 @@ class Batch:
         return 0
 
 
-class _Book:
-    """The rows of batch.json, in the order of the scenes; written, and told of, whenever one is added."""
-
-    def __init__(
-        self,
-        file: Path,
-        scenes: Sequence[str],
-        rows: dict[str, dict[str, Any]],
-        others: Sequence[dict[str, Any]],
-        asked: str,
-        tell: Console,
-    ) -> None:
-        """others: rows of scenes that are not of this batch. asked: a digest of how its scenes are to be run."""
-        self._file, self._scenes, self._rows, self._others = file, scenes, rows, others
-        self._asked, self._tell = asked, tell
-        self._write()
-
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        return [self._rows[scene] for scene in self._scenes if scene in self._rows]
-
-    def add(self, row: dict[str, Any]) -> None:
-        self._rows[row["scene"]] = row | {"asked": self._asked}
-        self._write()
-        place = f"see {row['out']}" if row["out"] else None
-        what = "; ".join(filter(None, (row["error"], place))) or f"{row['misses']} results computed"
-        words = escape(f"{row['scene']}: {what}")
-        self._tell.print(f"[{COLOURS[row['status']]}]{row['status']}[/] {words}")
-
-    def _write(self) -> None:
-        with writing_output(self._file):
-            write_atomically(self._file, json.dumps([*self._others, *self.rows], indent=1))
-
-
 class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
     """Finishes scenes in a thread of its own, so that the engine need not wait for files to be written.
 
@@ -199,7 +160,7 @@ class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
     def __init__(
         self,
         store: Store,
-        book: _Book,
+        book: Book,
         scenes: Sequence[tuple[tuple[Path, Prepared], Path | None]],
         *,
         undistorted: bool,
@@ -226,7 +187,7 @@ class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
             run_flows([replace(request, done=partial(self._add, position))], self._store, **options)
         except StoreFailure as error:
             (path, _), _ = self._scenes[position]
-            self._book.add(_row(path, "failed", error=str(error)))
+            self._book.add(row_of(path, "failed", error=str(error)))
 
     def _finish(self, position: int, report: Report) -> None:
         try:
@@ -239,34 +200,14 @@ class _Finishing(contextlib.AbstractContextManager["_Finishing"]):
         (path, prepared), out = self._scenes[position]
         try:
             document = finish(prepared, report, self._store, out, undistorted=self._undistorted)
-            row = _row(path, document["status"], report, out, first_failure(document), measures(self._store, document))
+            row = row_of(
+                path, document["status"], report, out, first_failure(document), measures(self._store, document)
+            )
         except Gone:
             raise
         except Exception as error:  # a fault in one scene's result must not stop the others
-            row = _row(path, "failed", report, error=_in_words(error))
+            row = row_of(path, "failed", report, error=_in_words(error))
         self._book.add(row)
-
-
-def _row(
-    path: Path,
-    status: str,
-    report: Report | None = None,
-    out: Path | None = None,
-    error: str | None = None,
-    metrics: dict[str, float] | None = None,
-) -> dict[str, Any]:
-    """A row of batch.json."""
-    counted = rows_of([{}], [report])[0] if report else None
-    return {
-        "scene": str(path),
-        "status": status,
-        "out": str(out) if out and status != "failed" else None,
-        "seconds": round(counted.seconds, 3) if counted else 0.0,
-        "hits": counted.hits if counted else 0,
-        "misses": counted.misses if counted else 0,
-        "error": error,
-        "metrics": metrics or {},
-    }
 
 
 def _in_words(error: BaseException) -> str:
@@ -309,48 +250,3 @@ def folder_names(scenes: Iterable[Path]) -> dict[Path, str]:
         numbered = (f"{capture_name(scene)}-{number}" for number in itertools.count(2))
         names[scene] = next(name for name in numbered if name not in names.values())
     return names
-
-
-def _earlier(file: Path, *, needed: bool) -> dict[str, dict[str, Any]]:
-    """The rows of earlier batches, by scene. Raises InputError when batch.json is damaged but needed."""
-    try:
-        return {row["scene"]: row for row in json.loads(file.read_text(encoding="utf-8")) if row["status"] in COLOURS}
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        if not needed:
-            return {}
-        raise InputError(f"{file} is damaged ({error}); run the batch without --retry-failed.") from None
-
-
-def _stays(row: Mapping[str, Any], places: Mapping[Path, Path]) -> bool:
-    """Whether the row of an earlier batch is of a scene that is not run now and whose folder is still its own."""
-    if Path(row["scene"]) in places or row.get("out") is None or Path(row["out"]) in places.values():
-        return False
-    return (Path(row["out"]) / RUN_FILE).is_file()
-
-
-def _has_ended(row: Mapping[str, Any] | None, asked: str) -> bool:
-    """Whether a scene, by its row of an earlier batch, if any, was run as is asked now, and what came of it is there.
-
-    A run that writes no folder (--until) has what came of it in the store.
-    """
-    if row is None or row["status"] == "failed" or row.get("asked") != asked:
-        return False
-    return row["out"] is None or (Path(row["out"]) / RUN_FILE).is_file()
-
-
-def _table(rows: Sequence[dict[str, Any]], folders: dict[Path, str]) -> Table:
-    metrics = [name for name in ("split.miou", "splat.miou") if any(name in row["metrics"] for row in rows)]
-    table = Table("scene", "", "instances", *metrics, "reused", "computed", "seconds", box=None)
-    for row in rows:
-        found = [row["metrics"].get(name) for name in ("splat.instances", *metrics)]
-        table.add_row(
-            escape(folders[Path(row["scene"])]),
-            f"[{COLOURS[row['status']]}]{row['status']}[/]",
-            *("" if value is None else f"{value:.4g}" for value in found),
-            str(row["hits"]),
-            str(row["misses"]),
-            f"{row['seconds']:.1f}",
-        )
-    return table

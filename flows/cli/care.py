@@ -8,7 +8,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from rich.markup import escape
 from rich.progress import Progress
@@ -27,12 +27,13 @@ from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.runs import Run, latest_runs
 from ss_flow.sweep import scene_of
+from ss_flow.tasks.words import first_of
 from ss_flow.units import parse_bytes, parse_seconds
 
 T = TypeVar("T")
 
 SHOWN = 10
-"""Damaged things that are named one by one."""
+"""Damaged things, and scenes, that are named one by one."""
 
 
 @dataclass(frozen=True)
@@ -72,23 +73,28 @@ class CacheCollect:
             unused_seconds=unused,
             dry=self.dry_run,
         )
+        losing = _runs_that_lose(store, collected.keys)
         runs = _delete(store, wanted.outdated, dry=self.dry_run)
         over = 0 if max_bytes is None else max(0, collected.left.bytes - max_bytes)
-        self._tell(collected, runs, over)
+        self._tell(collected, losing, runs, over)
         return STATUS_EXIT["degraded" if over else "ok"]
 
-    def _tell(self, collected: Collected, runs: Tally, over: int) -> None:
+    def _tell(self, collected: Collected, losing: list[dict[str, Any]], runs: Tally, over: int) -> None:
         rows = {step or "records that cannot be read": tally for step, tally in collected.results.items()}
         rows |= collected.others | ({"records of runs": runs} if runs.count else {})
         total, left = _sum(rows.values()), collected.left
         if self.json:
             removed = [{"what": what, **asdict(tally)} for what, tally in rows.items()]
             document = {"dry_run": self.dry_run, "removed": removed, "total": asdict(total), "left": asdict(left)}
-            print(json.dumps(document | {"over_bytes": over}, indent=1))
+            print(json.dumps(document | {"scenes": losing, "over_bytes": over}, indent=1))
             return
         out = console(json=False)
         print_table(_table("would go" if self.dry_run else "deleted", rows, {"total": total}), out)
         out.print(f"{left.count} results stay, {size_text(left.bytes)}")
+        if losing:
+            scenes = [f"{row['scene']} ({row['runs_that_lose']} of {row['runs']})" for row in losing]
+            words = "would lose" if self.dry_run else "lost"
+            out.print(escape(f"runs that {words} results: {first_of(scenes, SHOWN)}"))
         if over:
             out.print(
                 f"[yellow]{size_text(over)} more than --max-size {self.max_size}:[/] the rest is pinned, belongs to a "
@@ -140,6 +146,19 @@ class Wanted:
             return max(path.stat().st_mtime for path in (run.folder, *run.folder.iterdir())) < self._quiet_before
         except FileNotFoundError:
             return False
+
+
+def _runs_that_lose(store: Store, gone: frozenset[str]) -> list[dict[str, Any]]:
+    """The scenes with runs that need one of these keys, and how many of their runs do. To be called before the records
+    of runs are deleted."""
+    scenes: dict[str, Counter[bool]] = defaultdict(Counter)
+    for run in latest_runs(store.runs) if gone else ():
+        scenes[scene_of(run.header)][any(node["key"] in gone for node in run.nodes())] += 1
+    return [
+        {"scene": scene, "runs": count.total(), "runs_that_lose": count[True]}
+        for scene, count in scenes.items()
+        if count[True]
+    ]
 
 
 def _delete(store: Store, runs: list[Run], *, dry: bool) -> Tally:

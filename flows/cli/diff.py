@@ -53,8 +53,9 @@ class Diff:
 def difference(one: Path, other: Path) -> dict[str, Any]:
     """What two output folders of runs differ in. Raises InputError where one is none, or is damaged."""
     first, second = read_run(one), read_run(other)
-    views = [] if _of_other_photos(first, second) else _views_of_both(one, other)
-    matched = correspondence(_id_images(views)) if views else None
+    views = _views_of_both(one, other)
+    why_not = _why_not([one, other], views, other_photos=_of_other_photos(first, second))
+    matched = correspondence(_id_images(views)) if why_not is None else None
     return {
         "runs": [str(one), str(other)],
         "scenes": [first["scene"], second["scene"]],
@@ -64,6 +65,7 @@ def difference(one: Path, other: Path) -> dict[str, Any]:
         "metrics": _both(_flat(first["metrics"]), _flat(second["metrics"])),
         "steps": _steps(first["nodes"], second["nodes"]),
         "instances": None if matched is None else _instances(matched, len(views)),
+        "not_compared": why_not,
     }
 
 
@@ -118,6 +120,15 @@ def _of_other_photos(first: dict[str, Any], second: dict[str, Any]) -> bool:
     return first["scene"] != second["scene"] and photos[0].isdisjoint(photos[1])
 
 
+def _why_not(folders: list[Path], views: list[tuple[Path, Path]], *, other_photos: bool) -> str | None:
+    """Why the objects of two results cannot be compared; None where they can. views: those that both have."""
+    if unmasked := [folder for folder in folders if not (folder / "masks").is_dir()]:
+        return f"{unmasked[0]} has no masks"
+    if not views:
+        return "the two results have no view of the same name"
+    return "the two are of other photos" if other_photos else None
+
+
 def _views_of_both(first: Path, second: Path) -> list[tuple[Path, Path]]:
     return [(a, b) for a in sorted((first / "masks").glob("*.png")) if (b := second / "masks" / a.name).is_file()]
 
@@ -161,11 +172,7 @@ def _tell(document: dict[str, Any], out: Console) -> None:
     print_table(table, out)
     found = document["instances"]
     if found is None:
-        unmasked = [run for run in document["runs"] if not (Path(run) / "masks").is_dir()]
-        views = _views_of_both(*map(Path, document["runs"]))
-        why = "the two are of other photos" if views else "the two results have no view of the same name"
-        why = f"{unmasked[0]} has no masks" if unmasked else why
-        out.print(escape(f"objects: not compared; {why}."))
+        out.print(escape(f"objects: not compared; {document['not_compared']}."))
         return
     what = f"mean IoU over {found['views']} views; an object without a partner counts 0"
     out.print(f"objects: agreement {found['agreement']:.3f} ({what})")

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.markup import escape
@@ -132,6 +132,8 @@ class Completion:
 class Doctor:
     """Tell whether this machine has all that runs need, and what to do where it has not."""
 
+    json: bool = False
+    """Print one JSON document."""
     store: InStore = StoreOptions()
     """Where results are kept."""
 
@@ -151,17 +153,23 @@ class Doctor:
             *((name, partial(_library, name, module), f"{again} {name}") for name, module in _LIBRARIES),
             *((f"{kind} network", partial(_model, kind), "") for kind in _WITHOUT),
         ]
-        table = Table("what", "state", "what to do", box=None)
-        bad = 0
+        rows: list[dict[str, Any]] = []
         for name, look, mend in checks:
             try:
-                found = look()
-                table.add_row(name, *map(escape, found if isinstance(found, tuple) else (found,)))
+                found, ok = look(), True
             except Exception as error:
-                bad += 1
-                table.add_row(name, f"[red]{escape(str(error) or type(error).__name__)}[/]", escape(mend))
-        print_table(table, console(json=False))
-        return 1 if bad else 0
+                found, ok = (str(error) or type(error).__name__, mend), False
+            state, to_do = (found, "") if isinstance(found, str) else found
+            rows.append({"what": name, "ok": ok, "state": state, "what_to_do": to_do})
+        if self.json:
+            print(json.dumps(rows, indent=1))
+        else:
+            table = Table("what", "state", "what to do", box=None)
+            for row in rows:
+                state = escape(row["state"])
+                table.add_row(row["what"], state if row["ok"] else f"[red]{state}[/]", escape(row["what_to_do"]))
+            print_table(table, console(json=False))
+        return 0 if all(row["ok"] for row in rows) else 1
 
 
 def _store(options: StoreOptions) -> str:

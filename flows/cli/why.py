@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -20,6 +21,8 @@ from ss_flow.tasks.words import first_of
 
 _ITEMS = 8
 """Items of a step that a message names."""
+_REASONS = 5
+"""Reasons that the terminal shows; --json has them all."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,8 @@ class Why:
     """Name of a step, such as propagate or split.propagate; one item of it as segment[0003]."""
     scene: PositionalPath = None
     """The scene; the one that ran last, when left out."""
+    json: bool = False
+    """Print one JSON document."""
     store: InStore = StoreOptions()
     """Where results are kept."""
 
@@ -42,24 +47,39 @@ class Why:
                 break
         else:
             raise _unknown(self.step, runs[0])
-        out = console(json=False)
-        if other := not_latest(run, runs[0]):
-            out.print(escape(other))
         reason_of = Reasons(store, run)
         computed = [n for n in asked if "why" in n and n["event"] != "started"] or [n for n in asked if "why" in n]
         reasons: dict[str, list[dict[str, Any]]] = {}
         for node in computed or asked:
             moved = not computed and reason_of.only_moved(node)
             reasons.setdefault("" if moved else reason_of(node), []).append(node)
-        if reasons.keys() == {""}:
+        reasons.pop("", None)
+        rows = [
+            {
+                "step": these[0]["step"],
+                "labels": [node["label"] for node in these],
+                "why": reason,
+                "because": _causes(these[0], nodes, reason_of),
+            }
+            for reason, these in list(reasons.items())[: None if self.json else _REASONS]
+        ]
+        if self.json:
+            about = {"scene": run.scene, "started": run.header["started"], "reused": not computed}
+            print(json.dumps(about | {"reasons": rows}, indent=1))
+            return 0
+        out = console(json=False)
+        if other := not_latest(run, runs[0]):
+            out.print(escape(other))
+        if not rows:
             out.print(f"{asked[0]['step']}: reused; nothing that it depends on changed")
-        for reason, these in [one for one in reasons.items() if one[0]][:5]:
-            what = these[0]["label"] if len(these) == 1 else these[0]["step"]
+        for row in rows:
+            labels = row["labels"]
+            what = labels[0] if len(labels) == 1 else row["step"]
             found = "" if computed else "reused from an earlier run; since the last one, "
-            count = f" ({len(these)} of them)" if len(these) > 1 else ""
-            out.print(escape(f"{what}: {found}{reason}{count}"))
-            for cause in _causes(these[0], nodes, reason_of):
-                out.print(escape(f"  because {cause}"))
+            count = f" ({len(labels)} of them)" if len(labels) > 1 else ""
+            out.print(escape(f"{what}: {found}{row['why']}{count}"))
+            for cause in row["because"]:
+                out.print(escape(f"  because {cause['step']}: {cause['why']}"))
         return 0
 
 
@@ -105,9 +125,9 @@ class Reasons:
         return bool(self._known(node["label"])) and self._known.have(node["key"])
 
 
-def _causes(node: dict[str, Any], nodes: list[dict[str, Any]], reason_of: Reasons) -> list[str]:
+def _causes(node: dict[str, Any], nodes: list[dict[str, Any]], reason_of: Reasons) -> list[dict[str, str]]:
     """From a changed input back, step by step, to the change that began it; of a step's nodes that of the same item."""
-    found: list[str] = []
+    found: list[dict[str, str]] = []
     seen = {node["step"]}
     while (why := reason_of(node)).startswith("input "):
         producer = node.get("inputs", {}).get(why.split()[1])
@@ -118,5 +138,5 @@ def _causes(node: dict[str, Any], nodes: list[dict[str, Any]], reason_of: Reason
             break
         node = cause
         seen.add(node["step"])
-        found.append(f"{node['step']}: {reason_of(node)}")
+        found.append({"step": node["step"], "why": reason_of(node)})
     return found

@@ -74,6 +74,7 @@ def test_only_the_latest_runs_of_a_scene_are_kept_on_request(warm):
     done = gc(warm.store, "--keep-runs", "1")
     assert removed(told) == removed(done) == {"split.propagate": 1, "records of runs": 1}
     assert told.document() | {"dry_run": False} == done.document()
+    assert done.document()["scenes"] == [{"scene": str(warm.scene), "runs": 2, "runs_that_lose": 1}]
     keys, objects = entries(warm.store)
     assert keys == keys_of(latest) and objects == named_by(warm.store, keys)
     assert again(warm, "--set", "propagate.at_once.min_points=6").computed() == {}
@@ -112,6 +113,23 @@ def test_nothing_young_goes_and_a_dry_run_changes_nothing(warm):
     assert bytes_of(warm.store) == before
     assert removed(told)["split.visibility"] == 5
     assert told.document()["left"] == {"count": 0, "bytes": 0}
+
+
+def test_the_runs_that_lose_results_are_told_by_their_scenes(tmp_path):
+    store = Store(tmp_path / "store")
+    run_flow(toy.flow, store, scene="/one")
+    sweep(toy.flow, grid({"limit": (1.0, 2.0)}), store, scene="/one")
+    run_flow(lambda: {"half": toy.half(toy.source(values=(7.0,))[0])}, store, scene="/two")
+    age_all(store.root)
+
+    def told(*options):
+        return ss_flow("cache", "gc", "--cache", store.root, "--max-size", "0", *options).out.splitlines()[2:]
+
+    assert gc(store.root, "--dry-run").document()["scenes"] == []
+    assert not [line for line in told("--dry-run", "--grace", "1d") if "lose" in line]
+    scenes = "/two (1 of 1), /one (3 of 3)"
+    assert told("--dry-run")[-1] == f"runs that would lose results: {scenes}"
+    assert told()[-1] == f"runs that lost results: {scenes}"
 
 
 def test_without_runs_and_pins_nothing_is_left(warm):

@@ -80,6 +80,7 @@ def test_results_without_a_view_in_common_are_compared_without_objects(tiny, tmp
         file.rename(file.with_stem(f"other-{file.stem}"))
     answer = ss_flow("diff", tiny.out, other, "--json")
     assert answer.code == 0 and answer.document()["instances"] is None
+    assert answer.document()["not_compared"] == "the two results have no view of the same name"
     assert "no view of the same name" in ss_flow("diff", tiny.out, other).out
 
 

