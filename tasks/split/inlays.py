@@ -27,6 +27,8 @@ _FLAT = 0.8
 """Share of the points of a label that must do so."""
 _CELL = 2.0
 """Side of the squares in its plane that show where a label is, in spacings."""
+_SQUARES = 300
+"""How many a label is across at most: of a larger one, or one with a stray point far off, squares are larger."""
 _BESIDE = (2, 4)
 """Squares beyond its outline between which one looks for what is around it."""
 _MOST = 150
@@ -91,14 +93,15 @@ def find_inlays(looks: Looks, label: Int32, asked: Bool) -> Inlays:
 
 
 def _beside(points: Float64, plane: Plane, cell: float) -> Float64:
-    """[P, 3] places on a plane around points [N, 3], some way beyond their outline. cell: side of the squares that tell
-    the outline, world units."""
+    """[P, 3] places on a plane around points [N, 3], some way beyond their outline. cell: least side of the squares
+    that tell the outline, world units."""
     from scipy.ndimage import binary_dilation
 
     centre, normal = plane
     axes = np.linalg.svd(normal[None])[2][1:]
     flat = (points - centre) @ axes.T
     near, far = _BESIDE
+    cell = max(cell, float(np.ptp(flat, axis=0).max()) / _SQUARES)
     corner = flat.min(axis=0) - (far + 1) * cell
     square = ((flat - corner) / cell).astype(np.intp)
     covered = np.zeros(square.max(axis=0) + far + 2, bool)

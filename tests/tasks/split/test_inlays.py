@@ -114,3 +114,8 @@ def test_one_asks_of_flat_labels_alone_and_of_those_that_one_wants_to_know():
     assert found(MOUNT, (bent, PICTURE[1])).places[1] == 0
     few = rectangle(WHITE, (0.4, 0.4), (0.56, 0.6))
     assert found(without(BOARD, few), few).places.tolist()[1] == 0
+
+
+def test_a_stray_point_far_off_makes_squares_larger_but_not_more():
+    stray = np.append(PICTURE[0], [[1e6, 1e6, HIGH]], axis=0), np.append(PICTURE[1], WHITE[None], axis=0)
+    assert found(MOUNT, stray).places[1] <= 300
