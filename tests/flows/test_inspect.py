@@ -48,8 +48,9 @@ def test_status_of_a_run_that_was_cut_short_says_how_much_there_is_to_do(warm):
     """Cut the record in the middle of the views, as a kill would."""
     run = next(latest_runs(warm.store / "roots/runs"))
     lines = (run.folder / "events.jsonl").read_text().splitlines()
-    last = max(i for i, line in enumerate(lines) if json.loads(line).get("label") == "split.visibility[0002]")
-    (run.folder / "events.jsonl").write_text("\n".join(lines[: last + 1]))
+    # Views end in any order.
+    last = max(i for i, line in enumerate(lines) if json.loads(line).get("label", "").startswith("split.visibility["))
+    (run.folder / "events.jsonl").write_text("\n".join(lines[:last]))
     document = json.loads(ss_flow("status", "--json", "--cache", warm.store).out)
     visible = document["steps"]["split.visibility"]
     assert visible["finished"] < visible["expected"] == 5 and document["done"] < document["expected"]
