@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float64, Int32, PointCloud
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
 from ss_flow.tasks.geometry.shape import Plane
 from ss_flow.tasks.split.looks import Looks
 
@@ -38,7 +38,7 @@ def bridged(
     A look misses the surface that goes behind it, or meets in its plane a label with more points there than the smaller
     one has: that does not lie on the surface, but both in that, like two pages in a table.
     """
-    places = _across(looks.cloud, of == larger, of == smaller, longest)
+    places = _across(looks.cloud.points[of == smaller], looks.cloud.points[of == larger], looks.cloud.spacing, longest)
     if not len(places):
         return False
     centre, normal = plane
@@ -58,18 +58,17 @@ def bridged(
     return bool((count > 0).mean() >= _LOOKED_AT and missing <= _PAST * count.sum())
 
 
-def _across(cloud: PointCloud, first: Bool, second: Bool, longest: float) -> Float64:
-    """[P, 3] places across the gap between two sets of points [N], where it is narrow; none if it is too long."""
+def _across(some: Float32, others: Float32, spacing: float, longest: float) -> Float64:
+    """[P, 3] places across the gap between two sets of points [N, 3], where it is narrow; none if it is too long."""
     from scipy.spatial import cKDTree
 
-    ends, others = (cloud.points[rows].astype(np.float64) for rows in (second, first))
-    distance, nearest = cKDTree(others).query(ends)
+    distance, nearest = cKDTree(others).query(some)
     if distance.min() > longest:
         return np.zeros((0, 3))
     order = np.argsort(distance, kind="stable")
     facing = order[np.unique(nearest[order], return_index=True)[1]]  # the shortest line to each end
-    facing = facing[distance[facing] <= 2 * distance.min() + _FACING * cloud.spacing]
+    facing = facing[distance[facing] <= 2 * distance.min() + _FACING * spacing]
     facing = facing[:: max(1, len(facing) // _LINES)]
     share = np.linspace(0.25, 0.75, _STEPS)[:, None]
-    start, end = ends[facing][:, None], others[nearest[facing]][:, None]
+    start, end = (places.astype(np.float64)[:, None] for places in (some[facing], others[nearest[facing]]))
     return (start + share * (end - start)).reshape(-1, 3)

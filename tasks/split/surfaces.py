@@ -90,7 +90,7 @@ def lit_surfaces(looks: Looks, label: Int32, ends: Borders, params: ShadowParams
     touches = find_touches(cloud, label, filled, eye, shadows)
     while True:
         meeting = _meeting(touches, found.surface, filled, params)
-        if not found.unite(found.touching(meeting)) and not found.unite(found.apart(meeting, eye)):
+        if not found.unite(found.touching(meeting)) and not found.unite(found.apart(meeting)):
             return found.surface
 
 
@@ -126,9 +126,9 @@ class _Surfaces:
                 if (stays or self._of_one_color(rows)) and self._common_plane(rows, self._params.flat):
                     yield a, b
 
-    def apart(self, meeting: Meeting, eye: Float64) -> Iterator[tuple[int, int]]:
+    def apart(self, meeting: Meeting) -> Iterator[tuple[int, int]]:
         """Pairs of one colour in one plane that do not touch but for what lies or stands between them, each surface
-        once. eye: [3] the middle of the cameras."""
+        once."""
         of = self.surface[self._label]
         rows_of = rows_by_label(of)
         for larger, smaller, longest in self._near(rows_of) if self._params.gap else ():
@@ -139,7 +139,7 @@ class _Surfaces:
             if plane is None or not self._of_one_color(rows):
                 continue
             centre, normal, thickness = plane
-            faces = centre, towards(normal, centre, eye)
+            faces = centre, towards(normal, centre, middle_of(self._looks.cameras))
             color = np.median(self._brightness[np.concatenate(rows)], axis=0)
             alike = np.asarray((np.abs(self._brightness - color) < OTHER).all(axis=1))
             if bridged(self._looks, of, larger, smaller, faces, alike, thickness=thickness, longest=longest):
