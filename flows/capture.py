@@ -6,7 +6,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ss_flow.errors import InputError
-from ss_flow.flows.depths import Beside, all_of, completed_depth, depth_source, fitting_depth, measured, without_sensor
+from ss_flow.flows.depths import (
+    Beside,
+    all_of,
+    completed_depth,
+    depth_source,
+    fitting_depth,
+    measured,
+    presumed_depth,
+    without_sensor,
+)
 from ss_flow.flows.params import CaptureParams
 from ss_flow.flows.poses import fitting_poses, poses, poses_by_depth, refined_poses
 from ss_flow.graph import expand, pick
@@ -51,7 +60,9 @@ class Capture:
     """The cameras one by one."""
     depths: tuple[DepthMap, ...]
     presumed: tuple[DepthMap, ...]
-    """The same; where views were compared, with what one other view confirms. Split sees points by it."""
+    """The same; where views were compared, with what goes on flat from there. Split has its points from it."""
+    completed: bool
+    """Whether it is a sensor's, whose gaps are closed by comparing views."""
     unit: SceneUnit
     masks: tuple[MaskSet, ...] | None
     """Where the capture brought its own masks."""
@@ -114,7 +125,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         compared = params.registration.in_use(advise=advise)
         placing = registration(frames, cameras, sensed, advise=advise, params=compared)
         fitting = fitting_depth(frames, cameras, sensed, placing, params)
-        depths = presumed = completed_depth(frames, cameras, fitting, names, params)
+        depths = completed_depth(frames, cameras, fitting, names, params)
     elif params.calibrate == "depth":
         raise InputError(
             f"{scene.root} is to be run with depth that no sensor measured (capture.depth={source}), and only a "
@@ -122,7 +133,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         )
     else:
         beside = Beside.of(frames, cameras, names, params)
-        depths, presumed = without_sensor(source, beside, cameras, given, monodepth)
+        depths = without_sensor(source, beside, cameras, given, monodepth)
     by_view, unit = views.by_view(cameras), views.unit(cameras, depths)
     evened: tuple[ColourTransform, ...] = ()
     if params.colours.transform != "none" and given is None:  # whose Gaussians keep the colours they have
@@ -132,7 +143,8 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         cameras=cameras,
         by_view=by_view,
         depths=depths,
-        presumed=presumed,
+        presumed=presumed_depth(frames, depths, names, params) if source == "mvs" else depths,
+        completed=sensed is not None and params.completion.below > 0,
         unit=unit,
         masks=masks,
         truth=truth,

@@ -20,6 +20,7 @@ from ss_flow.tasks.capture.depth import AgreementParams
 from ss_flow.tasks.capture.given_scene import rendered_depth
 from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.neighbors import Neighbors, neighbors
+from ss_flow.tasks.capture.planes import planes
 from ss_flow.tasks.capture.registration import calibrated
 from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.capture.stereo import stereo
@@ -99,10 +100,9 @@ class Beside:
         beside = neighbors(cameras, sensed, params=params.neighbors)
         return cls(frames, views.by_view(cameras), beside, names, params)
 
-    def compared(self) -> tuple[Depths, Depths]:
-        """The depth that several views agree on, and what is presumed besides."""
-        found, agreed = self._found(self._each)
-        return agreed, self._confirmed(found, self.params.presumed)
+    def compared(self) -> Depths:
+        """The depth that several views agree on."""
+        return self._found(self._each)[1]
 
     def completed(self, sensor: Depths, gaps: Sequence[int]) -> Depths:
         """A sensor's depth, and what several views agree on where it has none.
@@ -212,23 +212,30 @@ def completed_depth(
 
 def without_sensor(
     source: str, beside: Beside, cameras: Cameras, given: Gaussians | None, monodepth: Model | None
-) -> tuple[Depths, Depths]:
-    """What several views show together ("mvs"), what a network ("mono") or a given scene ("rendered") says; and what is
-    presumed. Raises InputError when there is no such network or scene."""
+) -> Depths:
+    """What several views show together ("mvs"), what a network ("mono") or a given scene ("rendered") says.
+    Raises InputError when there is no such network or scene."""
     if source == "rendered":
         if given is None:
             raise InputError(
                 "capture.depth=rendered takes depth from a trained scene, and there is none; give it --scene."
             )
-        shown = beside.rendered(given)
-        return shown, shown
+        return beside.rendered(given)
     if source == "mono" and monodepth is None:
         raise InputError("capture.depth=mono needs a monocular depth network; `ss-flow models list` names some.")
-    agreed, presumed = beside.compared()
+    agreed = beside.compared()
     if source == "mvs" or monodepth is None:
-        return agreed, presumed
-    predicted = beside.predicted(agreed, cameras, monodepth.file("network"))
-    return predicted, predicted
+        return agreed
+    return beside.predicted(agreed, cameras, monodepth.file("network"))
+
+
+def presumed_depth(
+    frames: tuple[Frame, ...], depths: Depths, names: tuple[str, ...] | None, params: CaptureParams
+) -> Depths:
+    """What several views show together, and what is taken to go on flat from there."""
+    if not params.planes.flat:
+        return depths
+    return each(frames, depths, names=names, build=lambda frame, depth: planes(frame, depth, params=params.planes))
 
 
 def all_of(reference: Reference, paths: Sequence[Path | None]) -> tuple[Any, ...]:

@@ -13,6 +13,7 @@ from ss_flow.tasks.capture.ingest import IngestParams
 from ss_flow.tasks.capture.misfits import CheckParams
 from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.neighbors import NeighborParams
+from ss_flow.tasks.capture.planes import PlaneParams
 from ss_flow.tasks.capture.pose_fit import PoseFitParams
 from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.refine_poses import RefinePosesParams
@@ -75,9 +76,8 @@ class CaptureParams:
     sweep: SweepParams = field(default_factory=SweepParams)
     agreement: AgreementParams = field(default_factory=AgreementParams)
     stereo: StereoParams = field(default_factory=StereoParams)
-    presumed: AgreementParams = field(default_factory=lambda: AgreementParams(min_views=1))
-    """By which depth Split sees points where views are compared: one other view that agrees is enough, since the points
-    are confirmed by themselves. Nothing is trained on it."""
+    planes: PlaneParams = field(default_factory=PlaneParams)
+    """What Split takes to be flat where comparing views tells nothing. Nothing is trained on it."""
     registration: RegistrationParams = field(default_factory=RegistrationParams)
     completion: CompletionParams = field(default_factory=CompletionParams)
     mono: MonoParams = field(default_factory=MonoParams)
@@ -96,15 +96,12 @@ class SplitParams:
     rgbd: SegmentRgbdParams = field(default_factory=SegmentRgbdParams)
     dense_source: Literal["depth", "splatting"] = "depth"
     """Where the dense points come from: all depth maps, or a short splatting of the whole scene, as in the paper."""
-    dense_presumed: bool = False
-    """Whether points come from presumed depth, too (`capture.presumed`): more things are found where photos hardly
-    overlap, and more crumbs where they do."""
     dense: DenseParams = field(default_factory=DenseParams)
     splatting: DenseSplattingParams = field(default_factory=DenseSplattingParams)
     visibility: VisibilityParams = field(default_factory=VisibilityParams)
-    visible_color: NonNegative = 0.0
+    visible_color: NonNegative = 8.0
     """Where a view has no depth, it sees the points in front whose colour its photo shows: this is how far they may be
-    apart, in CIELAB. 0 = it sees none there; a sensor's gaps are closed before (`capture.completion`)."""
+    apart, in CIELAB. 0 = it sees none there, and so where a sensor's gaps are closed (`capture.completion`)."""
     observe: ObserveParams = field(default_factory=ObserveParams)
     propagate: PropagateParams = field(default_factory=PropagateParams)
     parts: PartsParams = field(default_factory=PartsParams)

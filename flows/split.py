@@ -145,19 +145,18 @@ def _dense_points(capture: Capture, params: SplitParams) -> PointCloud:
         return dense_splatting(
             *views, capture.depths, capture.unit, capture.colours, params=params.dense, splatting=params.splatting
         )
-    sources = capture.presumed if params.dense_presumed else capture.depths
-    return dense(*views, sources, capture.unit, params=params.dense)
+    return dense(*views, capture.presumed, capture.unit, params=params.dense)
 
 
 def _seen(capture: Capture, points: PointCloud, params: SplitParams) -> tuple[Visibility, ...]:
-    """Which points each view sees: by depth, and with `visible_color` by their colour where it has none."""
+    """Which points each view sees: by depth, and by their colour where it has none."""
     seen = each(
         capture.by_view,
         capture.presumed,
         names=capture.names,
         build=lambda camera, depth: visibility(points, camera, depth, params=params.visibility),
     )
-    if not params.visible_color:
+    if capture.completed or not params.visible_color:
         return seen
     return each(
         capture.by_view,

@@ -32,13 +32,13 @@ class PatchMatchParams:
 
     turns: Count = 4
     """How often every pixel tries its neighbours' planes and changes of its own."""
-    best: Annotated[int, Range(1, 8)] = 3
+    best: Annotated[int, Range(1, 8)] = 2
     """Out of the other photos, so many that match a pixel best decide."""
     window: Count = 11
     """Side of the window that is compared, in pixels, of which every second counts; even is one more."""
-    gray_scale: Positive = 30.0
+    gray_scale: Positive = 10.0
     """Pixels of a window whose gray level differs by so much from the middle's count 1/e."""
-    smoothness: NonNegative = 0.3
+    smoothness: NonNegative = 0.15
     """Price of a plane that none of the neighbours continues (matching costs lie in 0..1)."""
     smooth_scale: Positive = 0.02
     """Inverse depths that differ by this share, or more, do not continue one another."""

@@ -343,12 +343,14 @@ def test_a_photo_more_leaves_the_depth_of_views_that_are_no_neighbours_of_its_ow
     assert computed["capture.sweep"] < computed["capture.stereo"] <= 9
 
 
-def test_presumed_depth_changes_what_split_does_and_not_the_depth_itself(tmp_path):
+def test_what_goes_on_flat_changes_what_split_does_and_not_the_depth_itself(tmp_path):
     scene = write_room(tmp_path / "room", params=RoomParams(objects=2, views=22, width=64, height=48, held_out=0))
     options = ["--cache", tmp_path / "store", "--until", "visibility", "--json", "--set", "capture.depth=mvs"]
     options += ["--set", "capture.sweep.planes=24"]
     assert ss_flow("run", scene, *options).code == 0
-    sure = ss_flow("run", scene, *options, "--set", "capture.presumed.min_views=2")
-    assert sure.computed() == {"split.visibility": 22}
-    more = ss_flow("run", scene, *options, "--set", "split.dense_presumed=true")
-    assert more.computed() == {"split.dense": 1, "split.visibility": 22}
+    none = ss_flow("run", scene, *options, "--set", "capture.planes.flat=0")
+    assert none.computed() == {"split.dense": 1, "split.visibility": 22, "split.visible_by_color": 22}
+    other = ss_flow("run", scene, *options, "--set", "capture.planes.flat=0.5")
+    assert other.computed() == {
+        "capture.planes": 22, "split.dense": 1, "split.visibility": 22, "split.visible_by_color": 22
+    }  # fmt: skip
