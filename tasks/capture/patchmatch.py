@@ -36,7 +36,7 @@ class PatchMatchParams:
     """Out of the other photos, so many that match a pixel best decide."""
     window: Count = 11
     """Side of the window that is compared, in pixels, of which every second counts; even is one more."""
-    gray_scale: Positive = 10.0
+    gray_scale: Positive = 15.0
     """Pixels of a window whose gray level differs by so much from the middle's count 1/e."""
     smoothness: NonNegative = 0.15
     """Price of a plane that none of the neighbours continues (matching costs lie in 0..1)."""

@@ -1,14 +1,14 @@
 """How much depth several views give without a sensor, how right it is, and what it costs.
 
-    python tests/bench/bench_stereo.py CAPTURE [--rounds 1] [--stride 1] [--neighbors 8] [--max-side 320]
-                                       [--pictures FOLDER]
+    python tests/bench/bench_stereo.py CAPTURE [--stride 1] [--set STEP.PARAM=VALUE ...] [--pictures FOLDER]
     python tests/bench/bench_stereo.py --room 0 [--views 24]
 
 CAPTURE is a posed capture; where it has a sensor's depth, that is the truth, else only what is known is told. A room is
-generated, with exact depth. Printed after the sweep and after each round, by itself and as far as views agree: the
-share of all pixels that are known, of these (where the truth is known) the shares within 5 and 2 percent of the truth,
-the share of the truth's pixels that are known and within 5 percent, and CPU seconds a view. Pictures show the photo,
-the truth, the agreed sweep and the agreed last round of ten views beside each other.
+generated, with exact depth. Printed after the sweep and after each round, by itself and as far as views agree, and at
+last with surfaces that go on flat: the share of all pixels that are known, of these (where the truth is known) the
+shares within 5 and 2 percent of the truth, the share of the truth's pixels that are known and within 5 percent, and CPU
+seconds a view. Pictures show the photo, the truth, the agreed sweep, the agreed last round and the last line's depth of
+ten views beside each other.
 """
 
 from __future__ import annotations
@@ -16,21 +16,23 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
 import cv2
 import numpy as np
 
+from ss_flow.flows import settings
 from ss_flow.flows.generated import RoomParams, generate
+from ss_flow.flows.params import Params
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Frame
 from ss_flow.tasks.capture import ingest, sensor_depth
 from ss_flow.tasks.capture.depth import agree, sweep
-from ss_flow.tasks.capture.neighbors import NeighborParams, neighbors
+from ss_flow.tasks.capture.neighbors import neighbors
+from ss_flow.tasks.capture.planes import planes
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.capture.stereo import StereoParams, stereo
+from ss_flow.tasks.capture.stereo import stereo
 from ss_flow.tasks.geometry.cameras import cameras_by_view
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 
@@ -108,17 +110,15 @@ def main() -> None:
     parser.add_argument("--room", type=int, default=0, help="seed of the room, where no capture is named")
     parser.add_argument("--views", type=int, default=24, help="of the room")
     parser.add_argument("--stride", type=int, default=1, help="every n-th view of the capture")
-    parser.add_argument("--rounds", type=int, default=StereoParams().rounds)
-    parser.add_argument("--neighbors", type=int, default=NeighborParams().count)
-    parser.add_argument("--max-side", type=int, default=StereoParams().max_side)
+    parser.add_argument("--set", nargs="*", default=[], help="of `capture`")
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    params = replace(StereoParams(), max_side=options.max_side)
+    params = settings.apply(Params(), options.set).capture
     frames, cameras, truth = (
         captured(options.capture, options.stride) if options.capture else generated(options.room, options.views)
     )
-    near, by_view = neighbors(cameras, params=NeighborParams(options.neighbors)), cameras_by_view(cameras)
+    near, by_view = neighbors(cameras, params=params.neighbors), cameras_by_view(cameras)
 
     def of_each(step: str, work: Callable[[int, list[int]], DepthMap]) -> tuple[DepthMap, ...]:
         """A step of all views; `work` is told a view, and it with its neighbours."""
@@ -128,23 +128,30 @@ def main() -> None:
         return maps
 
     def agreement(step: str, maps: tuple[DepthMap, ...]) -> tuple[DepthMap, ...]:
-        return of_each(f"{step}, agreed", lambda _, around: agree(some(maps, around), some(by_view, around)))
+        def confirmed(_: int, around: list[int]) -> DepthMap:
+            return agree(some(maps, around), some(by_view, around), params=params.agreement)
 
-    found = of_each("swept", lambda k, around: sweep(some(frames, around), some(by_view, around), span=near.span_of(k)))
+        return of_each(f"{step}, agreed", confirmed)
+
+    found = of_each(
+        "swept",
+        lambda k, around: sweep(some(frames, around), some(by_view, around), span=near.span_of(k), params=params.sweep),
+    )
     swept = agreed = agreement("swept", found)
-    for number in range(options.rounds):
+    for number in range(params.stereo.rounds):
         before, confirmed, step = found, agreed, f"round {number + 1}"
         found = of_each(
             step,
             lambda k, around, before=before, confirmed=confirmed: stereo(
-                some(frames, around), some(by_view, around), before[k], some(confirmed, around), params=params
+                some(frames, around), some(by_view, around), before[k], some(confirmed, around), params=params.stereo
             ),
         )
         agreed = agreement(step, found)
+    flat = of_each("and going on flat", lambda k, _: planes(frames[k], agreed[k], params=params.planes))
     if options.pictures:
         options.pictures.mkdir(parents=True, exist_ok=True)
         for k in range(0, len(frames), max(1, len(frames) // 10)):
-            maps = [*([truth[k]] if truth else []), swept[k].depth, agreed[k].depth]
+            maps = [*([truth[k]] if truth else []), swept[k].depth, agreed[k].depth, flat[k].depth]
             cv2.imwrite(str(options.pictures / f"{frames[k].name}.png"), picture(frames[k], maps))
 
 
