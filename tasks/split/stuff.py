@@ -22,8 +22,9 @@ from ss_flow.tasks.geometry.shape import (
 from ss_flow.tasks.ranges import Count, Fraction
 
 _ROUNDS = 4
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
+_TRIM, _STRAY = 0.02, 0.1
+"""Share of the points, on every side, that the scene's extent and a label's leave out. Of a picture's mount every tenth
+point may be a stray somewhere on the wall."""
 _FEW = 10
 """Points below which a label has no plane."""
 _ENOUGH = 4000
@@ -62,7 +63,9 @@ def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params
     stuff = np.zeros(len(names), bool)
     for row, name in enumerate(names.tolist()):
         own = thinned(points.points[rows_of[name]], _ENOUGH)
-        if (extent := box_diagonal(own, _TRIM)) < least or len(own) < _FEW:
+        # What lies evenly on a plane reaches so much farther than its middle does.
+        extent = box_diagonal(own, _STRAY) / (1 - 2 * _STRAY)
+        if extent < least or len(own) < _FEW:
             continue
         thickness = params.thickness * extent
         planes = _planes(own, thickness, params)

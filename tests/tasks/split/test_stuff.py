@@ -65,6 +65,12 @@ def test_a_wall_and_a_thing_before_it_in_one_piece_are_no_stuff():
     assert kinds(FLOOR, np.concatenate([WALL, plane((1, -1, 0), (1.01, 1, 1.5), 1500)])) == [True, False]
 
 
+def test_strays_all_over_a_wall_make_no_wall_of_a_picture():
+    strays = plane((1.99, -2, 0), (2, 2, 2.5), 40)
+    assert kinds(FLOOR, WALL, np.concatenate([POSTER, strays])) == [True, True, False]
+    assert kinds(FLOOR, WALL, np.concatenate([POSTER, *[strays] * 10])) == [True, True, True]
+
+
 def test_a_few_points_are_no_wall_however_far_apart():
     share = np.linspace(0, 1, 9)
     few = np.stack([4 * share - 2, np.full(9, 2.0), 2.5 * (4 * share % 1)], axis=1)
