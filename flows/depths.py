@@ -16,7 +16,6 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, Registr
 from ss_flow.tasks.capture import depth as steps
 from ss_flow.tasks.capture import recordings, sensor_depth, views
 from ss_flow.tasks.capture.completion import Gaps, completed, gaps, sized
-from ss_flow.tasks.capture.depth import AgreementParams
 from ss_flow.tasks.capture.given_scene import rendered_depth
 from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.neighbors import Neighbors, neighbors
@@ -102,7 +101,7 @@ class Beside:
 
     def compared(self) -> Depths:
         """The depth that several views agree on."""
-        return self._found(self._each)[1]
+        return self._agreed(self._each)
 
     def completed(self, sensor: Depths, gaps: Sequence[int]) -> Depths:
         """A sensor's depth, and what several views agree on where it has none.
@@ -122,20 +121,18 @@ class Beside:
 
             return self._each(held)
 
-        _, agreed = self._found(with_sensor)
+        agreed = self._agreed(with_sensor)
         return with_sensor(lambda view, _: agreed[view], sensor)
 
     def rendered(self, scene: Gaussians) -> Depths:
         """The depth that a scene shows, where neighbours confirm it: at outlines it lies between two surfaces."""
-        return self._confirmed(
-            each(
-                self.frames,
-                self.cameras,
-                names=self.names,
-                build=lambda frame, camera: rendered_depth(scene, frame, camera, params=self.params.given),
-            ),
-            self.params.agreement,
+        shown = each(
+            self.frames,
+            self.cameras,
+            names=self.names,
+            build=lambda frame, camera: rendered_depth(scene, frame, camera, params=self.params.given),
         )
+        return self._each(self._agreeing(shown))
 
     def predicted(self, agreed: Depths, cameras: Cameras, network: FileRef) -> Depths:
         """A monocular network's depth, which takes its scale from what several views agree on."""
@@ -145,17 +142,17 @@ class Beside:
             build=lambda frame: mono(frame, cameras, agreed, model=network, params=self.params.mono),
         )
 
-    def _found(self, each_view: Callable[[OfView], Depths]) -> tuple[Depths, Depths]:
-        """What each view's photo is found to show beside its neighbours', and what of it several views agree on.
+    def _agreed(self, each_view: Callable[[OfView], Depths]) -> Depths:
+        """What several views agree on of what each view's photo is found to show beside its neighbours'.
 
         each_view: applies a step to all views.
         """
         found = each_view(self._swept)
-        agreed = each_view(self._agreeing(found, self.params.agreement))
+        agreed = each_view(self._agreeing(found))
         for _ in range(self.params.stereo.rounds):
             found = each_view(functools.partial(self._refined, found, agreed))
-            agreed = each_view(self._agreeing(found, self.params.agreement))
-        return found, agreed
+            agreed = each_view(self._agreeing(found))
+        return agreed
 
     def _each(self, build: OfView) -> Depths:
         return each(
@@ -181,13 +178,10 @@ class Beside:
             params=self.params.stereo,
         )
 
-    def _confirmed(self, found: Depths, params: AgreementParams) -> Depths:
-        return self._each(self._agreeing(found, params))
-
-    def _agreeing(self, found: Depths, params: AgreementParams) -> OfView:
+    def _agreeing(self, found: Depths) -> OfView:
         def agreeing(view: int, near: Neighbors) -> DepthMap:
             around = near.around(view)
-            return steps.agree(pick(found, around), pick(self.cameras, around), params=params)
+            return steps.agree(pick(found, around), pick(self.cameras, around), params=self.params.agreement)
 
         return agreeing
 

@@ -17,6 +17,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Float32, Float64
 from ss_flow.tasks.gaussians.library import StereoPhoto, StereoProblem, instruction_set, library
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.images import inverse_depth
 from ss_flow.tasks.geometry.plane_sweep import SweepView, pixel_transfer
 from ss_flow.tasks.processor import on_this_processor
 from ss_flow.tasks.ranges import Count, NonNegative, Positive, Range
@@ -83,7 +84,7 @@ def improved(
     planes: [3, H, W] inverse depth and its gradient over the image, along x and y.
     """
     height, width = planes.shape[1:]
-    held = [(quads(s.view.gray), s.view.valid.astype(np.uint8), _inverse(s.depth)) for s in sources]
+    held = [(quads(s.view.gray), s.view.valid.astype(np.uint8), inverse_depth(s.depth)) for s in sources]
     photos = (StereoPhoto * len(sources))(
         *(
             StereoPhoto(
@@ -114,11 +115,6 @@ def quads(gray: Float32) -> np.ndarray:
     rounded = np.pad(np.clip(np.rint(gray), 0, 255).astype(np.uint32), ((0, 1), (0, 1)), mode="edge")
     joined = rounded[:-1, :-1] | rounded[:-1, 1:] << 8 | rounded[1:, :-1] << 16 | rounded[1:, 1:] << 24
     return np.ascontiguousarray(joined)
-
-
-def _inverse(depth: Float32) -> Float32:
-    known = depth > 0
-    return np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
 
 
 def _there_and_back(reference: SweepView, source: SweepView) -> list[ctypes.Array[ctypes.c_float]]:

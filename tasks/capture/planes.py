@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Float64, Frame, Int32
-from ss_flow.tasks.geometry.images import near_border, resampled, shared_rgb, shared_valid
+from ss_flow.tasks.artifacts import Bool, DepthMap, Float64, Frame, Int32
+from ss_flow.tasks.geometry.images import inverse_depth, near_border, resampled, shared_rgb, shared_valid
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, Positive
 
 _SAMPLES = 100
@@ -62,8 +62,9 @@ def planes(frame: Frame, depth: DepthMap, *, params: PlaneParams = PlaneParams()
     Known depth stays, but along outlines (`rim`). Pixels that do not count (`Frame.valid`) stay unknown.
     """
     size = depth.depth.shape
-    regions, places, inverse = regions_of_colour(frame, size, params), _places(size), _inverse(depth.depth)
+    regions, inverse = regions_of_colour(frame, size, params), inverse_depth(depth.depth.astype(np.float64))
     coefficients, covariances = fitted_planes(regions, inverse, params)
+    places = _places(size)
     flat = np.einsum("hwi,hwi->hw", places, coefficients[regions])
     error = np.sqrt(np.einsum("hwi,hwij,hwj->hw", places, covariances[regions], places))
     nearest, farthest = inverse.max(), inverse.min(where=inverse > 0, initial=np.inf)
@@ -142,9 +143,3 @@ def _places(size: tuple[int, int]) -> Float64:
     h, w = size
     y, x = np.meshgrid((np.arange(h) + 0.5) / h, (np.arange(w) + 0.5) / w, indexing="ij")
     return np.stack([x, y, np.ones(size)], axis=2)
-
-
-def _inverse(depth: Float32) -> Float64:
-    """Inverse depth, 0 where it is unknown."""
-    known = depth > 0
-    return np.where(known, 1 / np.where(known, depth, 1).astype(np.float64), 0)

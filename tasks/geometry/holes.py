@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Float32
+from ss_flow.tasks.geometry.images import inverse_depth
 
 _STEP = 0.05
 """Share by which depths on both sides of a hole may differ; an edge may run between others."""
@@ -29,6 +30,6 @@ def close_holes(depth: Float32) -> Float32:
     largest = cv2.dilate(depth, near)
     smallest = cv2.erode(np.where(known, depth, np.float32(np.inf)), near)
     hole = thin & ~known & (largest / smallest <= 1 + _STEP)
-    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
-    count, total = (cv2.boxFilter(image, -1, (3, 3), normalize=False) for image in (known.astype(np.float32), inverse))
+    images = known.astype(np.float32), inverse_depth(depth)
+    count, total = (cv2.boxFilter(image, -1, (3, 3), normalize=False) for image in images)
     return np.where(hole, count / np.where(hole, total, 1), depth).astype(np.float32)

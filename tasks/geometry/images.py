@@ -108,6 +108,13 @@ def resampled(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return image[np.ix_(pixels_under(height, image.shape[0]), pixels_under(width, image.shape[1]))]
 
 
+def inverse_depth(depth: np.ndarray) -> np.ndarray:
+    """1 / depth, of the same floating type and shape; 0 where depth is unknown, that is 0."""
+    inverse = np.zeros_like(depth)
+    np.divide(1, depth, out=inverse, where=depth > 0)
+    return inverse
+
+
 def pixels_under(count: int, size: int) -> NDArray[np.intp]:
     """[count] of `size` pixels in a row, those under the centres of `count` others that span the same length."""
     return ((np.arange(count) + 0.5) * size / count).astype(np.intp)

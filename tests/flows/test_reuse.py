@@ -348,9 +348,8 @@ def test_what_goes_on_flat_changes_what_split_does_and_not_the_depth_itself(tmp_
     options = ["--cache", tmp_path / "store", "--until", "visibility", "--json", "--set", "capture.depth=mvs"]
     options += ["--set", "capture.sweep.planes=24"]
     assert ss_flow("run", scene, *options).code == 0
+    split = {"split.dense": 1, "split.visibility": 22, "split.visible_by_color": 22}
     none = ss_flow("run", scene, *options, "--set", "capture.planes.flat=0")
-    assert none.computed() == {"split.dense": 1, "split.visibility": 22, "split.visible_by_color": 22}
+    assert none.computed() == split
     other = ss_flow("run", scene, *options, "--set", "capture.planes.flat=0.5")
-    assert other.computed() == {
-        "capture.planes": 22, "split.dense": 1, "split.visibility": 22, "split.visible_by_color": 22
-    }  # fmt: skip
+    assert other.computed() == {"capture.planes": 22, **split}

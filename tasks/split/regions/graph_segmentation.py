@@ -15,6 +15,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, UInt8
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.images import inverse_depth
 
 _OF_SLOPE = 3
 """Pixels over which a slope is taken."""
@@ -66,7 +67,7 @@ def surface_of(depth: Float32, camera: Camera) -> Surface:
     import cv2
 
     known = depth > 0
-    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
+    inverse = inverse_depth(depth)
     scale = float(np.median(inverse[known])) if known.any() else 1.0
     filled = cv2.medianBlur(inverse, 5)
     filled = np.where(filled > 0, filled, inverse)
@@ -87,7 +88,7 @@ def surface_of(depth: Float32, camera: Camera) -> Surface:
     usable &= length[..., 0] > 0
     # n . X = 1 for the unnormalised normal, which therefore points away from the camera.
     normals = np.where(usable[..., None], -normals / np.maximum(length, 1e-12), 0).astype(np.float32)
-    z = np.where(known, 1 / np.where(known, smooth, 1), 0)
+    z = inverse_depth(smooth)
     points = np.stack([x / camera.fx * z, y / camera.fy * z, z], axis=2).astype(np.float32)
     return Surface(smooth, slope.astype(np.float32), points, normals)
 
