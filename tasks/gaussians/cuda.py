@@ -37,25 +37,28 @@ class DeviceCamera(NamedTuple):
     """Its width and height."""
     corner: Tensor
     """[2] where the image lies in it."""
+    half: Tensor
+    """[2] half of the image's width and height."""
     center: Tensor
     """[3] world."""
 
 
 def camera_on(device: torch.device, camera: Camera) -> DeviceCamera:
     """See `Renderer`."""
-    pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float32, device=device)
+    pose = torch.tensor(camera.world_to_camera, dtype=torch.float32, device=device)
     left, upper, right, lower = camera.borders
     cx, cy = -left * camera.fx, -upper * camera.fy
-    intrinsics, corner, center = (
+    intrinsics, corner, half, center = (
         torch.tensor(values, dtype=torch.float32, device=device)
         for values in (
             [[[camera.fx, 0, cx], [0, camera.fy, cy], [0, 0, 1]]],
             [cx - camera.cx, cy - camera.cy],
+            [camera.width / 2, camera.height / 2],
             camera.center.tolist(),
         )
     )
     photo = round((right - left) * camera.fx), round((lower - upper) * camera.fy)
-    return DeviceCamera(camera, pose[None], intrinsics, photo, corner, center)
+    return DeviceCamera(camera, pose[None], intrinsics, photo, corner, half, center)
 
 
 class _Splats(NamedTuple):
@@ -96,42 +99,49 @@ def draw(
             center_gradient.add_(towards[0])
 
         splats.means.register_hook(note)
-    in_view = (splats.radii[0] > 0).all(dim=-1)
+    reach = splats.radii[0].amax(dim=-1)
     used = (settings.sh_degree + 1) ** 2
-    colors = spherical_harmonics(
-        settings.sh_degree, gaussians.means - camera.center, gaussians.sh[:, :used], masks=in_view
-    )
-    channels = [torch.clamp(colors + 0.5, min=0), splats.depths[0][:, None]]
+    sh = gaussians.sh if used == gaussians.sh.shape[1] else gaussians.sh[:, :used]
+    colors = spherical_harmonics(settings.sh_degree, gaussians.means - camera.center, sh, masks=reach > 0)
+    channels = [torch.clamp(colors + 0.5, min=0), splats.depths.view(-1, 1)]
+    behind = [background, background.new_zeros(1 + settings.num_labels)]
     if labels is not None:
         channels.append((labels[:, None] == torch.arange(settings.num_labels, device=labels.device)).float())
     drawn = [
         rasterize_to_pixels(
             splats.means, splats.conics, _padded(some)[None], splats.opacities, width, height, _TILE, splats.offsets,
-            splats.listed,
+            splats.listed, backgrounds=_padded(color)[None],
         )
-        for some in torch.cat(channels, dim=1).split(_CHANNELS[-1], dim=1)
+        for some, color in zip(
+            torch.cat(channels, dim=1).split(_CHANNELS[-1], dim=1), torch.cat(behind).split(_CHANNELS[-1]), strict=True
+        )
     ]  # fmt: skip
-    image, alpha = torch.cat([images[0] for images, _ in drawn], dim=-1), drawn[0][1][0, :, :, 0]
+    image = drawn[0][0] if len(drawn) == 1 else torch.cat([images for images, _ in drawn], dim=-1)
+    # Views whose gradients are put together by one kernel; slices would be added up, each as large as the image.
+    image = image.view(height, width, -1)
+    parts = [3, 1, settings.num_labels]
+    rgb, depth, label_masks, _ = image.split([*parts, image.shape[-1] - sum(parts)], dim=-1)
+    alpha = drawn[0][1].view(height, width)
     top = torch.full((height, width), -1, dtype=torch.int32, device=alpha.device)
     strongest = alpha.new_zeros(len(gaussians))
     if settings.winners:
         with torch.no_grad():
             _find_winners(splats, alpha, top, strongest)
     return Rendered(
-        rgb=image[..., :3] + (1 - alpha)[..., None] * background,
+        rgb=rgb,
         alpha=alpha,
-        depth=image[..., 3],
-        label_masks=image[..., 4 : 4 + settings.num_labels].permute(2, 0, 1),
+        depth=depth.squeeze(-1),
+        label_masks=label_masks.permute(2, 0, 1),
         top_contributor=top,
-        radii=torch.where(in_view, splats.radii[0].amax(dim=-1), 0).float(),
+        radii=reach.float(),
         max_contribution=strongest,
         center_gradient=center_gradient,
     )
 
 
 def _padded(channels: Tensor) -> Tensor:
-    """[N, C] with channels of zeros up to a number that gsplat has a kernel for; some versions of it do not pad."""
-    count = channels.shape[1]
+    """[..., C] with channels of zeros up to a number that gsplat has a kernel for; some versions of it do not pad."""
+    count = channels.shape[-1]
     return torch.nn.functional.pad(channels, (0, next(known for known in _CHANNELS if known >= count) - count))
 
 
@@ -145,9 +155,8 @@ def _projected(gaussians: GaussianTensors, camera: DeviceCamera) -> _Splats:
         *camera.photo, near_plane=NEAR_PLANE, opacities=opacities,
     )  # fmt: skip
     means = means - camera.corner
-    low, high = means.detach() - radii, means.detach() + radii
-    shown = (high > 0).all(dim=-1) & (low[..., 0] < width) & (low[..., 1] < height)
-    radii = torch.where(shown[..., None], radii, 0)
+    shown = ((means.detach() - camera.half).abs() < radii + camera.half).all(dim=-1, keepdim=True)
+    radii = torch.where(shown, radii, 0)
     columns, rows = -(-width // _TILE), -(-height // _TILE)
     _, keys, listed = isect_tiles(means, radii, depths, _TILE, columns, rows)
     offsets = isect_offset_encode(keys, 1, columns, rows).reshape(1, rows, columns)

@@ -1,11 +1,14 @@
 """Training on a device of torch: on CUDA, where nothing leaves the device from step to step; on the CPU, to test that.
 
-Imports torch: import it inside functions. The losses are those of `losses.py`, written with torch's own operations.
+Imports torch: import it inside functions. The losses are those of `losses.py`, written with torch's own operations, and
+so are their gradients: on a device a step takes as long as the host needs to start its kernels, and autograd would
+start twice as many.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,6 +26,8 @@ from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered, rendere
 
 _RADIUS, _SIGMA = 5, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
+_PIXEL_BYTES = 90
+"""Of a pixel of a target, a few labels included."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,8 @@ class _Target:
     """None where no colour counts."""
     inside: Tensor
     judged: Tensor
-    depth: Tensor
+    inverse_depth: Tensor
+    """[h, w] 1 / the known depth."""
     known: Tensor
     labelled: Tensor | None
     one_hot: Tensor
@@ -47,18 +53,24 @@ class _Target:
 
 @dataclass(frozen=True)
 class _Photo:
-    """The pixels whose colour counts, and what SSIM takes of them, found once."""
+    """The pixels whose colour counts, and what L1 and SSIM take of them, found once. Planes are [3, 1, h, w], and 0
+    where the colour does not count."""
 
     counts: Tensor
     """[1, 1, h, w] bool."""
     share: Tensor
     """[1, 1, h, w] of each pixel in the mean over pixels and channels."""
     image: Tensor
-    """[3, 1, h, w] 0 where the colour does not count."""
     mean: Tensor
-    """[3, 1, h, w] within SSIM's window."""
-    variance: Tensor
-    """[3, 1, h, w] likewise."""
+    """mu_y within SSIM's window."""
+    brightness: Tensor
+    """mu_y^2 + c1."""
+    rest: Tensor
+    """The mean of y^2 within the window + c1 + c2; with that of x^2 it is the sum of both of SSIM's denominators."""
+    tap: Tensor
+    """[2 _RADIUS + 1] of the window."""
+    constants: tuple[Tensor, Tensor]
+    """c1, and c1 + c2."""
 
     @classmethod
     def of(cls, image: Tensor, counted: Tensor) -> _Photo:
@@ -66,8 +78,57 @@ class _Photo:
         counts = (counted > 0)[None, None]
         share = (counted / (3 * counted.sum()))[None, None]
         image = torch.where(counts, _planes(image), 0)
-        mean, squares = _blur(torch.stack([image, image * image]))
-        return cls(counts, share, image, mean, squares - mean * mean)
+        x = torch.arange(-_RADIUS, _RADIUS + 1, dtype=image.dtype, device=image.device)
+        tap = torch.exp(-(x**2) / (2 * _SIGMA**2))
+        tap = tap / tap.sum()
+        mean, squares = _blur(torch.stack([image, image * image]), tap)
+        constants = image.new_full((), _C1), image.new_full((), _C1 + _C2)
+        return cls(counts, share, image, mean, mean * mean + _C1, squares + _C1 + _C2, tap, constants)
+
+    def compare(self, image: Tensor, ssim_weight: float) -> tuple[Tensor, Tensor]:
+        """The colour loss (1 - w) L1 + w (1 - SSIM) of [h, w, 3] (Kerbl et al. 2023, Eq. 7), and its gradient."""
+        x = torch.where(self.counts, _planes(image), 0)
+        off = x - self.image
+        towards = off.sign() * ((1 - ssim_weight) * self.share)
+        loss = torch.dot(towards.flatten(), off.flatten())
+        if ssim_weight:
+            similarity, slope = self._ssim(x)
+            loss = (loss + ssim_weight).sub_(similarity, alpha=ssim_weight)
+            towards = torch.where(self.counts, towards.sub_(slope, alpha=ssim_weight), 0)
+        return loss, towards[:, 0].permute(1, 2, 0)
+
+    def _ssim(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean SSIM (Wang et al. 2004, Eq. 13) over the pixels that count, and its gradient.
+
+        SSIM = (A1 A2) / (B1 B2) is a function of three means within the window, m of x, q of x^2 and p of x y; the
+        gradient towards x is that towards each of them, through the window again, times what x is to it.
+        """
+        m, q, p = _blur(torch.stack([x, x * x, x * self.image]), self.tap)
+        c1, c1_c2 = self.constants
+        a1 = torch.addcmul(c1, m, self.mean, value=2)
+        a2 = torch.add(c1_c2, p, alpha=2) - a1
+        b1 = torch.addcmul(self.brightness, m, m)
+        b2 = q + self.rest - b1
+        part = self.share / (b1 * b2)
+        ssim = a1 * a2 * part
+        by_q, by_p = ssim / b2, a1 * part  # the slope towards q is -by_q, those towards m and p twice by_m and by_p
+        by_m = torch.addcmul((a2 - a1) * self.mean * part, m, by_q - ssim / b1)
+        by_m, by_q, by_p = _blur(torch.stack([by_m, by_q, by_p]), self.tap)
+        slope = torch.addcmul(torch.addcmul(by_m, by_p, self.image), x, by_q, value=-1)
+        return ssim.sum(), slope.mul_(2)
+
+
+class _OnDemand(Sequence[_Target]):
+    """Targets that are carried to the device again in each step."""
+
+    def __init__(self, targets: Targets, backend: TorchBackend) -> None:
+        self._targets, self._backend = targets, backend
+
+    def __len__(self) -> int:
+        return len(self._targets.views)
+
+    def __getitem__(self, view: Any) -> Any:
+        return self._backend.target(self._targets[view], self._targets.num_labels)
 
 
 class TorchBackend:
@@ -111,15 +172,23 @@ class TorchBackend:
             _Photo.of(self.put(target.image), self.put(target.counted)) if target.counted.any() else None,
             self.put(target.inside),
             self.put(target.judged),
-            self.put(target.depth),
+            self.put(1 / target.depth),
             self.put(target.known),
             None if target.labelled is None else self.put(target.labelled),
             self.put(one_hot),
             self.put(channel_of_label),
         )
 
-    def targets(self, targets: Targets) -> list[_Target]:
+    def targets(self, targets: Targets) -> Sequence[_Target]:
+        """All of them on the device, or, where they would fill it, each when it is asked for."""
+        pixels = sum(view.camera.width * view.camera.height for view in targets.views)
+        if pixels * _PIXEL_BYTES > self._room():
+            return _OnDemand(targets, self)
         return [self.target(target, targets.num_labels) for target in targets]
+
+    def _room(self) -> int:
+        """Bytes that targets may take: a training shares the device with others."""
+        return torch.cuda.mem_get_info(self._device)[0] // 4 if self._device.type == "cuda" else sys.maxsize
 
     def descent(
         self, values: Values, labels: Tensor | None, target: _Target, settings: Settings, weights: Weights
@@ -130,34 +199,33 @@ class TorchBackend:
             channels = torch.where(labels >= 0, target.channel_of_label[labels.clamp(min=0)], -1)
         settings = replace(settings, num_labels=0 if channels is None else len(target.one_hot))
         out = self._draw(leaves, target, channels, settings)
-        loss = _color_loss(out.rgb, target.photo, weights.ssim)
-        loss = loss + weights.alpha * (target.judged * (out.alpha - target.inside).abs()).sum()
-        loss = loss + weights.depth * (target.known * _depth_error(out.alpha, out.depth, target, weights)).sum()
-        if target.labelled is not None and channels is not None:
-            loss = loss + weights.mask * (target.labelled * (out.label_masks - target.one_hot).abs()).sum()
-        towards = torch.autograd.grad(loss, tuple(leaves.values()), materialize_grads=True)
-        gradients = dict(zip(leaves, towards, strict=True)) | {"centers": out.center_gradient}
-        return Descent(loss.detach(), gradients, out.radii)
+        with torch.no_grad():
+            loss, towards = _loss(out, target, weights)
+        images = [image for image, given in towards if given is not None]
+        given = [given for _, given in towards if given is not None]
+        found = torch.autograd.grad(images, tuple(leaves.values()), given, materialize_grads=True)
+        gradients = dict(zip(leaves, found, strict=True)) | {"centers": out.center_gradient}
+        return Descent(loss, gradients, out.radii)
 
     def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
-        rates = dict(step.rates)
-        rates["means"] = rates["means"][:, None]
+        # A step of Adam is as long as its rate, and rates differ by parameter and by row: what one call, all rates 1,
+        # does to zeros is cut to size here.
+        sizes = [value.numel() for value in values.values()]
+        flat = values["means"].new_zeros(sum(sizes)).split(sizes)
+        moves = {name: part.view_as(values[name]) for name, part in zip(values, flat, strict=True)}
+        adam(
+            list(moves.values()), *([group[name] for name in values] for group in (gradients, first, second)), [],
+            list(values["means"].new_full((len(values),), step.number - 1).unbind()),
+            fused=True, amsgrad=False, maximize=False, beta1=0.9, beta2=0.999, weight_decay=0.0, eps=EPSILON, lr=1.0,
+        )  # fmt: skip
+        rates = step.rates
+        for name in ("quaternions", "log_scales", "opacity_logits"):
+            values[name].add_(moves[name], alpha=rates[name])
+        values["means"].addcmul_(moves["means"], rates["means"][:, None])
         # Colours above `step.sh_degree` have neither gradient nor momentum, and so stay.
-        rates["sh"] = torch.full_like(values["sh"][:1, :, :1], rates["sh_rest"])
-        rates["sh"][:, 0] = step.rates["sh"]
-        for name, value in values.items():
-            rate = rates[name]
-            single = not isinstance(rate, Tensor)
-            before = value if single else value.clone()
-            adam(
-                [value], [gradients[name]], [first[name]], [second[name]], [],
-                [value.new_full((), step.number - 1)],
-                fused=True, amsgrad=False, maximize=False, beta1=0.9, beta2=0.999, weight_decay=0.0, eps=EPSILON,
-                lr=rate if single else 1.0,
-            )  # fmt: skip
-            # A step of Adam is as long as its rate: where rows have rates of their own, it is cut to size here.
-            if not single:
-                torch.lerp(before, value, rate, out=value)
+        values["sh"][:, :1].add_(moves["sh"][:, :1], alpha=rates["sh"])
+        if values["sh"].shape[1] > 1:
+            values["sh"][:, 1:].add_(moves["sh"][:, 1:], alpha=rates["sh_rest"])
 
     def strongest(self, values: Values, target: _Target) -> Tensor:
         with torch.no_grad():
@@ -171,25 +239,34 @@ class TorchBackend:
         )
 
 
-def _depth_error(alpha: Tensor, depth: Tensor, target: _Target, weights: Weights) -> Tensor:
-    if not weights.inverse_depth:
-        return (depth / target.depth - alpha).abs()
-    shown = depth > 0  # where nothing is, a division would put NaN into the gradient
-    return (torch.where(shown, alpha * alpha / torch.where(shown, depth, 1), 0) - 1 / target.depth).abs()
+def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, list[tuple[Tensor, Tensor | None]]]:
+    """The loss of a view, and each differentiable image with the gradient towards it, None where it is zero.
 
-
-def _color_loss(image: Tensor, photo: _Photo | None, ssim_weight: float) -> Tensor:
-    if photo is None:
-        return image.sum() * 0
-    x, y = torch.where(photo.counts, _planes(image), 0), photo.image
-    loss = (1 - ssim_weight) * (photo.share * (x - y).abs()).sum()
-    if ssim_weight == 0:
-        return loss
-    mean, squares, products = _blur(torch.stack([x, x * x, x * y]))
-    both, covariance = mean * photo.mean, products - mean * photo.mean
-    top = (2 * both + _C1) * (2 * covariance + _C2)
-    bottom = (mean * mean + photo.mean * photo.mean + _C1) * (squares - mean * mean + photo.variance + _C2)
-    return loss + ssim_weight * (1 - (photo.share * top / bottom).sum())
+    l = l_RGB + w_mask l_mask (Split&Splat, Eq. 5), with the losses of alpha and depth: see `losses.surface`.
+    """
+    towards_rgb = towards_labels = None
+    off = out.alpha - target.inside
+    towards_alpha = off.sign().mul_(weights.alpha * target.judged)
+    loss = torch.dot(towards_alpha.flatten(), off.flatten())
+    if target.photo is not None:
+        color, towards_rgb = target.photo.compare(out.rgb, weights.ssim)
+        loss += color
+    if weights.inverse_depth:
+        shown = out.depth > 0  # where nothing is, a division would put NaN into the gradient
+        share = torch.where(shown, out.alpha / torch.where(shown, out.depth, 1), 0)
+        off, by_alpha, by_depth = share * out.alpha - target.inverse_depth, 2 * share, -share * share
+    else:
+        by_alpha, by_depth = -1, target.inverse_depth
+        off = out.depth * by_depth - out.alpha
+    slope = off.sign().mul_(weights.depth * target.known)
+    loss += torch.dot(slope.flatten(), off.flatten())
+    towards_alpha += slope * by_alpha
+    if target.labelled is not None and len(out.label_masks):
+        off = out.label_masks - target.one_hot
+        towards_labels = off.sign().mul_(weights.mask * target.labelled)
+        loss += torch.dot(towards_labels.flatten(), off.flatten())
+    towards = (towards_rgb, towards_alpha, slope * by_depth, towards_labels)
+    return loss, list(zip((out.rgb, out.alpha, out.depth, out.label_masks), towards, strict=True))
 
 
 def _planes(image: Tensor) -> Tensor:
@@ -197,11 +274,10 @@ def _planes(image: Tensor) -> Tensor:
     return image.permute(2, 0, 1)[:, None]
 
 
-def _blur(images: Tensor) -> Tensor:
+def _blur(images: Tensor, tap: Tensor) -> Tensor:
     """[I, 3, 1, h, w] through the Gaussian window of SSIM, zeros beyond the border."""
-    x = torch.arange(-_RADIUS, _RADIUS + 1, dtype=images.dtype, device=images.device)
-    tap = torch.exp(-(x**2) / (2 * _SIGMA**2))
-    tap = tap / tap.sum()
-    planes = images.flatten(0, 1)
-    across = torch.nn.functional.conv2d(planes, tap.view(1, 1, 1, -1), padding=(0, _RADIUS))
-    return torch.nn.functional.conv2d(across, tap.view(1, 1, -1, 1), padding=(_RADIUS, 0)).reshape(images.shape)
+    planes = images.flatten(0, 2)[None]  # as channels that do not mix, for which CUDA has a fast kernel
+    count = planes.shape[1]
+    across, down = tap.expand(count, 1, 1, -1), tap.view(-1, 1).expand(count, 1, -1, 1)
+    blurred = torch.nn.functional.conv2d(planes, across, padding=(0, _RADIUS), groups=count)
+    return torch.nn.functional.conv2d(blurred, down, padding=(_RADIUS, 0), groups=count).view(images.shape)

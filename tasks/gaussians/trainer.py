@@ -27,6 +27,9 @@ from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonN
 
 CHECKPOINT_SECONDS = 60.0
 """How much work a kill may cost."""
+SMALL = 200 * 200
+"""Pixels of a view: where they have fewer in the mean, a step takes a core less time than a device needs to start its
+kernels, which is three milliseconds whatever the size (docs/device.md)."""
 
 
 class TrainingDiverged(RuntimeError):
@@ -107,8 +110,8 @@ def train(
     extent: size of what is trained, world units, or [N] of what each Gaussian is part of: scales the learning rate of
     the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. parts: what some rows of
     `initial` should look like alone, with `part_weight`, where nothing is cloned or split. backend: where it happens;
-    by default, that of `device_here`. On the CPU the number of threads changes no byte, and neither does a kill: a
-    later try goes on from the last checkpoint.
+    by default, that of `device_here` where views are large, else the CPU. On the CPU the number of threads changes no
+    byte, and neither does a kill: a later try goes on from the last checkpoint.
     Raises ValueError when there are no views or Gaussians, an array does not fit its camera, or rows of parts would
     move, TrainingDiverged when numbers blow up. The result has no Gaussians when all were pruned.
     """
@@ -127,9 +130,15 @@ def train(
             raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {value!r}")
     if parts and params.densify != "none":
         raise ValueError("views of parts need Gaussians whose rows stay, so densify must be none")
-    backend = backend or backend_for(device_here(), cores())
+    backend = backend or backend_for(_device(views), cores())
     with backend.stream():
         return _Training(initial, views, params, extents, seed, label_ids, parts, backend).run()
+
+
+def _device(views: Sequence[TrainView]) -> str:
+    """Where a training of these views is fastest."""
+    here = device_here()
+    return "cpu" if sum(view.camera.width * view.camera.height for view in views) < SMALL * len(views) else here
 
 
 class _Training:
@@ -148,7 +157,7 @@ class _Training:
     ) -> None:
         num_labels = len(label_ids) if params.mask_weight else 0
         self._initial, self._params, self._num_labels, self._backend = initial, params, num_labels, backend
-        self._views, self._there = views, backend.targets(Targets(views, params.objective, num_labels))
+        self._there = backend.targets(Targets(views, params.objective, num_labels))
         self._parts = (
             [(slice(p.start, p.stop), backend.target(p.target, 0)) for p in parts] if params.part_weight else []
         )
@@ -169,6 +178,7 @@ class _Training:
         self._longest = backend.put(longest)
         self._control = _control(params, GradientRecord(len(initial), backend), float(extents.max()))
         self.step = 0
+        self._pixels = [int(np.count_nonzero(params.objective.counted(view))) for view in views]
         self._losses = backend.put(np.zeros(params.iterations, np.float32))
         self._order: list[int] = []
 
@@ -195,7 +205,7 @@ class _Training:
         """One step: render a view, compare, go down the gradient, mind the number of Gaussians."""
         params, parameters = self._params, self.parameters
         if not self._order:
-            self._order = self._generator.permutation(len(self._views)).tolist()
+            self._order = self._generator.permutation(len(self._pixels)).tolist()
         view = self._order.pop()
         done_share = self.step / max(params.iterations - 1, 1)
         self.step += 1
@@ -215,8 +225,7 @@ class _Training:
         if params.max_scale:
             parameters.limit_scale(self._longest[parameters.origin])
         if self._control is not None:
-            pixels = int(np.count_nonzero(params.objective.counted(self._views[view])))
-            seen = Seen(found.gradients["centers"], found.radii, pixels)
+            seen = Seen(found.gradients["centers"], found.radii, self._pixels[view])
             self._control.after(self.step, parameters, seen, self._generator)
 
     def _towards_parts(self, settings: Settings) -> Iterator[tuple[slice, Values]]:

@@ -2,11 +2,15 @@
 
     python tests/bench/bench_device.py                                            # on CUDA: 100k Gaussians, 1920x1080
     python tests/bench/bench_device.py --device cpu --gaussians 500 --size 64x48  # the same code, without a GPU
+    python tests/bench/bench_device.py --growth                                   # from which size a device pays
 
 Ours: `train` on the torch backend: colour, alpha and depth, its own Adam, nothing checked from step to step. The plain
 loop: six parameters with a fused `torch.optim.Adam` each, gsplat's `rasterization` and `DefaultStrategy` (which
 densifies nothing in so few steps), L1 + SSIM by torchmetrics. On torch's CPU device the native rasterizer stands in
 for gsplat's, and no figure of it says anything about a GPU.
+
+--growth: trainings of growing size on the device and on the CPU, alone, and four side by side as a run has them: the
+steps of all together.
 """
 
 from __future__ import annotations
@@ -15,12 +19,14 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
 
 from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.gaussians.backends import Backend, NativeBackend
 from ss_flow.tasks.gaussians.initialise import initialise, with_sh_degree
 from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, rasterize
@@ -31,6 +37,8 @@ from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
 
 RATES = LearningRates()
+GROWTH = ((500, 64, 48), (1_000, 96, 96), (3_000, 160, 120), (10_000, 320, 240), (50_000, 640, 480))
+SIDE_BY_SIDE = 4
 NAMES = {"means": "means", "scales": "log_scales", "quats": "quaternions", "opacities": "opacity_logits"}
 
 
@@ -52,7 +60,7 @@ def scene(count: int, width: int, height: int, degree: int) -> tuple[Gaussians, 
     return with_sh_degree(Gaussians(**{**vars(cloud), "sh": grey}), degree), views
 
 
-def ours(initial: Gaussians, views: list[TrainView], steps: int, device: str) -> float:
+def ours(initial: Gaussians, views: list[TrainView], steps: int, backend: Backend) -> float:
     """Steps a second, the first 50 left out."""
     times = []
 
@@ -61,7 +69,7 @@ def ours(initial: Gaussians, views: list[TrainView], steps: int, device: str) ->
 
     params = TrainParams(iterations=50 + steps, densify="none", prune_opacity=0.0, prune_contribution=0.0)
     with running(Surroundings(note)):
-        train(initial, views, params=params, extent=2.0, seed=0, backend=TorchBackend(device))
+        train(initial, views, params=params, extent=2.0, seed=0, backend=backend)
     (first, begun), (last, ended) = times[0], times[-1]
     return (last - first) / (ended - begun)
 
@@ -97,6 +105,29 @@ def plain(initial: Gaussians, views: list[TrainView], steps: int, device: str) -
         after(step, info)
     _wait(device)
     return steps / (time.perf_counter() - begun)
+
+
+def growth(steps: int, degree: int, device: str) -> None:
+    """Print a table of steps a second by size."""
+    ways: dict[str, tuple[int, Callable[[], Backend]]] = {
+        device: (1, lambda: TorchBackend(device)),
+        f"{device}, {SIDE_BY_SIDE} at once": (SIDE_BY_SIDE, lambda: TorchBackend(device)),
+        "CPU, 1 thread": (1, lambda: NativeBackend(1)),
+        f"CPU, {SIDE_BY_SIDE} at once": (SIDE_BY_SIDE, lambda: NativeBackend(1)),
+        f"CPU, {SIDE_BY_SIDE} threads": (1, lambda: NativeBackend(SIDE_BY_SIDE)),
+    }
+    print(f"| Gaussians, picture | {' | '.join(ways)} |\n|---{'|---' * len(ways)}|")
+    for count, width, height in GROWTH:
+        initial, views = scene(count, width, height, degree)
+
+        def rate(make: Callable[[], Backend], initial=initial, views=views) -> float:
+            return ours(initial, views, steps, make())
+
+        row = []
+        for many, make in ways.values():
+            with ThreadPoolExecutor(many) as pool:
+                row.append(sum(pool.map(rate, [make] * many)))
+        print(f"| {count}, {width}x{height} | {' | '.join(f'{r:.0f}' for r in row)} |", flush=True)
 
 
 def _with_gsplat(params: dict, optimizers: dict, device: str) -> tuple[Callable, Callable]:
@@ -142,15 +173,22 @@ def main() -> None:
     parser.add_argument("--degree", type=int, default=0, help="of the colours, 0 to 3")
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--growth", action="store_true", help="trainings of growing size, on the device and on the CPU")
     asked = parser.parse_args()
     width, height = map(int, asked.size.split("x"))
     name = torch.cuda.get_device_name() if asked.device == "cuda" else "torch's CPU device, the native rasterizer"
-    print(f"{name}; torch {torch.__version__}; {asked.gaussians} Gaussians, {asked.size}, degree {asked.degree}")
+    print(
+        f"{name}; torch {torch.__version__}"
+        + ("" if asked.growth else f"; {asked.gaussians} Gaussians, {asked.size}, degree {asked.degree}")
+    )
+    if asked.growth:
+        growth(asked.steps, asked.degree, asked.device)
+        return
     initial, views = scene(asked.gaussians, width, height, asked.degree)
     rates: dict[str, list[float]] = {"ours": [], "plain": []}
     for _ in range(asked.turns):
-        for way, measured in ((ours, rates["ours"]), (plain, rates["plain"])):
-            measured.append(way(initial, views, asked.steps, asked.device))
+        rates["ours"].append(ours(initial, views, asked.steps, TorchBackend(asked.device)))
+        rates["plain"].append(plain(initial, views, asked.steps, asked.device))
     for way, measured in rates.items():
         print(f"{way:6} {statistics.median(measured):8.1f} steps a second ({', '.join(f'{r:.1f}' for r in measured)})")
     print(f"ours / plain: {statistics.median(a / b for a, b in zip(*rates.values(), strict=True)):.2f}")

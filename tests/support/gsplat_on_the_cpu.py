@@ -97,15 +97,19 @@ def rasterize_to_pixels(
     means2d, conics, colors, opacities, image_width, image_height, tile_size, isect_offsets, flatten_ids,
     backgrounds=None, masks=None, packed=False, absgrad=False,
 ):  # fmt: skip
-    assert colors.shape[:2] == means2d.shape[:2] and colors.shape[2] in KERNELS and backgrounds is None
+    assert colors.shape[:2] == means2d.shape[:2] and colors.shape[2] in KERNELS
     rows = flatten_ids[: means2d.shape[1]].long()
     alpha = _alphas(means2d, conics, opacities, rows, image_width, image_height)
     left = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], dim=1)
     weight = torch.where(left > END, before * alpha, 0)
+    opaque = weight.sum(dim=1, keepdim=True)
     images = weight @ torch.nan_to_num(colors[0, rows])  # of weight 0
+    if backgrounds is not None:
+        assert backgrounds.shape == (1, colors.shape[2])
+        images = images + (1 - opaque) * backgrounds
     size = (1, image_height, image_width)
-    return images.reshape(*size, -1), weight.sum(dim=1).reshape(*size, 1)
+    return images.reshape(*size, -1), opaque.reshape(*size, 1)
 
 
 def rasterize_to_indices_in_range(

@@ -230,10 +230,11 @@ def test_renderings_by_torch_are_the_native_ones(monkeypatch, label_ids):
         values["means"], np.zeros((120, 3), np.uint8), np.take([4, 9, 2, 11], labels % 4), 1.0, opacity=0.6
     )
     made = replace(made, sh=values["sh"], quaternions=values["quaternions"])
+    drawing = sys.modules[render.__module__]
+    monkeypatch.setattr(drawing, "_device", lambda gaussians: "cpu")
     expected = render(made, target.camera, background=(0.1, 0.2, 0.3), label_ids=label_ids)
     ids = np.random.default_rng(0).integers(-1, 5, expected.alpha.shape)
     weights = dict(weights_by_id(made, target.camera, ids))
-    drawing = sys.modules[render.__module__]
     monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))  # torch's, not "cpu", the native one
     found = render(made, target.camera, background=(0.1, 0.2, 0.3), label_ids=label_ids)
     for name, image in expected._asdict().items():
@@ -336,6 +337,21 @@ def test_a_training_by_torch_repeats_to_the_byte_and_goes_on_after_a_kill(tmp_pa
     for name in PARAMETERS:
         assert getattr(resumed.gaussians, name).tobytes() == getattr(alone.gaussians, name).tobytes()
     assert resumed.loss.tobytes() == alone.loss.tobytes()
+
+
+def test_targets_that_would_fill_the_device_are_carried_there_step_by_step(monkeypatch):
+    params = TrainParams(iterations=40, densify="none")
+    alone = trained(TorchBackend("cpu"), params)
+    full = TorchBackend("cpu")
+    monkeypatch.setattr(full, "_room", lambda: 1000)
+    carried = []
+    put = full.target
+    monkeypatch.setattr(full, "target", lambda target, labels: carried.append(target) or put(target, labels))
+    again = trained(full, params)
+    assert len(carried) >= params.iterations
+    assert again.loss.tobytes() == alone.loss.tobytes()
+    for name in PARAMETERS:
+        assert getattr(again.gaussians, name).tobytes() == getattr(alone.gaussians, name).tobytes()
 
 
 def test_a_training_by_torch_keeps_no_tensor():

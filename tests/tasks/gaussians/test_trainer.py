@@ -11,6 +11,7 @@ import pytest
 
 from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Gaussians
+from ss_flow.tasks.gaussians import trainer
 from ss_flow.tasks.gaussians.backends import NativeBackend
 from ss_flow.tasks.gaussians.densification import (
     REFERENCE_ROWS,
@@ -32,6 +33,12 @@ from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
 
 SIZE = 48
+
+
+@pytest.fixture
+def native(monkeypatch):
+    """Train on the CPU wherever the tests run: only there the same inputs give the same bytes."""
+    monkeypatch.setattr(trainer, "device_here", lambda: "cpu")
 
 
 def camera_round(angle: float) -> Camera:
@@ -95,7 +102,7 @@ def test_training_finds_colours_shape_and_depth_of_a_ball():
     assert np.allclose(np.linalg.norm(result.gaussians.quaternions, axis=1), 1, atol=1e-5)
 
 
-def test_threads_beside_it_do_not_change_a_byte():
+def test_threads_beside_it_do_not_change_a_byte(native):
     params = TrainParams(iterations=60)
     alone = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1)
     found = {}
@@ -137,7 +144,7 @@ def test_the_mask_loss_gives_pixels_back_to_their_instance():
 
 
 @pytest.mark.parametrize("background", ["random", "black"])
-def test_ignored_pixels_do_not_count(background):
+def test_ignored_pixels_do_not_count(native, background):
     noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
     views = [replace(v, free=np.zeros_like(v.free)) for v in VIEWS]
     disturbed = [replace(v, image=np.where(v.inside[..., None], v.image, noise)) for v in views]
@@ -146,7 +153,7 @@ def test_ignored_pixels_do_not_count(background):
     assert a.gaussians.means.tobytes() == b.gaussians.means.tobytes()
 
 
-def test_on_black_photos_colour_counts_where_nothing_may_be_seen_and_the_photo_does_not():
+def test_on_black_photos_colour_counts_where_nothing_may_be_seen_and_the_photo_does_not(native):
     noise = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
     disturbed = [replace(v, image=np.where(v.inside[..., None], v.image, noise)) for v in VIEWS]
     blind = [replace(v, free=np.zeros_like(v.free)) for v in VIEWS]
@@ -230,6 +237,21 @@ def test_only_the_view_of_the_step_is_laid_out_for_the_losses():
     params = TrainParams(iterations=2 * len(VIEWS))
     train(ball_points(), VIEWS, params=params, extent=1.6, seed=1, backend=Watching(1))
     assert len(laid_out) == params.iterations
+
+
+def test_small_views_are_trained_on_the_cpu_and_large_ones_on_the_device(monkeypatch):
+    asked = []
+    monkeypatch.setattr(trainer, "device_here", lambda: "cuda")
+    monkeypatch.setattr(trainer, "backend_for", lambda device, threads: asked.append(device) or NativeBackend(threads))
+    for side in (199, 200):
+        view = ball_view(0.0)
+        camera = replace(view.camera, width=side, height=side)
+        blank = np.zeros((side, side), bool)
+        large = TrainView(
+            camera, np.zeros((side, side, 3), np.float32), ~blank, blank, np.zeros(blank.shape, np.float32)
+        )
+        train(ball_points(), [large], params=TrainParams(iterations=1), extent=1.6, seed=1)
+    assert asked == ["cpu", "cuda"]
 
 
 def test_bad_input_is_refused():
@@ -461,7 +483,7 @@ def test_the_mismatch_is_the_absolute_error_of_all_label_masks():
         assert np.allclose(a[name], b[name], atol=1e-5), name
 
 
-def test_the_number_of_threads_changes_no_byte():
+def test_the_number_of_threads_changes_no_byte(native):
     params = TrainParams(iterations=240)
     trained = []
     for cores in (1, 2, 3):
@@ -477,7 +499,7 @@ def test_the_number_of_threads_changes_no_byte():
 
 
 @pytest.mark.parametrize("strategy", ["classic", "none"])
-def test_a_training_that_was_interrupted_goes_on_to_the_same_bytes(strategy, tmp_path):
+def test_a_training_that_was_interrupted_goes_on_to_the_same_bytes(native, strategy, tmp_path):
     params = TrainParams(iterations=320, densify=strategy, part_weight=0.1, parts_per_step=2)
     parts = [part_view(0, 200, angle) for angle in (0.3, 0.9, 1.8)] if strategy == "none" else []
     alone = train(ball_points(), VIEWS, params=params, extent=1.6, seed=1, parts=parts)
@@ -512,7 +534,7 @@ def part_view(start: int, stop: int, angle: float) -> PartView:
     return PartView(start, stop, Target.of(empty, Objective(), 0))
 
 
-def test_what_no_photo_shows_goes_where_it_is_seen_alone_from_the_side():
+def test_what_no_photo_shows_goes_where_it_is_seen_alone_from_the_side(native):
     ball, behind = ball_points(), np.array([[0, 0, 1.3]], np.float32)
     hidden = initialise(np.repeat(behind, 5, axis=0), np.zeros((5, 3), np.uint8), 4, 0.5, opacity=0.9)
     hidden = replace(hidden, log_scales=np.full((5, 3), np.log(0.1), np.float32))
