@@ -213,10 +213,11 @@ class TorchBackend:
         sizes = [value.numel() for value in values.values()]
         flat = values["means"].new_zeros(sum(sizes)).split(sizes)
         moves = {name: part.view_as(values[name]) for name, part in zip(values, flat, strict=True)}
+        towards, means, squares = ([group[name] for name in values] for group in (gradients, first, second))
+        numbers = list(values["means"].new_full((len(values),), step.number - 1).unbind())
         adam(
-            list(moves.values()), *([group[name] for name in values] for group in (gradients, first, second)), [],
-            list(values["means"].new_full((len(values),), step.number - 1).unbind()),
-            fused=True, amsgrad=False, maximize=False, beta1=0.9, beta2=0.999, weight_decay=0.0, eps=EPSILON, lr=1.0,
+            list(moves.values()), towards, means, squares, [], numbers, fused=True, amsgrad=False, maximize=False,
+            beta1=0.9, beta2=0.999, weight_decay=0.0, eps=EPSILON, lr=1.0,
         )  # fmt: skip
         rates = step.rates
         for name in ("quaternions", "log_scales", "opacity_logits"):
@@ -251,13 +252,14 @@ def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, lis
     if target.photo is not None:
         color, towards_rgb = target.photo.compare(out.rgb, weights.ssim)
         loss += color
+    by_alpha: Tensor | int = -1
+    by_depth = target.inverse_depth
     if weights.inverse_depth:
         shown = out.depth > 0  # where nothing is, a division would put NaN into the gradient
         share = torch.where(shown, out.alpha / torch.where(shown, out.depth, 1), 0)
         off, by_alpha, by_depth = share * out.alpha - target.inverse_depth, 2 * share, -share * share
     else:
-        by_alpha, by_depth = -1, target.inverse_depth
-        off = out.depth * by_depth - out.alpha
+        off = out.depth * target.inverse_depth - out.alpha
     slope = off.sign().mul_(weights.depth * target.known)
     loss += torch.dot(slope.flatten(), off.flatten())
     towards_alpha += slope * by_alpha
