@@ -23,10 +23,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians import library as native
 from ss_flow.tasks.gaussians import native_pass
+from ss_flow.tasks.gaussians.backends import NativeBackend
 from ss_flow.tasks.gaussians.library import Workspace
 from ss_flow.tasks.gaussians.native_pass import NativePass, Settings
 from ss_flow.tasks.gaussians.render import render
@@ -187,10 +187,11 @@ def training_scene(n: int, side: tuple[int, int], labels: int) -> tuple[Gaussian
 def steps_a_second(n: int, side: tuple[int, int], labels: int, threads: int, iterations: int = 300) -> float:
     start, views = training_scene(n, side, labels)
     params = TrainParams(iterations=iterations, sh_degree=0, densify="none", mask_weight=1.0 if labels else 0.0)
-    with running(Surroundings(cores=threads)):
-        began = time.perf_counter()
-        train(start, views, params=params, extent=4.0, seed=0, label_ids=range(1, labels + 1))
-        return iterations / (time.perf_counter() - began)
+    began = time.perf_counter()
+    train(
+        start, views, params=params, extent=4.0, seed=0, label_ids=range(1, labels + 1), backend=NativeBackend(threads)
+    )
+    return iterations / (time.perf_counter() - began)
 
 
 def training() -> None:
@@ -213,7 +214,7 @@ def small_trainings() -> None:
     params = TrainParams(iterations=300, sh_degree=0)
 
     def one(seed: int) -> None:
-        train(start, views, params=params, extent=4.0, seed=seed)
+        train(start, views, params=params, extent=4.0, seed=seed, backend=NativeBackend(1))
 
     seconds = {}
     for workers in (1, 2):
