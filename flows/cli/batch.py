@@ -41,8 +41,8 @@ from ss_flow.flows.cli.telling import hits_of, plan_in_words, print_table, would
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.measures import measures
 from ss_flow.flows.params import Params
+from ss_flow.tasks.capture.names import capture_name, named_after
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.capture.scene_files import capture_name, named_after
 from ss_flow.tasks.deliver.output import check_writable
 from ss_flow.tasks.deliver.places import RESULT, check_outside, check_replaceable
 

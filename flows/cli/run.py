@@ -21,8 +21,9 @@ from ss_flow.flows.cli.prepare import RunOptions, display, finish, prepare, tell
 from ss_flow.flows.cli.telling import hits_of, print_table, would_run
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.flows.params import Params
+from ss_flow.tasks.capture.names import capture_name
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.capture.scene_files import SceneFiles, capture_name
+from ss_flow.tasks.capture.scene_files import SceneFiles
 from ss_flow.tasks.deliver.places import RESULT, check_outside, check_replaceable
 from ss_flow.tasks.gaussians.read_ply import read_columns
 

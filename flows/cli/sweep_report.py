@@ -17,7 +17,7 @@ from ss_flow.cache.files import write_atomically
 from ss_flow.flows.cli.telling import plan_in_words, print_table, would_run
 from ss_flow.flows.measures import HEADLINE
 from ss_flow.sweep import Row
-from ss_flow.tasks.capture.scene_files import named_after
+from ss_flow.tasks.capture.names import named_after
 
 Document = Mapping[str, Any]
 """A row of sweep.json."""

@@ -16,7 +16,7 @@ from ss_flow.flows.cli.context import InStore, PositionalPath, StoreOptions, con
 from ss_flow.flows.cli.inspect import named, not_latest, runs_to_ask
 from ss_flow.runs import DONE, PreviousKeys, Run, latest_runs
 from ss_flow.sweep import scene_of
-from ss_flow.tasks.capture.scene_files import natural_key
+from ss_flow.tasks.capture.names import natural_key
 from ss_flow.tasks.words import first_of
 
 _ITEMS = 8

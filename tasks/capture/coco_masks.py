@@ -15,7 +15,8 @@ from ss_flow.task import FileRef, Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Frame, MaskSet
 from ss_flow.tasks.capture.id_images import frame_pixels
 from ss_flow.tasks.capture.lens import Lens
-from ss_flow.tasks.capture.scene_files import finder, is_number, read_json
+from ss_flow.tasks.capture.names import finder
+from ss_flow.tasks.capture.scene_files import is_number, read_json
 from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.words import first_of
 
@@ -37,7 +38,7 @@ def coco_masks(
     """The masks of a COCO instance file, for each frame; those of one view may overlap.
 
     names, lenses: of the capture's views. An image of the file is the view that has its file name's stem, or its
-    path where views are called so (`scene_files.view_names`); a view that the file does not list has no masks. Crowd
+    path where views are called so (`names.view_names`); a view that the file does not list has no masks. Crowd
     regions, which stand for many objects at once, are left out. The masks come in canonical order; `predicted_iou` is
     what the file gives as `predicted_iou` or `score`, else 1.
 

@@ -12,7 +12,8 @@ from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Clicks, Float64, Frame
 from ss_flow.tasks.capture.lens import Lens, photo_lens, undistorted
-from ss_flow.tasks.capture.scene_files import Hint, Hints, Point, finder, is_number, read_json
+from ss_flow.tasks.capture.names import finder
+from ss_flow.tasks.capture.scene_files import Hint, Hints, Point, is_number, read_json
 from ss_flow.tasks.words import first_of
 
 

@@ -12,16 +12,8 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float32, Float64
 from ss_flow.tasks.capture.lens import Lens
-from ss_flow.tasks.capture.scene_files import (
-    Pose,
-    SceneFiles,
-    check_lens,
-    check_rigid,
-    files_in,
-    natural_key,
-    read_text,
-    view_names,
-)
+from ss_flow.tasks.capture.names import natural_key, view_names
+from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, check_lens, check_rigid, files_in, read_text
 
 _MODELS: tuple[tuple[str, int], ...] = (
     ("SIMPLE_PINHOLE", 3),

@@ -12,17 +12,9 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
+from ss_flow.tasks.capture.names import natural_key, view_names
 from ss_flow.tasks.capture.photo_files import header_size
-from ss_flow.tasks.capture.scene_files import (
-    OPENGL_TO_OPENCV,
-    Pose,
-    SceneFiles,
-    check_lens,
-    natural_key,
-    read_text,
-    rigid_inverse,
-    view_names,
-)
+from ss_flow.tasks.capture.scene_files import OPENGL_TO_OPENCV, Pose, SceneFiles, check_lens, read_text, rigid_inverse
 from ss_flow.tasks.geometry.cameras import Camera
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")

@@ -8,15 +8,14 @@ import numpy as np
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
+from ss_flow.tasks.capture.names import by_stem, natural_key
 from ss_flow.tasks.capture.scene_files import (
     OPENGL_TO_OPENCV,
     Pose,
     SceneFiles,
-    by_stem,
     check_lens,
     files_in,
     is_number,
-    natural_key,
     read_json,
     rigid_inverse,
 )

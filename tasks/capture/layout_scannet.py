@@ -11,11 +11,11 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.lens import Lens
+from ss_flow.tasks.capture.names import by_stem
 from ss_flow.tasks.capture.scene_files import (
     NO_POSE,
     Pose,
     SceneFiles,
-    by_stem,
     check_lens,
     files_in,
     read_matrix,

@@ -12,7 +12,8 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.layout_colmap import pose_matrix
 from ss_flow.tasks.capture.lens import Lens
-from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, by_stem, check_lens, files_in, read_text, rigid_inverse
+from ss_flow.tasks.capture.names import by_stem
+from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, check_lens, files_in, read_text, rigid_inverse
 from ss_flow.tasks.capture.upright import upright
 from ss_flow.tasks.geometry.cameras import centers_of
 

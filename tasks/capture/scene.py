@@ -16,6 +16,7 @@ from ss_flow.tasks.capture.layout_replica import is_replica, open_replica
 from ss_flow.tasks.capture.layout_scannet import is_scannet, open_scannet, open_sens
 from ss_flow.tasks.capture.layout_stray import is_stray, open_stray
 from ss_flow.tasks.capture.layout_tum import open_tum
+from ss_flow.tasks.capture.names import by_name, finder, spelt
 from ss_flow.tasks.capture.scene_files import (
     HEIC_SUFFIXES,
     PHOTO_SUFFIXES,
@@ -23,11 +24,8 @@ from ss_flow.tasks.capture.scene_files import (
     UNREAD_SUFFIXES,
     VIDEO_SUFFIXES,
     SceneFiles,
-    by_name,
     files_in,
-    finder,
     read_json,
-    spelt,
 )
 
 ACCEPTED = (

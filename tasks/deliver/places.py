@@ -15,7 +15,7 @@ from typing import Any
 from ss_flow.cache.files import UNFINISHED
 from ss_flow.cache.location import is_url
 from ss_flow.errors import InputError
-from ss_flow.tasks.capture.scene_files import spelt
+from ss_flow.tasks.capture.names import spelt
 from ss_flow.tasks.deliver.output import OWN_FILES, OWN_FOLDERS, RUN_FILE, check_place, replacing
 
 _LITTER = re.compile(rf"\.DS_Store|Thumbs\.db|desktop\.ini|\._.*|{UNFINISHED.pattern}")

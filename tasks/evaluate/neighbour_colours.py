@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import ColourTransform, Float32, Float64, Gaussians
-from ss_flow.tasks.capture.scene_files import natural_key
+from ss_flow.tasks.capture.names import natural_key
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import size_within
 

@@ -16,8 +16,8 @@ from ss_flow.errors import InputError
 from ss_flow.task import FileRef
 from ss_flow.tasks.capture import ingest
 from ss_flow.tasks.capture.layout_colmap import read_points
+from ss_flow.tasks.capture.names import capture_name, natural_key
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.capture.scene_files import capture_name, natural_key
 
 SHARED = Path(__file__).parents[3] / ".." / "shared" / "data"
 WORLD_TO_CAMERA = np.stack([np.linalg.inv(made.pose(i)) for i in range(3)])
