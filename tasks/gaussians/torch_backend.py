@@ -188,7 +188,10 @@ class TorchBackend:
 
     def _room(self) -> int:
         """Bytes that targets may take: a training shares the device with others."""
-        return torch.cuda.mem_get_info(self._device)[0] // 4 if self._device.type == "cuda" else sys.maxsize
+        if self._device.type != "cuda":
+            return sys.maxsize
+        kept = torch.cuda.memory_reserved(self._device) - torch.cuda.memory_allocated(self._device)  # of trainings past
+        return (torch.cuda.mem_get_info(self._device)[0] + kept) // 4
 
     def descent(
         self, values: Values, labels: Tensor | None, target: _Target, settings: Settings, weights: Weights
