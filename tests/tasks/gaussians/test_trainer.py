@@ -1,4 +1,4 @@
-"""Training on a generated ball, and the rules around it."""
+"""Training on a generated ball, and what counts in it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,10 @@ from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.gaussians import trainer
 from ss_flow.tasks.gaussians.backends import NativeBackend
-from ss_flow.tasks.gaussians.densification import (
-    REFERENCE_ROWS,
-    AdaptiveControl,
-    GradientRecord,
-    Schedule,
-    Seen,
-    densify,
-    rotations,
-)
-from ss_flow.tasks.gaussians.initialise import concatenate, initialise, laid_flat, select, with_sh_degree
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
-from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import PartView, TrainingDiverged, TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
@@ -75,10 +65,6 @@ def ball_points(n: int = 300):
     points = np.random.default_rng(0).normal(size=(n, 3))
     points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
     return initialise(points.astype(np.float32), (255 * color_at(points)).astype(np.uint8), 4, 0.5)
-
-
-def three_gaussians() -> Gaussians:
-    return initialise(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8), 1, 1.0)
 
 
 def same_bytes(a: Gaussians, b: Gaussians) -> bool:
@@ -282,70 +268,6 @@ def test_a_loss_that_is_not_finite_is_told_with_its_step_wherever_training_ends(
         train(ball_points(), VIEWS, params=params, extent=1.6, seed=0, backend=Broken(1))
 
 
-def test_large_gaussians_are_split_and_small_ones_cloned():
-    points = three_gaussians()
-    parameters = {"means": points.means, "quaternions": points.quaternions, "log_scales": points.log_scales.copy()}
-    parameters["log_scales"][0] = np.log(0.001)
-    values, source, fresh = densify(
-        parameters, np.array([1.0, 1.0, 0.0]), threshold=0.5, extent=1.0, most=10, generator=np.random.default_rng(0),
-        backend=NativeBackend(1),
-    )  # fmt: skip
-    assert source.tolist() == [0, 2, 0, 1, 1] and fresh.tolist() == [False, False, True, True, True]
-    assert np.array_equal(values["means"][2], points.means[0])
-    assert np.allclose(np.exp(values["log_scales"][3:]), np.exp(points.log_scales[1]) / 1.6)
-    assert not np.array_equal(values["means"][3], values["means"][4])
-
-
-@pytest.mark.parametrize(("most", "sources"), [(8, [0, 1, 2, 3, 4, 5, 1, 3]), (4, [0, 1, 2, 3, 4, 5])])
-def test_densification_ends_at_the_limit_with_the_largest_gradients_first(most, sources):
-    points = initialise(np.random.default_rng(0).random((6, 3)).astype(np.float32), np.zeros((6, 3), np.uint8), 1, 1.0)
-    parameters = {"means": points.means, "quaternions": points.quaternions, "log_scales": points.log_scales - 9}
-    gradient = np.array([1, 6, 2, 5, 3, 4.0])
-    _, source, _ = densify(
-        parameters, gradient, threshold=0.5, extent=1, most=most, generator=np.random.default_rng(0),
-        backend=NativeBackend(1),
-    )  # fmt: skip
-    assert source.tolist() == sources
-
-
-def test_the_halves_of_a_split_gaussian_lie_along_it_as_it_is_turned():
-    half = np.sqrt(0.5)
-    needle = {
-        "means": np.zeros((1, 3), np.float32),
-        "quaternions": np.array([[half, 0, 0, half]], np.float32),  # a quarter turn about z: x becomes y
-        "log_scales": np.log(np.array([[1, 1e-4, 1e-4]], np.float32)),
-    }
-    values, *_ = densify(
-        needle, np.ones(1), threshold=0.5, extent=1.0, most=9, generator=np.random.default_rng(0),
-        backend=NativeBackend(1),
-    )  # fmt: skip
-    away = np.abs(values["means"])
-    assert (away[:, 1] > 0.05).all() and (away[:, [0, 2]] < 1e-3).all()
-
-
-def densified(given: Gaussians, step: int, **changes) -> list[int]:
-    """Which of three Gaussians are left after a step, when they are looked at every 10, and reset every 20."""
-    backend = NativeBackend(1)
-    rules = {"threshold": 1.0, "extent": 2.0, "most": 9, "prune_opacity": 0.0, **changes}
-    control = AdaptiveControl(GradientRecord(3, backend), Schedule(0, 100, 10, 20), **rules)
-    parameters, nothing = Parameters(given, 0, backend), Seen(np.zeros((3, 2), np.float32), np.ones(3, np.float32), 1)
-    control.after(step, parameters, nothing, np.random.default_rng(0))
-    return parameters.origin.tolist()
-
-
-@pytest.mark.parametrize(("step", "kept"), [(20, [0, 1, 2]), (30, [0, 1])])
-def test_what_is_larger_than_a_tenth_of_the_scene_is_dropped_once_opacities_have_been_reset(step, kept):
-    given = three_gaussians()
-    given.log_scales[:] = np.log([[0.01], [0.19], [0.21]])
-    assert densified(given, step) == kept
-
-
-def test_what_is_faint_is_dropped_whenever_gaussians_are_cloned_and_split():
-    given = three_gaussians()
-    given.opacity_logits[:] = np.log([0.1 / 0.9, 0.01 / 0.99, 0.1 / 0.9])
-    assert densified(given, 10, prune_opacity=0.05) == [0, 2]
-
-
 @pytest.mark.parametrize(
     ("rules", "left"), [({}, 300), ({"prune_opacity": 0.02}, 290), ({"prune_contribution": 1e-9}, 280)]
 )
@@ -357,34 +279,6 @@ def test_what_is_faint_and_what_no_view_shows_are_dropped_in_the_end(rules, left
     assert len(train(ball, VIEWS, params=params, extent=1.6, seed=1).gaussians) == left
 
 
-def moving() -> Parameters:
-    """Three Gaussians, with momenta of 1 in everything."""
-    parameters = Parameters(three_gaussians(), 0, NativeBackend(1))
-    state = parameters.state()
-    parameters.restore({name: np.ones_like(a) if is_momentum(name) else a for name, a in state.items()})
-    return parameters
-
-
-def is_momentum(name: str) -> bool:
-    return name.startswith(("first.", "second."))
-
-
-def test_new_rows_start_without_momentum_and_old_ones_keep_theirs():
-    parameters, rows = moving(), np.array([2, 0, 0])
-    parameters.rearrange({n: a[rows] for n, a in parameters.values.items()}, rows, np.array([False, False, True]))
-    state = parameters.state()
-    assert state["origin"].tolist() == [2, 0, 0]
-    assert all(a[:2].all() and not a[2].any() for name, a in state.items() if is_momentum(name))
-
-
-def test_opacities_that_are_reset_lose_their_momentum_and_nothing_else_does():
-    parameters = moving()
-    parameters.limit_opacity(0.01)
-    assert parameters.opacities() == pytest.approx(0.01)
-    momenta = {name: a.any() for name, a in parameters.state().items() if is_momentum(name)}
-    assert {name for name, kept in momenta.items() if not kept} == {"first.opacity_logits", "second.opacity_logits"}
-
-
 def test_a_limit_of_none_lets_densification_go_on():
     few = select(ball_points(), np.arange(60))
     counts = [
@@ -392,68 +286,6 @@ def test_a_limit_of_none_lets_densification_go_on():
         for most in (60, 30_000, 0)
     ]
     assert counts[0] <= 60 < counts[1] == counts[2]
-
-
-def test_the_gradient_record_averages_over_the_views_that_saw():
-    record = GradientRecord(2, NativeBackend(1))
-    record.add(np.array([[3, 4], [0, 0]], np.float32), np.array([1, 0], np.float32), 2 * REFERENCE_ROWS)
-    record.add(np.array([[0, 1], [0, 2]], np.float32), np.array([1, 1], np.float32), 2 * REFERENCE_ROWS)
-    assert record.mean().tolist() == [3, 2]
-
-
-def test_a_long_training_densifies_as_3dgs_does():
-    assert Schedule().of(30_000) == Schedule(500, 15_000, 100, 3_000)
-
-
-@pytest.mark.parametrize(
-    ("stop", "reset_every", "iterations", "densified", "resets"),
-    [
-        (15_000, 3_000, 1_000, (600, 900), []),  # paper
-        (10_000, 1_000, 1_000, (600, 900), []),  # the code of its authors: the reset of step 1,000 comes too late
-        (15_000, 3_000, 10_000, (600, 9_900), [3_000, 6_000, 9_000]),  # paper, LERF
-        (10_000, 1_000, 10_000, (600, 9_900), list(range(1_000, 10_000, 1_000))),
-    ],
-)
-def test_a_schedule_that_is_not_shortened_ends_before_the_last_step(stop, reset_every, iterations, densified, resets):
-    schedule = Schedule(500, stop, 100, reset_every, shorten=False).of(iterations)
-    steps = [step for step in range(1, iterations + 1) if schedule.densifies(step)]
-    assert (steps[0], steps[-1], len(steps)) == (*densified, 1 + (densified[1] - densified[0]) // 100)
-    assert [step for step in range(1, iterations + 1) if schedule.resets(step)] == resets
-
-
-@pytest.mark.parametrize("most", [99, 120, 199, 200, 201, 1_000])
-@pytest.mark.parametrize("shorten", [True, False])
-@pytest.mark.parametrize(("every", "reset_every"), [(100, 3_000), (3_000, 100), (3_000, 4_000)])
-def test_a_schedule_that_is_not_reached_does_nothing_in_any_training_that_short(most, shorten, every, reset_every):
-    schedule = Schedule(0, every=every, reset_every=reset_every, shorten=shorten)
-    acts = [
-        schedule.of(steps).densifies(step) or schedule.of(steps).resets(step)
-        for steps in range(1, most + 1)
-        for step in range(100, steps + 1, 100)
-    ]
-    assert schedule.reached(most) or not any(acts)
-    if reset_every > every:  # a reset comes before the step after which nothing comes
-        assert schedule.reached(most) == any(acts)
-
-
-def test_initial_scales_are_the_root_mean_square_of_three_neighbours():
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], np.float32)
-    made = initialise(points, np.full((4, 3), 255, np.uint8), 7, 0.25)
-    assert np.exp(made.log_scales[0]) == pytest.approx([np.sqrt(14 / 3)] * 3)
-    assert 1 / (1 + np.exp(-made.opacity_logits[0])) == pytest.approx(0.1)
-    assert made.sh[0, 0] * 0.28209479 + 0.5 == pytest.approx([1, 1, 1])
-    assert made.part_id.tolist() == [0] * 4
-    assert initialise(points, np.zeros((4, 3), np.uint8), 7, 0.25, np.arange(4)).part_id.tolist() == [0, 1, 2, 3]
-    lone = initialise(points[:1], np.zeros((1, 3), np.uint8), 7, 0.25)
-    assert np.exp(lone.log_scales[0]) == pytest.approx([0.01] * 3)
-
-
-def test_joining_fills_colours_of_lower_degree_and_picking_undoes_it():
-    three = initialise(np.ones((3, 3), np.float32), np.zeros((3, 3), np.uint8), 2, 1.0)
-    low, high = ball_points(5), with_sh_degree(three, 2)
-    both = concatenate([low, high])
-    assert both.sh.shape == (8, 9, 3) and both.instance_id.tolist() == [4] * 5 + [2] * 3
-    assert np.array_equal(select(both, both.instance_id == 4).means, low.means)
 
 
 def test_opaque_rendering_ignores_the_opacities():
@@ -594,26 +426,3 @@ def test_a_step_sees_as_many_parts_as_asked_for_one_after_the_other():
 def test_views_of_parts_need_rows_that_stay():
     with pytest.raises(ValueError, match="densify must be none"):
         train(ball_points(), VIEWS, params=TrainParams(iterations=1), extent=1.6, seed=1, parts=[part_view(0, 9, 0.3)])
-
-
-@pytest.mark.parametrize("normal", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, -1, 0), (0.3, -0.5, -0.8)])
-def test_discs_lie_in_the_surface(normal):
-    normal = np.array(normal) / np.linalg.norm(normal)
-    across = np.linalg.svd(normal[None])[2][1:]
-    points = (np.random.default_rng(0).random((200, 2)) @ across).astype(np.float32)
-    round_ = initialise(points, np.zeros((200, 3), np.uint8), 3, 1.0)
-    flat = laid_flat(round_, 0.1)
-    axes, scales = rotations(flat.quaternions), np.exp(flat.log_scales)
-    np.testing.assert_allclose(np.abs(axes[:, :, 2] @ normal), 1, atol=1e-5)
-    np.testing.assert_allclose(scales[:, 2], 0.1 * scales[:, 0], rtol=1e-5)
-    np.testing.assert_array_equal(flat.log_scales[:, :2], round_.log_scales[:, :2])
-    few = laid_flat(select(round_, np.arange(3)), 0.1)
-    np.testing.assert_array_equal(few.log_scales, round_.log_scales[:3])
-
-
-def test_discs_on_a_ball_point_outwards():
-    around = np.random.default_rng(1).normal(size=(2000, 3))
-    around /= np.linalg.norm(around, axis=1, keepdims=True)
-    flat = laid_flat(initialise(around.astype(np.float32), np.zeros((2000, 3), np.uint8), 3, 1.0), 0.2)
-    outwards = np.abs(np.einsum("nd,nd->n", rotations(flat.quaternions)[:, :, 2], around))
-    assert np.median(outwards) > 0.99 and (outwards > 0.9).mean() > 0.98
