@@ -8,7 +8,7 @@ start twice as many.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -118,17 +118,18 @@ class _Photo:
         return ssim.sum(), slope.mul_(2)
 
 
-class _OnDemand(Sequence[_Target]):
-    """Targets that are carried to the device again in each step."""
+@dataclass(frozen=True)
+class _OnDemand:
+    """Targets that are carried to the device again whenever one is asked for."""
 
-    def __init__(self, targets: Targets, backend: TorchBackend) -> None:
-        self._targets, self._backend = targets, backend
+    targets: Targets
+    backend: TorchBackend
 
-    def __len__(self) -> int:
-        return len(self._targets.views)
+    def __getitem__(self, view: int) -> _Target:
+        return self.backend.target(self.targets[view], self.targets.num_labels)
 
-    def __getitem__(self, view: Any) -> Any:
-        return self._backend.target(self._targets[view], self._targets.num_labels)
+    def __iter__(self) -> Iterator[_Target]:
+        return (self[view] for view in range(len(self.targets.views)))
 
 
 class TorchBackend:
@@ -179,12 +180,11 @@ class TorchBackend:
             self.put(channel_of_label),
         )
 
-    def targets(self, targets: Targets) -> Sequence[_Target]:
+    def targets(self, targets: Targets) -> list[_Target] | _OnDemand:
         """All of them on the device, or, where they would fill it, each when it is asked for."""
+        there = _OnDemand(targets, self)
         pixels = sum(view.camera.width * view.camera.height for view in targets.views)
-        if pixels * _PIXEL_BYTES > self._room():
-            return _OnDemand(targets, self)
-        return [self.target(target, targets.num_labels) for target in targets]
+        return there if pixels * _PIXEL_BYTES > self._room() else list(there)
 
     def _room(self) -> int:
         """Bytes that targets may take: a training shares the device with others."""
@@ -203,10 +203,8 @@ class TorchBackend:
         settings = replace(settings, num_labels=0 if channels is None else len(target.one_hot))
         out = self._draw(leaves, target, channels, settings)
         with torch.no_grad():
-            loss, towards = _loss(out, target, weights)
-        images = [image for image, given in towards if given is not None]
-        given = [given for _, given in towards if given is not None]
-        found = torch.autograd.grad(images, tuple(leaves.values()), given, materialize_grads=True)
+            loss, images, towards = _loss(out, target, weights)
+        found = torch.autograd.grad(images, tuple(leaves.values()), towards, materialize_grads=True)
         gradients = dict(zip(leaves, found, strict=True)) | {"centers": out.center_gradient}
         return Descent(loss, gradients, out.radii)
 
@@ -243,18 +241,14 @@ class TorchBackend:
         )
 
 
-def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, list[tuple[Tensor, Tensor | None]]]:
-    """The loss of a view, and each differentiable image with the gradient towards it, None where it is zero.
+def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+    """The loss of a view, the images that it depends on, and the gradient towards each of them.
 
     l = l_RGB + w_mask l_mask (Split&Splat, Eq. 5), with the losses of alpha and depth: see `losses.surface`.
     """
-    towards_rgb = towards_labels = None
     off = out.alpha - target.inside
     towards_alpha = off.sign().mul_(weights.alpha * target.judged)
     loss = torch.dot(towards_alpha.flatten(), off.flatten())
-    if target.photo is not None:
-        color, towards_rgb = target.photo.compare(out.rgb, weights.ssim)
-        loss += color
     by_alpha: Tensor | int = -1
     by_depth = target.inverse_depth
     if weights.inverse_depth:
@@ -266,12 +260,17 @@ def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, lis
     slope = off.sign().mul_(weights.depth * target.known)
     loss += torch.dot(slope.flatten(), off.flatten())
     towards_alpha += slope * by_alpha
+    images, towards = [out.alpha, out.depth], [towards_alpha, slope * by_depth]
+    if target.photo is not None:
+        color, towards_rgb = target.photo.compare(out.rgb, weights.ssim)
+        loss += color
+        images, towards = [*images, out.rgb], [*towards, towards_rgb]
     if target.labelled is not None and len(out.label_masks):
         off = out.label_masks - target.one_hot
         towards_labels = off.sign().mul_(weights.mask * target.labelled)
         loss += torch.dot(towards_labels.flatten(), off.flatten())
-    towards = (towards_rgb, towards_alpha, slope * by_depth, towards_labels)
-    return loss, list(zip((out.rgb, out.alpha, out.depth, out.label_masks), towards, strict=True))
+        images, towards = [*images, out.label_masks], [*towards, towards_labels]
+    return loss, images, towards
 
 
 def _planes(image: Tensor) -> Tensor:

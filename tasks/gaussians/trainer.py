@@ -178,6 +178,7 @@ class _Training:
         self._longest = backend.put(longest)
         self._control = _control(params, GradientRecord(len(initial), backend), float(extents.max()))
         self.step = 0
+        # Of each view, those whose colour counts.
         self._pixels = [int(np.count_nonzero(params.objective.counted(view))) for view in views]
         self._losses = backend.put(np.zeros(params.iterations, np.float32))
         self._order: list[int] = []

@@ -118,16 +118,15 @@ def growth(steps: int, degree: int, device: str) -> None:
     }
     print(f"| Gaussians, picture | {' | '.join(ways)} |\n|---{'|---' * len(ways)}|")
     for count, width, height in GROWTH:
-        initial, views = scene(count, width, height, degree)
+        made = scene(count, width, height, degree)
+        rates = [together(*made, steps, many, make) for many, make in ways.values()]
+        print(f"| {count}, {width}x{height} | {' | '.join(f'{rate:.0f}' for rate in rates)} |", flush=True)
 
-        def rate(make: Callable[[], Backend], initial=initial, views=views) -> float:
-            return ours(initial, views, steps, make())
 
-        row = []
-        for many, make in ways.values():
-            with ThreadPoolExecutor(many) as pool:
-                row.append(sum(pool.map(rate, [make] * many)))
-        print(f"| {count}, {width}x{height} | {' | '.join(f'{r:.0f}' for r in row)} |", flush=True)
+def together(initial: Gaussians, views: list[TrainView], steps: int, many: int, make: Callable[[], Backend]) -> float:
+    """Steps a second of so many trainings side by side."""
+    with ThreadPoolExecutor(many) as pool:
+        return sum(pool.map(lambda _: ours(initial, views, steps, make()), range(many)))
 
 
 def _with_gsplat(params: dict, optimizers: dict, device: str) -> tuple[Callable, Callable]:
@@ -177,13 +176,11 @@ def main() -> None:
     asked = parser.parse_args()
     width, height = map(int, asked.size.split("x"))
     name = torch.cuda.get_device_name() if asked.device == "cuda" else "torch's CPU device, the native rasterizer"
-    print(
-        f"{name}; torch {torch.__version__}"
-        + ("" if asked.growth else f"; {asked.gaussians} Gaussians, {asked.size}, degree {asked.degree}")
-    )
+    print(f"{name}; torch {torch.__version__}")
     if asked.growth:
         growth(asked.steps, asked.degree, asked.device)
         return
+    print(f"{asked.gaussians} Gaussians, {asked.size}, degree {asked.degree}")
     initial, views = scene(asked.gaussians, width, height, asked.degree)
     rates: dict[str, list[float]] = {"ours": [], "plain": []}
     for _ in range(asked.turns):
