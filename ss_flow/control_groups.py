@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 from pathlib import Path
 
 GROUPS, OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
@@ -16,6 +17,11 @@ _MEMORY = (
     ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 )
 """Of each version: the controller, the files of limit and use, and which part of the use is given up when need be."""
+
+
+def usable_cores() -> int:
+    """Cores this process may use: those it may run on, or what its container's share of time keeps busy."""
+    return within_quota(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def within_quota(cores: int) -> int:

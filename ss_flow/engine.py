@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import glob
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,7 +14,7 @@ from ss_flow.cache.canonical import digests_of
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, StoreFailure, writing
 from ss_flow.cache.store import Store
-from ss_flow.control_groups import within_limit, within_quota
+from ss_flow.control_groups import usable_cores, within_limit
 from ss_flow.errors import InputError
 from ss_flow.events import Record, Reporter, Reporters
 from ss_flow.executors import Executor, open_executor
@@ -80,11 +79,6 @@ class Report:
         if isinstance(value, Failure):
             raise value.error
         return value
-
-
-def usable_cores() -> int:
-    """Cores this process may use: those it may run on, or what its container's share of time keeps busy."""
-    return within_quota(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def run_flow(

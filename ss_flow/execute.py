@@ -44,6 +44,8 @@ class Invocation:
     isolate: bool
     store: str
     """Where the store is, as `open_store` takes it."""
+    alone: bool = False
+    """Whether nothing may run beside it: it ran out of memory once."""
 
 
 class Cancelled(Exception):
@@ -63,7 +65,8 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     arguments = {name: _read(value, store, name in task.streamed) for name, value in invocation.inputs.items()}
     checkpoint = store.checkpoint(invocation.key)
     warned: list[str] = []
-    surroundings = Surroundings(listener, max(1, invocation.resources.cores), checkpoint, warned)
+    cores = max(1, invocation.resources.cores)
+    surroundings = Surroundings(listener, cores, checkpoint, warned, invocation.alone)
     # Whether a file was another one only in between, its stamp tells, and no later look at its content.
     stamps = {ref: ref.stamp_now() for ref in files_in(invocation.parameters)}
     _refuse([ref for ref in stamps if ref.has_changed()], invocation.label)

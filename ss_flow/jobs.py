@@ -22,8 +22,6 @@ class Job:
     why: str
     priority: tuple[int, int]
     """Lower goes first."""
-    alone: bool = False
-    """Whether nothing may run beside it: it ran out of memory once."""
 
     @property
     def key(self) -> str:
@@ -42,7 +40,7 @@ class Tokens:
         """Whether a job may start now; what needs more than the machine has runs alone."""
         if not self._running:
             return True
-        if job.alone or any(other.alone for other in self._running.values()):
+        if job.invocation.alone or any(other.invocation.alone for other in self._running.values()):
             return False
         wanted = job.invocation.resources
         return all(
@@ -86,7 +84,7 @@ class Queue:
         return self._length
 
     def push(self, job: Job) -> None:
-        row = self._rows.setdefault((job.invocation.resources, job.alone), [])
+        row = self._rows.setdefault((job.invocation.resources, job.invocation.alone), [])
         heapq.heappush(row, (job.priority, next(self._order), job))
         self._length += 1
 

@@ -33,6 +33,8 @@ class Surroundings:
     """Where the task's half-done work lies, if there is any."""
     warned: list[str] | None = None
     """Collects what the task warns of; None = Python's own warnings do."""
+    last_try: bool = False
+    """Whether memory ran out once, so that nothing runs beside the task now."""
 
 
 _ALONE = Surroundings()
@@ -77,6 +79,11 @@ def progress(done: int, total: int, note: str = "") -> None:
 def cores() -> int:
     """How many threads the task may use."""
     return _surroundings.get().cores
+
+
+def last_try() -> bool:
+    """Whether the task fails if memory runs out once more."""
+    return _surroundings.get().last_try
 
 
 def warn(message: str) -> None:

@@ -12,7 +12,7 @@ import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ss_flow.cache.canonical import digests_of
@@ -240,8 +240,8 @@ class Scheduler:
                 self._complete(job, future.result(), "finished")
             elif isinstance(error, Gone | StoreFailure | ExecutorLost):
                 raise error
-            elif isinstance(error, OUT_OF_MEMORY) and not job.alone:
-                job.alone = True
+            elif isinstance(error, OUT_OF_MEMORY) and not job.invocation.alone:
+                job.invocation = replace(job.invocation, alone=True)
                 self._tell("retried", job.nodes[0], key=job.key, because=_described(error))
                 self._queue.push(job)
             else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -55,7 +56,7 @@ def render(
     label_ids: Sequence[int] = (),
     winners: bool = True,
 ) -> Rendering:
-    """Render Gaussians, on CUDA where Gaussians are trained there.
+    """Render Gaussians, on CUDA where Gaussians are trained there and it has the memory.
 
     opaque: every opacity 1, with the falloff kept (spec P2). label_ids: instance ids, one mask channel each. winners:
     whether `top_contributor` and `max_contribution` are asked for, which take long on CUDA.
@@ -73,16 +74,17 @@ def render(
     if _device(gaussians) != "cpu":
         from ss_flow.tasks.gaussians.torch_render import draw
 
-        there = draw(_device(gaussians), parameters, labels, camera, settings)
-        return Rendering(
-            there.rgb.cpu().numpy(),
-            there.alpha.cpu().numpy(),
-            there.depth.cpu().numpy(),
-            there.label_masks.cpu().numpy(),
-            there.top_contributor.cpu().numpy(),
-            there.radii.cpu().numpy() > 0,
-            there.max_contribution.cpu().numpy(),
-        )
+        with suppress(MemoryError):
+            there = draw(_device(gaussians), parameters, labels, camera, settings)
+            return Rendering(
+                there.rgb.cpu().numpy(),
+                there.alpha.cpu().numpy(),
+                there.depth.cpu().numpy(),
+                there.label_masks.contiguous().cpu().numpy(),  # in this order, too, in memory
+                there.top_contributor.cpu().numpy(),
+                there.radii.cpu().numpy() > 0,
+                there.max_contribution.cpu().numpy(),
+            )
     done = NativePass(parameters, labels, camera, settings)  # type: ignore[arg-type]
     none = np.full(done.alpha.shape, -1, np.int32), np.zeros(len(gaussians), np.float32)
     top, strongest = none if done.top is None or done.strongest is None else (done.top, done.strongest)
@@ -117,7 +119,8 @@ def _weigher(
     if device != "cpu":
         from ss_flow.tasks.gaussians.torch_render import weigher
 
-        return weigher(device, parameters, camera, settings)
+        with suppress(MemoryError):
+            return weigher(device, parameters, camera, settings)
     drawn = NativePass(parameters, None, camera, settings)  # type: ignore[arg-type]
     return lambda towards: drawn.backward(towards, None, None, None)["sh"][:, 0]
 

@@ -2,12 +2,13 @@
 
 Imports torch: import it inside functions. The losses are those of `losses.py`, written with torch's own operations, and
 so are their gradients: on a device a step takes as long as the host needs to start its kernels, and autograd would
-start twice as many.
+start twice as many. No operation here is one of cuBLAS, which keeps some 30 MB for each stream that it was used on.
 """
 
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from ss_flow.tasks.gaussians.backends import EPSILON, AdamStep, Descent, Values
 from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.gaussians.objective import Target, Targets, Weights
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered, renderer_on
+from ss_flow.tasks.gaussians.torch_render import memory_of
 
 _RADIUS, _SIGMA = 5, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
@@ -90,7 +92,7 @@ class _Photo:
         x = torch.where(self.counts, _planes(image), 0)
         off = x - self.image
         towards = off.sign() * ((1 - ssim_weight) * self.share)
-        loss = torch.dot(towards.flatten(), off.flatten())
+        loss = (towards * off).sum()
         if ssim_weight:
             similarity, slope = self._ssim(x)
             loss = (loss + ssim_weight).sub_(similarity, alpha=ssim_weight)
@@ -145,12 +147,8 @@ class TorchBackend:
 
     @contextmanager
     def stream(self) -> Iterator[None]:
-        own = torch.cuda.stream(torch.cuda.Stream(self._device)) if self._device.type == "cuda" else nullcontext()
-        try:
-            with own:
-                yield
-        except torch.OutOfMemoryError as error:  # is no MemoryError, upon which a task is tried once more alone
-            raise MemoryError(f"not enough memory on {self._device} for a training") from error
+        with memory_of(self._device), _stream() if self._device.type == "cuda" else nullcontext():
+            yield
 
     def put(self, array: NDArray[Any]) -> Tensor:
         return torch.tensor(array, device=self._device)
@@ -241,6 +239,23 @@ class TorchBackend:
         )
 
 
+_AT_ONCE = threading.BoundedSemaphore(4)
+"""Trainings on a device: more would take memory and make nothing faster."""
+_idle: list[torch.cuda.Stream] = []
+"""Streams of trainings that ended: the memory that torch keeps belongs to a stream."""
+
+
+@contextmanager
+def _stream() -> Iterator[None]:
+    with _AT_ONCE:
+        own = _idle.pop() if _idle else torch.cuda.Stream()
+        try:
+            with torch.cuda.stream(own):
+                yield
+        finally:
+            _idle.append(own)
+
+
 def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, list[Tensor], list[Tensor]]:
     """The loss of a view, the images that it depends on, and the gradient towards each of them.
 
@@ -248,7 +263,7 @@ def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, lis
     """
     off = out.alpha - target.inside
     towards_alpha = off.sign().mul_(weights.alpha * target.judged)
-    loss = torch.dot(towards_alpha.flatten(), off.flatten())
+    loss = (towards_alpha * off).sum()
     by_alpha: Tensor | int = -1
     by_depth = target.inverse_depth
     if weights.inverse_depth:
@@ -258,7 +273,7 @@ def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, lis
     else:
         off = out.depth * target.inverse_depth - out.alpha
     slope = off.sign().mul_(weights.depth * target.known)
-    loss += torch.dot(slope.flatten(), off.flatten())
+    loss += (slope * off).sum()
     towards_alpha += slope * by_alpha
     images, towards = [out.alpha, out.depth], [towards_alpha, slope * by_depth]
     if target.photo is not None:
@@ -268,7 +283,7 @@ def _loss(out: Rendered, target: _Target, weights: Weights) -> tuple[Tensor, lis
     if target.labelled is not None and len(out.label_masks):
         off = out.label_masks - target.one_hot
         towards_labels = off.sign().mul_(weights.mask * target.labelled)
-        loss += torch.dot(towards_labels.flatten(), off.flatten())
+        loss += (towards_labels * off).sum()
         images, towards = [*images, out.label_masks], [*towards, towards_labels]
     return loss, images, towards
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 
@@ -12,26 +13,43 @@ from ss_flow.tasks.gaussians.rasterize import GaussianTensors, Rendered, rendere
 from ss_flow.tasks.geometry.cameras import Camera
 
 
+@contextmanager
+def memory_of(device: torch.device) -> Iterator[None]:
+    """Within this, a device without memory is told as the host is: by MemoryError, which torch's own error is not."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise MemoryError(f"not enough memory on {device}") from error
+
+
 def draw(
     device: str, parameters: Sequence[Float32], labels: Int32 | None, camera: Camera, settings: Settings
 ) -> Rendered:
-    """A rendering without gradients. parameters: in the order of `PARAMETERS`. labels: [N], < 0 = none."""
-    with torch.no_grad():
+    """A rendering without gradients. parameters: in the order of `PARAMETERS`. labels: [N], < 0 = none.
+
+    Raises MemoryError.
+    """
+    with torch.no_grad(), memory_of(torch.device(device)):
         return _drawn(GaussianTensors(*(torch.tensor(a, device=device) for a in parameters)), labels, camera, settings)
 
 
 def weigher(
     device: str, parameters: Sequence[Float32], camera: Camera, settings: Settings
 ) -> Callable[[Float32], Float32]:
-    """The gradient of the picture's sum, weighted by [H, W, 3], towards the constant colours [N, 3]."""
-    gaussians = GaussianTensors(*(torch.tensor(a, device=device) for a in parameters))
-    gaussians.sh.requires_grad_()
-    picture = _drawn(gaussians, None, camera, settings).rgb
+    """The gradient of the picture's sum, weighted by [H, W, 3], towards the constant colours [N, 3].
+
+    Both raise MemoryError.
+    """
+    with memory_of(torch.device(device)):
+        gaussians = GaussianTensors(*(torch.tensor(a, device=device) for a in parameters))
+        gaussians.sh.requires_grad_()
+        picture = _drawn(gaussians, None, camera, settings).rgb
 
     def weigh(towards: Float32) -> Float32:
-        given = torch.tensor(towards, device=device)
-        (found,) = torch.autograd.grad(picture, gaussians.sh, given, retain_graph=True)
-        return found[:, 0].cpu().numpy()
+        with memory_of(torch.device(device)):
+            given = torch.tensor(towards, device=device)
+            (found,) = torch.autograd.grad(picture, gaussians.sh, given, retain_graph=True)
+            return found[:, 0].cpu().numpy()
 
     return weigh
 

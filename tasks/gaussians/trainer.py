@@ -12,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
+from ss_flow.control_groups import usable_cores
+from ss_flow.running import cores, last_try, load_checkpoint, progress, save_checkpoint, warn
 from ss_flow.tasks.artifacts import Float32, Gaussians
 from ss_flow.tasks.gaussians.backends import AdamStep, Backend, Values, backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecord, Schedule, Seen
@@ -27,9 +28,10 @@ from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonN
 
 CHECKPOINT_SECONDS = 60.0
 """How much work a kill may cost."""
-SMALL = 200 * 200
-"""Pixels of a view: where they have fewer in the mean, a step takes a core less time than a device needs to start its
-kernels, which is three milliseconds whatever the size (docs/device.md)."""
+SMALL, SMALL_PER_CORE = 200 * 200, 13_000
+"""Pixels of a view. A device takes three milliseconds a step whatever the size, to start its kernels, and no more steps
+a second for several trainings than for one (docs/device.md). Where views have fewer pixels in the mean, a training with
+several cores is faster on these, and those that have a core each are together."""
 
 
 class TrainingDiverged(RuntimeError):
@@ -110,8 +112,9 @@ def train(
     extent: size of what is trained, world units, or [N] of what each Gaussian is part of: scales the learning rate of
     the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. parts: what some rows of
     `initial` should look like alone, with `part_weight`, where nothing is cloned or split. backend: where it happens;
-    by default, that of `device_here` where views are large, else the CPU. On the CPU the number of threads changes no
-    byte, and neither does a kill: a later try goes on from the last checkpoint.
+    by default, that of `device_here` where views are large, else the CPU, which also takes over in a last try where the
+    device has not enough memory. On the CPU the number of threads changes no byte, and neither does a kill: a later try
+    goes on from the last checkpoint.
     Raises ValueError when there are no views or Gaussians, an array does not fit its camera, or rows of parts would
     move, TrainingDiverged when numbers blow up. The result has no Gaussians when all were pruned.
     """
@@ -130,15 +133,26 @@ def train(
             raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {value!r}")
     if parts and params.densify != "none":
         raise ValueError("views of parts need Gaussians whose rows stay, so densify must be none")
-    backend = backend or backend_for(_device(views), cores())
-    with backend.stream():
-        return _Training(initial, views, params, extents, seed, label_ids, parts, backend).run()
+
+    def run_on(backend: Backend) -> TrainResult:
+        with backend.stream():
+            return _Training(initial, views, params, extents, seed, label_ids, parts, backend).run()
+
+    device = _device(views)
+    try:
+        return run_on(backend or backend_for(device, cores()))
+    except MemoryError:
+        if backend or device == "cpu" or not last_try():
+            raise
+    warn(f"{device} has not enough memory for a training of {len(views)} views: it ran on the CPU.")
+    return run_on(backend_for("cpu", cores()))
 
 
 def _device(views: Sequence[TrainView]) -> str:
-    """Where a training of these views is fastest."""
+    """Where a training of these views is fastest. One that has a single core is taken for one of many at once."""
     here = device_here()
-    return "cpu" if sum(view.camera.width * view.camera.height for view in views) < SMALL * len(views) else here
+    small = SMALL if cores() > 1 else SMALL_PER_CORE * usable_cores()
+    return "cpu" if sum(view.camera.width * view.camera.height for view in views) < small * len(views) else here
 
 
 class _Training:

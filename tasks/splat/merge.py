@@ -149,7 +149,7 @@ class MergeParams:
 
 @task(
     name="splat.merge_pair",
-    resources=Resources(cores=1, most_cores=8, memory_mb=2000, gpus=0.25),
+    resources=Resources(cores=1, most_cores=8, memory_mb=2000, gpus=0.05),
     environment=backend_identity,
 )
 def merge_pair(

@@ -113,7 +113,7 @@ class ReconstructParams:
 
 @task(
     name="splat.reconstruct",
-    resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.25),
+    resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.05),
     environment=backend_identity,
 )
 def reconstruct(
@@ -143,7 +143,7 @@ def reconstruct(
 
 @task(
     name="splat.retrain",
-    resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.25),
+    resources=Resources(cores=1, most_cores=8, memory_mb=1500, gpus=0.05),
     environment=backend_identity,
 )
 def retrain(

@@ -80,8 +80,8 @@ def test_more_in_use_than_the_limit_leaves_nothing(groups):
 
 
 def test_a_run_takes_no_more_than_its_container_has(groups, monkeypatch):
-    monkeypatch.setattr(engine.os, "sched_getaffinity", lambda process: range(MANY), raising=False)
-    assert engine.usable_cores() == MANY
+    monkeypatch.setattr(control_groups.os, "sched_getaffinity", lambda process: range(MANY), raising=False)
+    assert control_groups.usable_cores() == MANY
     groups("0::/\n", {"cpu.max": "300000 100000\n", **memory(GB // 2, 0, 0)})
     assert psutil.virtual_memory().available > GB // 2
     there = engine._this_machine(0)

@@ -337,6 +337,12 @@ def test_a_task_whose_process_was_killed_is_tried_once_more_alone(store, tmp_pat
     assert all("memory runs out" in because for _, because in told)
 
 
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+def test_a_task_whose_memory_ran_out_knows_its_last_try(store, executor):
+    report = run(store, one(toy.makes_do), executor=executor)
+    assert computed(report) == ["ss_flow_toy.makes_do", "ss_flow_toy.source"]
+
+
 def test_a_killed_process_is_not_waited_for_until_a_child_that_its_task_forked_ends(store, tmp_path):
     child = tmp_path / "child"
     report = run(store, one(lambda x: toy.killed_beside_its_child(x, child_file=str(child))))

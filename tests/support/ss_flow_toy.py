@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ss_flow.graph import each, expand
-from ss_flow.running import cores, load_checkpoint, progress, save_checkpoint
+from ss_flow.running import cores, last_try, load_checkpoint, progress, save_checkpoint
 from ss_flow.task import Bundle, FileRef, Resources, task
 
 if TYPE_CHECKING:
@@ -256,6 +256,14 @@ def killed_once(x: Number, *, marker: str) -> Number:
     if not Path(marker).exists():
         Path(marker).write_text("")
         os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+@task()
+def makes_do(x: Number) -> Number:
+    """Does with less in its last try."""
+    if not last_try():
+        raise MemoryError("not enough memory on the device")
     return x
 
 

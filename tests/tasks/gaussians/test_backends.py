@@ -424,12 +424,42 @@ def test_a_backend_for_cuda_is_of_torch():
     assert isinstance(backend_for("meta", 2), TorchBackend)
 
 
+def no_memory(*_):
+    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3 GiB.")
+
+
 def test_a_device_without_memory_is_told_as_the_host_is():
     backend = TorchBackend("cpu")
-
-    def descent(*_):
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3 GiB.")
-
-    backend.descent = descent
-    with pytest.raises(MemoryError, match="not enough memory on cpu for a training"):
+    backend.descent = no_memory
+    with pytest.raises(MemoryError, match="not enough memory on cpu"):
         trained(backend, TrainParams(iterations=3, densify="none"))
+
+
+def test_what_a_device_has_no_memory_for_is_trained_on_the_cpu_in_the_last_try(monkeypatch):
+    full = TorchBackend("cpu")
+    full.descent = no_memory
+    training = sys.modules[train.__module__]
+    monkeypatch.setattr(training, "_device", lambda views: "small")
+    monkeypatch.setattr(training, "backend_for", lambda device, threads: full if device == "small" else NATIVE)
+    params = TrainParams(iterations=3, densify="none")
+    with pytest.raises(MemoryError):
+        trained(None, params)
+    heard: list[str] = []
+    with running(Surroundings(warned=heard, last_try=True)):
+        again = trained(None, params)
+    assert again.loss.tobytes() == trained(NATIVE, params).loss.tobytes()
+    assert heard == ["small has not enough memory for a training of 4 views: it ran on the CPU."]
+
+
+def test_what_a_device_has_no_memory_for_is_drawn_on_the_cpu(monkeypatch):
+    made = initialise(np.array([[0, 0, 2.0]]), np.full((1, 3), 200, np.uint8), 1, 1.0)
+    camera = Camera(32, 24, 30, 30, 16, 12, np.eye(4))
+    ids = np.zeros((24, 32), int)
+    expected, weights = render(made, camera), dict(weights_by_id(made, camera, ids))
+    drawing = sys.modules[render.__module__]
+    monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))
+    by_torch = sys.modules["ss_flow.tasks.gaussians.torch_render"]
+    monkeypatch.setattr(by_torch, "_drawn", no_memory)
+    for name, image in expected._asdict().items():
+        assert np.array_equal(getattr(render(made, camera), name), image), name
+    assert np.array_equal(dict(weights_by_id(made, camera, ids))[0], weights[0])
