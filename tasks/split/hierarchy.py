@@ -2,7 +2,8 @@
 
 A segmenter shows the box, its faces and the label printed on it, and often the box with what stands beside it. The
 level that is a thing is the one that the views repeat: most views which see two pieces of it have a mask with just
-these pieces, and the segmenter is as sure of that mask as of those of the pieces. Four things are known without masks:
+these pieces, and the segmenter is as sure of that mask as of those of the pieces. Pieces that touch each other more
+than anything else are one rather, and pieces that do not touch are rather not. Four things are known without masks:
 what light alone or nothing parts is one surface, what touches nothing but walls and floors stands alone, and what meets
 in a convex edge, or lies in another's surface, is of one thing, unless the views deny it. Beyond Split&Splat.
 """
@@ -21,8 +22,6 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import (
     Bool,
     Cameras,
-    Float32,
-    Float64,
     Hierarchy,
     PointCloud,
     PointLabels,
@@ -31,11 +30,12 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
-from ss_flow.tasks.split.agreement import View, agreement_of, ramp, views_of
+from ss_flow.tasks.split.agreement import View, agreement_of, views_of
+from ss_flow.tasks.split.contact import Contact, find_contact
 from ss_flow.tasks.split.edges import convex_edges
 from ss_flow.tasks.split.inlays import Inlays, find_inlays
 from ss_flow.tasks.split.looks import Looks
-from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
+from ss_flow.tasks.split.mounds import Mounds, find_mounds
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
@@ -43,10 +43,6 @@ from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 _ON_TOP = 0.5
 """What is left of an agreement when one piece stands on the others: the views show a group."""
-_ALONE = 0.5
-"""Share of what pieces touch, other than stuff, that must be of their own set for it to begin to stand alone."""
-_TOUCH = 10.0
-"""Border points of other things that are presumed, so that a faint touch proves nothing."""
 _TOGETHER = 0.5
 """Share of the views which see two pieces that must hold them under one mask, whatever else it holds, so that a convex
 edge between them makes them faces of one thing."""
@@ -86,6 +82,11 @@ class HierarchyParams:
     alone: Fraction = 0.3
     """Share by which an agreement rises towards 1 where the pieces touch each other and stuff, and nothing else: a
     chair on a floor. Less where they touch other things, down to nothing at half of what they touch."""
+    contact: Fraction = 0.2
+    """How much it counts what the pieces touch: an agreement falls by this share where it is other labels only, and
+    rises by it where it is each other."""
+    apart: Fraction = 0.3
+    """Share by which an agreement falls where the pieces do not touch each other: the views show a group."""
     convex: Fraction = 0.46
     """Agreement that two pieces have at least where they meet in a convex edge, as the faces of a box do, and half of
     the views that see both hold them under one mask. Just above the default of `split.granularity`, so that what the
@@ -157,8 +158,7 @@ class _Pieces:
     """K."""
     stuff: Bool
     """[G]."""
-    contact: Float32
-    """[G, G] points at which each touches each other one, from both sides."""
+    contact: Contact
     edges: Bool
     """[G, G] which meet in a convex edge."""
     labels: list[tuple[int, ...]]
@@ -187,7 +187,7 @@ class _Pieces:
             self,
             views=[view.joined(joined) for view in self.views],
             stuff=self.stuff[[members[0] for members in groups]],
-            contact=(joined.T @ self.contact @ joined * ~np.eye(len(groups), dtype=bool)).astype(np.float32),
+            contact=self.contact.joined(joined),
             edges=joined.T @ self.edges @ joined * ~np.eye(len(groups), dtype=bool) > 0,
             labels=[tuple(row for piece in members for row in self.labels[piece]) for members in groups],
         )
@@ -207,9 +207,11 @@ class _Pieces:
         agreement = agreement_of(
             self.counted, member, doubt=params.doubt, prior=params.prior, prior_agreement=params.prior_agreement
         )
-        agreement += (1 - agreement) * params.alone * self._alone(member)
+        agreement += (1 - agreement) * params.alone * self.contact.alone(member, self.stuff)
+        agreement = np.minimum(agreement * (1 + params.contact * (2 * self.contact.own(member) - 1)), 1)
+        agreement *= np.where(group, _ON_TOP, np.where(self.contact.hang_together(member), 1, 1 - params.apart))
         least = [presumed.get(members, 0.0) for members in sets]
-        agreement = np.maximum(agreement * np.where(group, _ON_TOP, 1.0), least).astype(np.float64).round(6)
+        agreement = np.maximum(agreement, least).astype(np.float64).round(6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
@@ -268,10 +270,3 @@ class _Pieces:
         on_sheet = self.sheets.standing([self.labels[piece] for piece in members])
         risen = zip(members, on_sheet.tolist(), strict=True)
         return {piece for piece, rises in risen if rises or all(on_top[row] for row in self.labels[piece])}
-
-    def _alone(self, member: Float32) -> Float64:
-        """[S] how far each set of pieces [S, G] stands alone, 0..1: whether it touches nothing but itself and stuff."""
-        inside = np.einsum("sg,gh,sh->s", member, self.contact, member, optimize=True) / 2
-        outside = np.einsum("sg,gh,sh->s", member, self.contact, (1 - member) * ~self.stuff, optimize=True)
-        things = (member @ self.stuff) == 0
-        return things * ramp(inside / (inside + outside + _TOUCH), _ALONE, 1.0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, PointLabels, Tally
+from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
@@ -93,24 +93,6 @@ def find_mounds(
         enough = height * max(2 * alike, _LEAST) * box_diagonal(own, _TRIM)
         bulges[row] = rises >= max(enough, 2 * points.spacing)
     return Mounds(share, size.astype(np.int32), bulges, around)
-
-
-def find_contact(ends: Borders, label: Int32) -> Float32:
-    """[L, L] at how many points, on both sides, the labels that occur, ascending, touch each other in space.
-
-    ends: the borders of the labels [N], 0 = none.
-    """
-    names = np.unique(label[label > 0])
-    contact = np.zeros((len(names), len(names)), np.float32)
-    if len(names):
-        big = int(names[-1]) + 1
-        point = np.arange(len(ends.rows), dtype=np.int64)[:, None]
-        number, other = np.divmod(np.unique(point * big + label[ends.beside]), big)
-        own = label[ends.rows[number]]
-        touches = (other > 0) & (other != own)
-        pair = np.searchsorted(names, own[touches]), np.searchsorted(names, other[touches])
-        np.add.at(contact, pair, 1)
-    return contact + contact.T
 
 
 def _ends(label: Int32, names: Int32, ends: Borders) -> Bool:

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels, Tally
 from ss_flow.tasks.split import hierarchy as module
+from ss_flow.tasks.split.contact import Contact
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
 from ss_flow.tasks.split.inlays import Inlays
 from ss_flow.tasks.split.mounds import Mounds
@@ -27,7 +28,8 @@ def tally(masks: list[tuple[set[int], float]], sees: set[int], points: int = SEE
 
 
 def tree(tallies: list[Tally], labels: int, unused: int = 0, **changes) -> Hierarchy:
-    """Labels 1.., each a ball of points far from the others, so that none is flat; higher ones are unused."""
+    """Labels 1.., each a ball of points far from the others, so that none is flat; higher ones are unused. What touches
+    what does not count, if not asked for."""
     rng = np.random.default_rng(0)
     places = rng.normal(size=(20 * labels, 3)).astype(np.float32)
     places[:, 0] += 9 * np.repeat(np.arange(labels), 20)
@@ -37,7 +39,8 @@ def tree(tallies: list[Tally], labels: int, unused: int = 0, **changes) -> Hiera
     given = PointLabels(label, np.ones(len(label), np.float32), labels + unused, nothing, nothing, nothing)
     sizes, intrinsics = np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]])
     cameras = Cameras(("a",), sizes, intrinsics, np.eye(4)[None], True)
-    return hierarchy(cloud, cameras, [], given, tallies, params=HierarchyParams(**{"prior": 0.0, **changes}))
+    params = HierarchyParams(**{"prior": 0.0, "contact": 0.0, "apart": 0.0, **changes})
+    return hierarchy(cloud, cameras, [], given, tallies, params=params)
 
 
 def unions(found: Hierarchy) -> dict[frozenset[int], float]:
@@ -187,7 +190,8 @@ def agreement_beside(neighbour: float, alone: float = 0.3) -> float:
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.02)
     views = [tally([({1, 2}, 0.9)], {1, 2, 3}), tally([({1}, 0.9), ({2}, 0.9)], {1, 2, 3})]
     stuff = StuffParams(extent=1.0)  # nothing is
-    found = hierarchy(cloud, cameras, [], given, views, params=HierarchyParams(prior=0.0, alone=alone, stuff=stuff))
+    params = HierarchyParams(prior=0.0, alone=alone, contact=0.0, stuff=stuff)
+    found = hierarchy(cloud, cameras, [], given, views, params=params)
     return dict(zip(found.node.tolist(), found.agreement.tolist(), strict=True))[4]
 
 
@@ -197,9 +201,10 @@ def test_what_touches_nothing_else_is_one_thing_rather():
     assert agreement_beside(0.0) == pytest.approx(0.5)
 
 
-def known(monkeypatch, *, stuff=(), touching=(), convex=(), inlaid=(), on_top=()) -> None:
+def known(monkeypatch, *, stuff=(), touching=(), convex=(), inlaid=(), on_top=(), size=40) -> None:
     """What their places tell of three labels: which are stuff, which touch at 50 points of each, meet in a convex edge
-    or lie in the other, and whether 3 stands on the other two, which surround it."""
+    or lie in the other, and whether 3, which has `size` points beside 100 and 100, stands on the other two, which
+    surround it."""
 
     def pairs(of, value):
         table = np.zeros((3, 3), np.float32)
@@ -208,10 +213,10 @@ def known(monkeypatch, *, stuff=(), touching=(), convex=(), inlaid=(), on_top=()
         return table
 
     share = np.array([[0, 0, 0], [0, 0, 0], [0.5, 0.5, 0]])
-    mounds = Mounds(share, np.array([100, 100, 40], np.int32), np.isin([1, 2, 3], on_top), 0.8)
+    mounds = Mounds(share, np.array([100, 100, size], np.int32), np.isin([1, 2, 3], on_top), 0.8)
     told = {
         "find_stuff": np.isin([1, 2, 3], stuff),
-        "find_contact": pairs(touching, 50),
+        "find_contact": Contact(pairs(touching, 50), np.array([100, 100, size], np.float32)),
         "convex_edges": pairs(convex, 1) > 0,
         "find_inlays": Inlays(np.full(3, 100.0), np.full(3, 20.0), 20 * pairs(inlaid, 1).astype(np.float64)),
         "find_mounds": mounds,
@@ -240,6 +245,25 @@ def test_where_pieces_of_a_union_touch_each_other_tells_nothing_about_what_it_is
     known(monkeypatch, touching=[(1, 2)])
     views = [tally([({1, 2}, 0.9), ({1, 2, 3}, 0.9)], {1, 2, 3}), tally([({1, 2}, 0.9)], {1, 2, 3})]
     assert unions(tree(views, 3)) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.5}
+
+
+@pytest.mark.parametrize(("touching", "own"), [([(1, 2)], 100 / 120), ([(1, 2), (1, 3), (2, 3)], 100 / 220), ([], 0)])
+def test_an_agreement_rises_with_the_share_of_what_the_pieces_touch_that_is_their_own(monkeypatch, touching, own):
+    known(monkeypatch, touching=touching)
+    views = [tally([({1, 2}, 0.9)], {1, 2, 3}), tally([({1}, 0.9), ({2}, 0.9)], {1, 2, 3})]
+    factor = 0.8 + 0.4 * own
+    assert unions(tree(views, 3, alone=0.0, contact=0.2)) == {frozenset({1, 2}): 0.5 * factor}
+    assert unions(tree(views[:1], 3, alone=0.0, contact=0.2)) == {frozenset({1, 2}): min(factor, 1)}
+
+
+@pytest.mark.parametrize(
+    ("touching", "size", "agreement"),
+    [([(1, 3), (3, 2)], 40, 1.0), ([(1, 2)], 40, 0.7), ([(1, 2)], 10, 1.0), ([(1, 3)], 10, 0.7), ([], 40, 0.7)],
+)
+def test_pieces_that_do_not_touch_are_a_group_but_for_a_crumb(monkeypatch, touching, size, agreement):
+    known(monkeypatch, touching=touching, size=size)
+    view = tally([({1, 2, 3}, 0.9)], {1, 2, 3})
+    assert unions(tree([view], 3, apart=0.3)) == {frozenset({1, 2, 3}): agreement}
 
 
 @pytest.mark.parametrize("how", ["convex", "inlaid"])

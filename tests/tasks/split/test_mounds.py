@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
-from ss_flow.tasks.split.mounds import Mounds, find_contact, find_mounds
+from ss_flow.tasks.split.mounds import Mounds, find_mounds
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 STEP = 0.02
@@ -80,30 +80,3 @@ def test_nothing_stands_on_something_smaller_or_on_what_does_not_surround_it():
     assert Mounds(share, np.array([100, 40], np.int32), bulges, 0.8).standing([0, 1]).tolist() == [False, True]
     assert Mounds(share, np.array([100, 60], np.int32), bulges, 0.8).standing([0, 1]).tolist() == [False, False]
     assert Mounds(0.7 * share, np.array([100, 40], np.int32), bulges, 0.8).standing([0, 1]).tolist() == [False, False]
-
-
-def test_labels_touch_where_their_points_lie_side_by_side():
-    strip = grid(0.2, 1.0)
-    places = np.concatenate([strip, *(strip + np.array(at) for at in ((0.2, 0, 0), (0.6, 0, 0), (0.4, 0, 0.5)))])
-    label = np.repeat(np.array([1, 3, 0, 4], np.int32), len(strip))
-    cloud = PointCloud(places.astype(np.float32), np.zeros((len(places), 3), np.uint8), 1.0, STEP)
-    contact = find_contact(borders(label, cloud, TouchingParams()), label)
-    assert contact.tolist() == contact.T.tolist()
-    assert contact[0, 1] >= 2 * 50  # a row of points on either side
-    assert not contact[[0, 1, 2, 0, 1], [0, 1, 2, 2, 2]].any()
-
-
-def test_where_labels_touch_the_points_of_both_sides_count():
-    strip = grid(0.2, 1.0)
-    coarse = strip[np.rint(strip[:, 1] / STEP).astype(int) % 2 == 0] + np.array([0.2, 0, 0])  # every second row
-    label = np.repeat(np.array([1, 2], np.int32), [len(strip), len(coarse)])
-    places = np.concatenate([strip, coarse]).astype(np.float32)
-    cloud = PointCloud(places, np.zeros((len(label), 3), np.uint8), 1.0, STEP)
-    contact = find_contact(borders(label, cloud, TouchingParams()), label)
-    assert contact[0, 1] == contact[1, 0] > 0
-
-
-def test_of_no_labels_none_touch():
-    cloud = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), 1.0, STEP)
-    nothing = np.zeros(1, np.int32)
-    assert find_contact(borders(nothing, cloud, TouchingParams()), nothing).shape == (0, 0)
