@@ -80,7 +80,7 @@ def render(
                 there.rgb.cpu().numpy(),
                 there.alpha.cpu().numpy(),
                 there.depth.cpu().numpy(),
-                there.label_masks.contiguous().cpu().numpy(),  # in this order, too, in memory
+                there.label_masks.cpu().numpy(),
                 there.top_contributor.cpu().numpy(),
                 there.radii.cpu().numpy() > 0,
                 there.max_contribution.cpu().numpy(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 
@@ -15,10 +16,12 @@ from ss_flow.tasks.geometry.cameras import Camera
 
 @contextmanager
 def memory_of(device: torch.device) -> Iterator[None]:
-    """Within this, a device without memory is told as the host is: by MemoryError, which torch's own error is not."""
+    """Within this, a device without memory is told as the host is: by MemoryError, which no error of torch is."""
     try:
         yield
-    except torch.OutOfMemoryError as error:
+    except RuntimeError as error:  # not all of them are OutOfMemoryError: a context may not fit, either
+        if "out of memory" not in str(error):
+            raise
         raise MemoryError(f"not enough memory on {device}") from error
 
 
@@ -30,7 +33,10 @@ def draw(
     Raises MemoryError.
     """
     with torch.no_grad(), memory_of(torch.device(device)):
-        return _drawn(GaussianTensors(*(torch.tensor(a, device=device) for a in parameters)), labels, camera, settings)
+        gaussians = GaussianTensors(*(torch.tensor(a, device=device) for a in parameters))
+        drawn = _drawn(gaussians, labels, camera, settings)
+        # NumPy goes through each mask by itself, and gsplat has them side by side in each pixel.
+        return replace(drawn, label_masks=drawn.label_masks.contiguous())
 
 
 def weigher(

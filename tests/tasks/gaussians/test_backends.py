@@ -428,10 +428,26 @@ def no_memory(*_):
     raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3 GiB.")
 
 
-def test_a_device_without_memory_is_told_as_the_host_is():
+def no_room_for_a_context(*_):
+    raise RuntimeError("CUDA error: out of memory")
+
+
+def another_error(*_):
+    raise RuntimeError("CUDA error: an illegal memory access was encountered")
+
+
+@pytest.mark.parametrize(
+    ("fails", "told", "match"),
+    [
+        (no_memory, MemoryError, "not enough memory on cpu"),
+        (no_room_for_a_context, MemoryError, "not enough memory on cpu"),
+        (another_error, RuntimeError, "illegal memory access"),
+    ],
+)
+def test_a_device_without_memory_is_told_as_the_host_is(fails, told, match):
     backend = TorchBackend("cpu")
-    backend.descent = no_memory
-    with pytest.raises(MemoryError, match="not enough memory on cpu"):
+    backend.descent = fails
+    with pytest.raises(told, match=match):
         trained(backend, TrainParams(iterations=3, densify="none"))
 
 
