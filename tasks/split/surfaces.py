@@ -35,8 +35,6 @@ _ENOUGH = 2000
 _ROUNDS = 8
 _FILLED = 30
 """How often points without a label take that of their neighbours, to tell which labels touch."""
-_FLAT = 0.9
-"""Share of the points of each of two labels that do not touch that must lie on one plane."""
 _FEW = 100
 """Points below which a label that touches no other has no plane."""
 
@@ -123,7 +121,7 @@ class _Surfaces:
         for (a, b), stays in meeting.items():
             if stays is not None and not self._taken & {a, b}:
                 rows = rows_of[a], rows_of[b]
-                if (stays or self._of_one_color(rows)) and self._common_plane(rows, self._params.flat):
+                if (stays or self._of_one_color(rows)) and self._common_plane(rows):
                     yield a, b
 
     def apart(self, meeting: Meeting) -> Iterator[tuple[int, int]]:
@@ -135,7 +133,7 @@ class _Surfaces:
             if self._taken & {larger, smaller} or (min(larger, smaller), max(larger, smaller)) in meeting:
                 continue
             rows = rows_of[larger], rows_of[smaller]
-            plane = self._common_plane(rows, _FLAT)
+            plane = self._common_plane(rows)
             if plane is None or not self._of_one_color(rows):
                 continue
             centre, normal, thickness = plane
@@ -151,7 +149,7 @@ class _Surfaces:
         names, boxes, longest = list[int](), list[Float64](), list[float]()
         for name in sorted(rows_of.keys() - {0}, key=lambda name: (-len(rows_of[name]), name)):
             rows = rows_of[name]
-            if len(rows) >= _FEW and self._common_plane((rows, rows), _FLAT) is not None:
+            if len(rows) >= _FEW and self._common_plane((rows, rows)) is not None:
                 places = self._cloud.points[rows].astype(np.float64)
                 names.append(name)
                 boxes.append(np.stack([places.min(axis=0), places.max(axis=0)]))
@@ -173,17 +171,12 @@ class _Surfaces:
         spread = TouchingParams().color_spread
         return likeness(*(histogram(self._bins[part], spread) for part in rows)) >= self._params.colors
 
-    def _common_plane(
-        self, rows: tuple[NDArray[np.intp], NDArray[np.intp]], flat: float
-    ) -> tuple[Float64, Float64, float] | None:
-        """The plane of the larger of two sets of points, on which most of each lies, with its thickness; None if not.
-
-        flat: how much of each.
-        """
+    def _common_plane(self, rows: tuple[NDArray[np.intp], NDArray[np.intp]]) -> tuple[Float64, Float64, float] | None:
+        """The plane of the larger of two sets of points, with its thickness; None where not most of each lies on it."""
         larger, smaller = (thinned(self._cloud.points[part], _ENOUGH) for part in sorted(rows, key=len, reverse=True))
         thickness = max(self._params.thickness * box_diagonal(smaller, _TRIM), self._cloud.spacing)
         plane = plane_of_most(larger, thickness, _ROUNDS)
-        if any(on_plane(part, plane, thickness).mean() < flat for part in (larger, smaller)):
+        if any(on_plane(part, plane, thickness).mean() < self._params.flat for part in (larger, smaller)):
             return None
         return *plane, thickness
 
