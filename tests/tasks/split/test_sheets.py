@@ -140,7 +140,8 @@ def test_views_that_show_page_and_mug_as_one_show_a_group(flush, agreement):
     seen = np.bincount(labels.label)[1:].astype(np.int32)
     both = np.array([[0, seen[1], seen[2]]], np.int32)
     view = Tally("a", np.arange(1, 4, dtype=np.int32), seen, both, np.zeros((3, 3), np.int32), np.ones(1, np.float32))
-    tree = hierarchy(cloud, cameras, [], labels, [view], params=HierarchyParams(prior=0.0, flush=flush))
+    params = HierarchyParams(prior=0.0, contact=0.0, apart=0.0, flush=flush)
+    tree = hierarchy(cloud, cameras, [], labels, [view], params=params)
     assert tree.parent.tolist() == [0, 4, 4, 0]
     assert tree.agreement[3] == pytest.approx(agreement)
 
