@@ -174,6 +174,7 @@ def densify(
         both = source[halves]
         scales = xp.exp(xp.asarray(values["log_scales"][both], dtype=xp.float64))
         offset = backend.put(generator.normal(size=(len(both), 3))) * scales
+        # On CUDA an einsum would be one of cuBLAS: see `torch_backend`.
         turned = (rotations(values["quaternions"][both], xp) * offset[:, None, :]).sum(2)
         out["means"][halves] += xp.asarray(turned, dtype=xp.float32)
         out["log_scales"][halves] -= float(np.log(SPLIT_SHRINK))

@@ -138,11 +138,13 @@ def train(
         with backend.stream():
             return _Training(initial, views, params, extents, seed, label_ids, parts, backend).run()
 
+    if backend is not None:
+        return run_on(backend)
     device = _device(views)
     try:
-        return run_on(backend or backend_for(device, cores()))
+        return run_on(backend_for(device, cores()))
     except MemoryError:
-        if backend or device == "cpu" or not last_try():
+        if device == "cpu" or not last_try():
             raise
     warn(f"{device} has not enough memory for a training of {len(views)} views: it ran on the CPU.")
     return run_on(backend_for("cpu", cores()))

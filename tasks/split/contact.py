@@ -34,7 +34,7 @@ class Contact:
         return Contact(between, np.asarray(self.size @ member, np.float32))
 
     def own(self, member: Float32) -> Float64:
-        """[S] share of what each set touches that is of the set, 0..1."""
+        """[S] share of what the pieces of each set touch, each for itself, that is of the set, 0..1."""
         touched = member @ self.points
         return np.asarray((touched * member).sum(axis=1) / (touched.sum(axis=1) + 2 * _FAINT), np.float64)
 
