@@ -57,8 +57,10 @@ class RunOptions:
     """How many tasks may run at once; 0 = one a core."""
     memory: OptionalText = None
     """How much memory tasks may declare together, such as 8GB; what is free, when left out."""
-    executor: str = "threads"
-    """threads, processes, dask (a cluster on this machine) or dask://HOST:PORT."""
+    executor: OptionalText = None
+    """mixed (one task in this process, those beside it in processes of their own), threads, processes, dask (a cluster
+    on this machine) or dask://HOST:PORT; when left out, mixed, but threads where tasks compute on a GPU, whose memory
+    they then share."""
     dry_run: bool = False
     """Tell what would run and why, and run nothing."""
     verify: bool = False
@@ -98,11 +100,12 @@ class RunOptions:
             raise InputError(f"--memory {error}") from None
         if self.memory is not None and memory_mb == 0:
             raise InputError(f"--memory {self.memory} is out of range; it must be 1 MiB or more, such as 8GB.")
+        on_gpu = device_here() == "cuda" or lacks_cuda() is None  # whatever the driver shows
         return {
             "jobs": self.jobs,
             "memory_mb": memory_mb,
-            "gpus": int(device_here() == "cuda" or lacks_cuda() is None),  # whatever the driver shows
-            "executor": self.executor,
+            "gpus": int(on_gpu),
+            "executor": self.executor or ("threads" if on_gpu else "mixed"),
             "dry": self.dry_run,
         }
 

@@ -12,7 +12,7 @@ from ss_flow.errors import InputError
 from ss_flow.execute import Invocation
 from ss_flow.task import Resources
 
-NAMES = ("threads", "processes", "dask", "dask://HOST:PORT")
+NAMES = ("mixed", "threads", "processes", "dask", "dask://HOST:PORT")
 
 OnProgress = Callable[[str, int, int, str], None]
 """Called from any thread with the key of a call, how much is done, of how much, and a note."""
@@ -44,16 +44,18 @@ class Executor(Protocol):
 
 
 def open_executor(name: str, workers: int, store: Store, on_progress: OnProgress) -> Executor:
-    """The executor "threads", "processes", "dask" (a cluster on this machine) or "dask://HOST:PORT".
+    """The executor "threads", "processes", "mixed" (one call in a thread of this process, and those beside it in
+    processes of their own), "dask" (a cluster on this machine) or "dask://HOST:PORT".
 
     workers: how many calls may run at once on this machine; another cluster's `capacity` says it for itself.
 
     Raises InputError for another name, or when Dask is not installed or does not answer.
     """
-    if name in ("threads", "processes"):
+    here = {"threads": workers, "processes": 0, "mixed": 1}
+    if name in here:
         from ss_flow.executors.local import LocalPool
 
-        return LocalPool(workers, store, on_progress, processes=name == "processes")
+        return LocalPool(workers, store, on_progress, here=here[name])
     if found := re.fullmatch(r"dask(?:://(.+))?", name):
         from ss_flow.executors.dask import open_dask
 

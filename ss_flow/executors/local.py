@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextvars
 import threading
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from ss_flow.cache.store import Action, Store
@@ -12,20 +13,30 @@ from ss_flow.executors import OnProgress
 from ss_flow.executors.worker import Worker
 from ss_flow.task import Resources
 
+START_SECONDS = 1.0
+"""About what a process takes to start and to load what a task needs."""
+LOOK_SECONDS = 0.01
+"""How often a call that waits for room looks whether it should have a process."""
+
 
 class LocalPool:
-    """The executors "threads" and "processes": as many calls at once as there are workers.
+    """Executors of this machine: as many calls at once as there are workers.
 
-    A task marked `isolate` always gets a process to itself. Other processes are kept for the next call.
+    here: how many of them may run in threads of this process; the others get processes of their own, which are kept for
+    the next call. Where there are both, no process is started before calls have waited for room here as long as its
+    start takes: short runs need none. A task marked `isolate` always gets a process to itself.
     """
 
     capacity: Resources | None = None
 
-    def __init__(self, workers: int, store: Store, on_progress: OnProgress, *, processes: bool) -> None:
+    def __init__(self, workers: int, store: Store, on_progress: OnProgress, *, here: int) -> None:
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="task")
         self._store = store
         self._on_progress = on_progress
-        self._processes = processes
+        self._only_processes = here == 0
+        self._here = threading.Semaphore(here)
+        self._waited = 0.0
+        """Seconds of calls, together, since a process was last given instead."""
         self._lock = threading.Lock()
         self._idle: list[Worker] = []
         self._busy: set[Worker] = set()
@@ -35,13 +46,32 @@ class LocalPool:
         return self._pool.submit(contextvars.Context().run, self._run, invocation)
 
     def _run(self, invocation: Invocation) -> Action:
+        if invocation.isolate or self._only_processes or not self._finds_room_here():
+            return self._run_in_process(invocation)
+        try:
+            return self._run_here(invocation)
+        finally:
+            self._here.release()
+
+    def _finds_room_here(self) -> bool:
+        """Whether a call got room in this process; else it should have a process of its own."""
+        since = time.monotonic()
+        while not self._here.acquire(timeout=LOOK_SECONDS):
+            with self._lock:
+                now = time.monotonic()
+                self._waited += now - since
+                since = now
+                if self._idle or self._waited > START_SECONDS:
+                    self._waited = 0.0
+                    return False
+        return True
+
+    def _run_here(self, invocation: Invocation) -> Action:
         def listener(done: int, total: int, note: str) -> None:
             if self._cancelled:
                 raise Cancelled(invocation.label)
             self._on_progress(invocation.key, done, total, note)
 
-        if self._processes or invocation.isolate:
-            return self._run_in_process(invocation)
         if self._cancelled:
             raise Cancelled(invocation.label)
         return execute(invocation, self._store, listener)

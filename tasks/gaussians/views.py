@@ -147,8 +147,8 @@ def crop_camera(full: Camera, inside: Bool, points: Float32 | Float64, params: C
     _, column, row, _ = pixels_in_view(points, full)
     columns, rows = np.flatnonzero(inside.any(axis=0)), np.flatnonzero(inside.any(axis=1))
     if len(column):
-        columns = np.append(columns, np.quantile(column, (0.005, 0.995)))
-        rows = np.append(rows, np.quantile(row, (0.005, 0.995)))
+        outermost = np.quantile([column, row], (0.005, 0.995), axis=1)
+        columns, rows = np.append(columns, outermost[:, 0]), np.append(rows, outermost[:, 1])
     if not len(columns):
         return full
     x0, y0 = (max(0, int(v.min()) - params.margin_px) for v in (columns, rows))

@@ -5,8 +5,8 @@ Beyond Split&Splat.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,21 @@ LEAST_VIEWS = 4
 """Views whose masks hold a missing point, its own among them."""
 STRIDE = 2
 """Every second row and column of a mask is looked at for missing points."""
+TOGETHER = 50_000
+"""Points from which on views are not asked about those of one more view at once: a question takes a tenth of a
+millisecond however few its points are, and memory for all of them."""
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Some pixels of a view whose depth is known, and the points of the surface there."""
+
+    place: int
+    """Of the view among those of the instance."""
+    row: _Rows
+    column: _Rows
+    points: Float32
+    """[N, 3] world."""
 
 
 def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator[Int32]:
@@ -45,15 +60,14 @@ def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator
 
     scene: at least the views that have a mask. Yields, for each of these, the channels [H, W] that `group_view` takes.
     """
-    for view, mask, others in _views(scene, instance):
+    rows = _rows(scene, instance)
+    near = (_surface(scene, rows, k, *_border(instance.mask(k))) for k in range(len(rows)))
+    for some, votes, held in _votes(scene, instance, rows, near):
+        mask = instance.mask(some.place)
         channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
-        y, x = np.nonzero(_border(mask))
-        if len(y):
-            y, x, points = _surface(scene, view, y, x)
-            votes, held = _votes(scene, points, others)
-            same = np.where(mask[y, x], held, votes - held) + 1
-            doubtful = (votes >= 2) & (same < share * (votes + 1))
-            channels[y[doubtful], x[doubtful]] = IGNORED
+        same = np.where(mask[some.row, some.column], held, votes - held) + 1
+        doubtful = (votes >= 2) & (same < share * (votes + 1))
+        channels[some.row[doubtful], some.column[doubtful]] = IGNORED
         yield channels
 
 
@@ -71,19 +85,21 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
         return instance
     tree = cKDTree(instance.points)
     found: list[tuple[Float32, UInt8, Float32]] = []
-    for view, mask, others in _views(scene, instance):
-        y, x = np.nonzero(mask[::STRIDE, ::STRIDE])
-        y, x, points = _surface(scene, view, STRIDE * y, STRIDE * x)
-        distance, _ = tree.query(points, distance_upper_bound=BEYOND * spacing, workers=1)
-        far = np.flatnonzero(np.isinf(distance))
-        if not len(far):
-            continue
-        votes, held = _votes(scene, points[far], others)
+    rows = _rows(scene, instance)
+
+    def missing(place: int) -> _Pixels:
+        row, column = np.nonzero(instance.mask(place)[::STRIDE, ::STRIDE])
+        some = _surface(scene, rows, place, STRIDE * row, STRIDE * column)
+        distance, _ = tree.query(some.points, distance_upper_bound=BEYOND * spacing, workers=1)
+        far = np.isinf(distance)
+        return _Pixels(place, some.row[far], some.column[far], some.points[far])
+
+    for some, votes, held in _votes(scene, instance, rows, map(missing, range(len(rows)))):
         joins = (held + 1 >= LEAST_VIEWS) & (held + 1 >= share * (votes + 1))
         if joins.any():
-            rows = far[joins]
-            colors = shared_rgb(scene.frames[view])[y[rows], x[rows]]
-            found.append((points[rows], colors, ((held + 1) / (votes + 1))[joins].astype(np.float32)))
+            photo = shared_rgb(scene.frames[rows[some.place]])
+            colors = photo[some.row[joins], some.column[joins]]
+            found.append((some.points[joins], colors, ((held + 1) / (votes + 1))[joins].astype(np.float32)))
     if not found:
         return instance
     points, colors, confidence = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
@@ -100,43 +116,61 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     )
 
 
-def _views(scene: SceneViews, instance: InstanceMasks) -> Iterator[tuple[int, Bool, list[tuple[int, Bool]]]]:
-    """Each view with a mask: its row, the mask, and rows and masks of the views that are asked about it."""
+def _rows(scene: SceneViews, instance: InstanceMasks) -> list[int]:
+    """The scene's row of each view with a mask."""
     row_of = scene.row_of()
-    views = [row_of[name] for name in instance.views]
-    asked = [(views[k], instance.mask(k)) for k in range(0, len(views), -(-len(views) // MOST_VIEWS))]
-    for k, view in enumerate(views):
-        yield view, instance.mask(k), [(other, held) for other, held in asked if other != view]
+    return [row_of[name] for name in instance.views]
 
 
-def _border(mask: Bool) -> Bool:
-    """[H, W] the pixels within reach of a mask's border."""
+def _border(mask: Bool) -> tuple[_Rows, _Rows]:
+    """Rows and columns of the pixels within reach of a mask's border."""
     import cv2
 
-    border = np.zeros_like(mask)
-    if mask.any():
-        x0, y0, x1, y1 = bounds(mask)
-        box = (slice(max(y0 - REACH, 0), y1 + REACH), slice(max(x0 - REACH, 0), x1 + REACH))
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH + 1, 2 * REACH + 1))
-        image = mask[box].astype(np.uint8)
-        border[box] = cv2.dilate(image, disc) > cv2.erode(image, disc, borderValue=1)
-    return border
+    x0, y0, x1, y1 = bounds(mask)
+    top, left = max(y0 - REACH, 0), max(x0 - REACH, 0)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH + 1, 2 * REACH + 1))
+    image = mask[top : y1 + REACH, left : x1 + REACH].astype(np.uint8)
+    row, column = np.nonzero(cv2.dilate(image, disc) > cv2.erode(image, disc, borderValue=1))
+    return top + row, left + column
 
 
-def _surface(scene: SceneViews, view: int, row: _Rows, column: _Rows) -> tuple[_Rows, _Rows, Float32]:
-    """Those of some pixels of a view whose depth is known, rows and columns, and their surface points [N, 3], world."""
+def _surface(scene: SceneViews, rows: list[int], place: int, row: _Rows, column: _Rows) -> _Pixels:
+    """Those of some pixels of a view whose depth is known."""
+    view = rows[place]
     camera = scene.cameras[view]
     depth = depth_at(scene.depths[view], column, row, camera.width, camera.height)
     known = depth > 0
     points = surface_of_pixels(column[known], row[known], depth[known], camera)
-    return row[known], column[known], points.astype(np.float32)
+    return _Pixels(place, row[known], column[known], points.astype(np.float32))
 
 
-def _votes(scene: SceneViews, points: Float32, others: list[tuple[int, Bool]]) -> tuple[Int32, Int32]:
-    """[N] how many other views see each point, and how many of these have it in their mask."""
-    seen, held = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
-    for view, mask in others:
-        rows, column, row, _ = scene.surface_points(view, points)
-        seen[rows] += 1
-        held[rows] += mask[row, column]
-    return seen, held
+def _votes(
+    scene: SceneViews, instance: InstanceMasks, rows: list[int], of_views: Iterable[_Pixels]
+) -> Iterator[tuple[_Pixels, Int32, Int32]]:
+    """The pixels of each view, [N] how many other views see each one's point, and how many of these have it in their
+    mask."""
+    asked = [(k, instance.mask(k)) for k in range(0, len(rows), -(-len(rows) // MOST_VIEWS))]
+    for some in _some_together(of_views):
+        sizes = [len(pixels.points) for pixels in some]
+        points, place = np.concatenate([p.points for p in some]), np.repeat([p.place for p in some], sizes)
+        seen, held = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+        for k, mask in asked:
+            visible, column, row, _ = scene.surface_points(rows[k], points)
+            other = place[visible] != k
+            seen[visible] += other
+            held[visible] += other & mask[row, column]
+        ends = np.cumsum(sizes)[:-1]
+        yield from zip(some, np.split(seen, ends), np.split(held, ends), strict=True)
+
+
+def _some_together(of_views: Iterable[_Pixels]) -> Iterator[list[_Pixels]]:
+    """The views one after the other, as many at once as their points allow."""
+    some, count = list[_Pixels](), 0
+    for pixels in of_views:
+        some.append(pixels)
+        count += len(pixels.points)
+        if count >= TOGETHER:
+            yield some
+            some, count = [], 0
+    if some:
+        yield some

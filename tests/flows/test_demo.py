@@ -104,7 +104,7 @@ def test_another_room_does_not_take_away_what_a_user_put_beside_the_photos(tmp_p
         (["--set", "tau_label=7"], "must be between 0 and 1"),
         (["--jobs", "-1"], "--jobs -1 is out of range"),
         (["--memory", "much"], "--memory"),
-        (["--executor", "slurm"], "choose one of: threads"),
+        (["--executor", "slurm"], "choose one of: mixed"),
         (["--seed", "-1"], "--seed -1 is out of range"),
     ],
 )

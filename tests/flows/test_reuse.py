@@ -252,7 +252,11 @@ def test_a_task_that_is_retuned_but_not_rewritten_keeps_its_results(warm, edited
     assert run_tiny(warm.scene, warm.store, out=warm.out).computed() == {}
 
 
-@pytest.mark.parametrize("how", [("--jobs", "1"), ("--jobs", "2"), ("--jobs", "2", "--executor", "processes")], ids=str)
+@pytest.mark.parametrize(
+    "how",
+    [("--jobs", "1"), ("--jobs", "2"), *(("--jobs", "2", "--executor", name) for name in ("threads", "processes"))],
+    ids=str,
+)
 def test_the_results_do_not_depend_on_how_many_tasks_run_at_once_or_where(tiny, tmp_path, how):
     other = run_tiny(tiny.scene, tmp_path / "store", *how, out=tmp_path / "out")
     assert other.code == 0, other.err

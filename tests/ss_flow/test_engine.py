@@ -45,14 +45,14 @@ def value(store, digest):
     return float(store.get(digest).value[0])
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.parametrize("executor", ["mixed", "threads", "processes"])
 def test_a_flow_gives_the_same_result_on_every_executor(store, executor):
     report = run(store, toy.flow, executor=executor)
     assert value(store, report.values["total"]) == 14.0
     assert [value(store, d) for d in report.values["squares"]] == [1.0, 4.0, 9.0]
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.parametrize("executor", ["mixed", "threads", "processes"])
 def test_a_sequence_is_read_item_by_item(store, executor):
     def flow():
         return {"total": toy.streamed_total(toy.source(values=(1.0, 2.0, 3.0)))}
@@ -61,7 +61,7 @@ def test_a_sequence_is_read_item_by_item(store, executor):
     assert value(store, report.values["total"]) == (1 + 2 + 3) + (1 + 3) + 3
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.parametrize("executor", ["mixed", "threads", "processes"])
 def test_a_bundle_is_taken_apart_into_inputs_and_put_together_for_the_task(store, executor):
     def flow(last: float = 3.0):
         xs = toy.source(values=(1.0, 2.0, last))
@@ -272,7 +272,7 @@ def test_the_last_task_that_waits_gets_the_cores_that_nobody_wants(store):
     assert sorted(value(store, d) for d in both.values.values()) == [1, 2]
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.parametrize("executor", ["mixed", "threads", "processes"])
 def test_half_done_work_is_kept_until_the_task_is_done(store, tmp_path, executor):
     falls_at = tmp_path / "falls_at"
     falls_at.write_text("3")
@@ -647,7 +647,7 @@ def test_a_result_that_is_taken_from_another_run_counts_as_used_and_is_in_the_re
     assert all(time.time() - used[name] < 600 for name in digests)
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.parametrize("executor", ["mixed", "threads", "processes"])
 def test_a_task_that_changes_what_it_is_given_changes_it_for_no_other(store, executor):
     def build():
         table = toy.table()

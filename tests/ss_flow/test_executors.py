@@ -30,6 +30,8 @@ from ss_flow.task import Resources
 
 SUPPORT = str(Path(toy.__file__).parent)
 PATIENCE = 30.0
+IN_THIS_PROCESS = ("mixed", "threads")
+"""Executors that run a call which has nothing beside it here."""
 
 
 def dask_cluster(scheduler=None, **options):
@@ -67,7 +69,7 @@ class Opened:
         return self.pool.submit(invocation).exception(PATIENCE)
 
 
-@pytest.fixture(params=["threads", "processes", "dask", "dask://HOST:PORT"])
+@pytest.fixture(params=["mixed", "threads", "processes", "dask", "dask://HOST:PORT"])
 def executor(request, store):
     name = request.param
     if name == "dask":
@@ -130,7 +132,7 @@ def test_what_a_task_raises_comes_back_as_itself(store, executor):
 @pytest.mark.parametrize(("task", "raised"), [(toy.unsayable, ValueError), (toy.unmade, toy.Unmade)])
 def test_what_cannot_travel_comes_back_as_its_text(store, executor, task, raised):
     error = executor.error(call(store, task, 2.0))
-    assert type(error) is (raised if executor.name == "threads" else RuntimeError)
+    assert type(error) is (raised if executor.name in IN_THIS_PROCESS else RuntimeError)
     assert "two is too much" in str(error)
     assert value(store, executor.run(call(store, toy.square, 3.0)).outputs[0]) == 9.0
 
@@ -144,7 +146,7 @@ def test_a_task_that_raises_what_a_lost_process_does_has_failed_of_itself(store,
 @pytest.mark.parametrize("name", ["SystemExit", "KeyboardInterrupt", "GeneratorExit"])
 def test_a_task_that_raises_what_ends_a_program_has_failed_and_the_next_one_is_run(store, executor, name):
     error = executor.error(call(store, toy.raising, 2.0, error=name))
-    if executor.name == "threads":
+    if executor.name in IN_THIS_PROCESS:
         assert type(error).__name__ == name
     else:
         assert type(error) is RuntimeError and str(error) == f"{name}: two is too much"
@@ -211,7 +213,7 @@ def test_a_call_is_told_how_many_cores_it_has(store, executor):
 
 @pytest.mark.parametrize("isolated", [True, False])
 def test_a_call_whose_process_dies_says_so_and_the_next_one_is_run(store, executor, isolated):
-    if executor.name == "threads" and not isolated:
+    if executor.name in IN_THIS_PROCESS and not isolated:
         pytest.skip("it would be this process")
     error = executor.error(replace(call(store, toy.abort, 1.0), isolate=isolated))
     assert type(error) is WorkerDied
@@ -226,6 +228,29 @@ def test_a_call_that_failed_may_be_tried_again(store, executor, tmp_path):
     assert str(executor.error(invocation)) == "fell"
     falls_at.unlink()
     assert value(store, executor.run(invocation).outputs[0]) == 3.0
+
+
+# "mixed" alone
+
+
+def located(store, seconds, count):
+    """In which process each of some calls was that begin at once, two at a time."""
+    opened = Opened("mixed", store)
+    futures = [opened.pool.submit(call(store, toy.located, float(x), seconds=seconds)) for x in range(count)]
+    for future in futures:
+        future.result(PATIENCE)
+    opened.pool.close()
+    return [int(note) for _, _, _, note in opened.heard]
+
+
+def test_calls_that_are_soon_done_start_no_process(store):
+    assert set(located(store, 0.05, 6)) == {os.getpid()}
+
+
+def test_what_runs_beside_a_long_call_gets_a_process_which_the_next_one_has_too(store):
+    where = located(store, 2.5, 4)
+    assert where.count(os.getpid()) == 2
+    assert len(set(where)) == 2
 
 
 # Dask alone
