@@ -34,7 +34,6 @@ import contextlib
 import copy
 import dataclasses
 import errno
-import functools
 import json
 import math
 import os
@@ -404,16 +403,11 @@ class Store:
 def _own(value: Any) -> Any:
     """The same with lists and tables of its own, which can be changed as nothing else of a frozen dataclass can."""
     own = value
-    for name in _fields_of(type(value)):
-        if isinstance(content := getattr(value, name), dict | list):
+    for item in dataclasses.fields(value):
+        if isinstance(content := getattr(value, item.name), dict | list):
             own = copy.copy(value) if own is value else own
-            object.__setattr__(own, name, copy.deepcopy(content))
+            object.__setattr__(own, item.name, copy.deepcopy(content))
     return own
-
-
-@functools.cache
-def _fields_of(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(kind))
 
 
 def _records(folder: str) -> Iterator[Entry]:

@@ -6,12 +6,11 @@ from typing import Any
 
 from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import Params
-from ss_flow.flows.splat import described
+from ss_flow.flows.splat import described, shown_masks
 from ss_flow.flows.split import Networks, Split
 from ss_flow.graph import each, labelled
 from ss_flow.tasks.artifacts import Gaussians, LabelMap
 from ss_flow.tasks.splat.label import label, own_gaussians, vote
-from ss_flow.tasks.splat.render_masks import render_masks
 
 
 def label_given(
@@ -44,7 +43,7 @@ def label_given(
     for number in range(settings.label.rounds):
         with labelled(str(number)):
             scene = voted(masks)
-            masks = render_masks(capture.views, scene, masks, params=settings.masks)
+            masks = shown_masks(capture, scene, masks, params)
     return {
         "refine": found.instances,
         "scene": scene,

@@ -95,9 +95,25 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
         "masks_refined": masks_refined,
         "merge": merged,
         "scene": scene,
-        "masks": render_masks(views, scene, masks_refined, params=settings.masks),
+        "masks": shown_masks(capture, scene, masks_refined, params),
         "describe": described(capture, found, networks, params, refined, reconstructed),
     }
+
+
+def shown_masks(
+    capture: Capture, scene: Gaussians, masks: tuple[LabelMap, ...], params: Params
+) -> tuple[LabelMap, ...]:
+    """The masks that the finished scene shows in all views; masks: the exclusive ones before."""
+    return each(
+        capture.frames,
+        capture.by_view,
+        capture.depths,
+        masks,
+        names=capture.names,
+        build=lambda frame, camera, depth, known: render_masks(
+            frame, camera, depth, scene, known, params=params.splat.masks
+        ),
+    )
 
 
 def described(

@@ -13,6 +13,7 @@ from ss_flow.tasks.artifacts import (
     Clicks,
     Hierarchy,
     InstanceMasks,
+    InstancesInView,
     MaskSet,
     PointCloud,
     PointLabels,
@@ -34,7 +35,7 @@ from ss_flow.tasks.split.hierarchy import hierarchy
 from ss_flow.tasks.split.observe import observe
 from ss_flow.tasks.split.parts import find_parts
 from ss_flow.tasks.split.propagate import propagate
-from ss_flow.tasks.split.reproject import reproject
+from ss_flow.tasks.split.reproject import instances_in_view, reproject
 from ss_flow.tasks.split.reprompt import reprompt
 from ss_flow.tasks.split.segment import segment
 from ss_flow.tasks.split.segment_rgbd import segment_rgbd
@@ -133,7 +134,8 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     prompted: tuple[PromptedMasks, ...] = ()
     if segmenter is not None and capture.masks is None:
         prompted = _prompted(capture, embeddings, seen, shown, labels, segmenter, params)
-    instances = reproject(points, seen, shown, labels, parts, prompted, params=params.reproject)
+    in_views = _in_views(capture, seen, shown, labels, prompted, params)
+    instances = reproject(points, labels, parts, in_views, min_views=params.reproject.min_views)
     seen_in = appearances(labels, seen)
     return Split(points, seen, masks, pieces, tree, labels, parts, instances, seen_in, embeddings, hinted)
 
@@ -271,6 +273,32 @@ def _prompted(
             params=params.reprompt,
             selection=params.reproject.selection,
         ),
+    )
+
+
+def _in_views(
+    capture: Capture,
+    seen: tuple[Visibility, ...],
+    shown: tuple[MaskSet, ...],
+    labels: PointLabels,
+    prompted: tuple[PromptedMasks, ...],
+    params: SplitParams,
+) -> tuple[InstancesInView, ...]:
+    """The masks of the instances in each view, by its own masks and those that the segmenter was asked for."""
+    settings = params.reproject.in_view()
+    if not prompted:
+        return each(
+            seen,
+            shown,
+            names=capture.names,
+            build=lambda visible, pool: instances_in_view(visible, pool, labels, params=settings),
+        )
+    return each(
+        seen,
+        shown,
+        prompted,
+        names=capture.names,
+        build=lambda visible, pool, asked: instances_in_view(visible, pool, labels, (asked,), params=settings),
     )
 
 

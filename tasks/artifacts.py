@@ -317,6 +317,20 @@ class PromptedMasks(PhotoMasks):
 
 
 @dataclass(frozen=True)
+class InstancesInView(PhotoMasks):
+    """The masks of all instances that one view shows, which do not overlap; the background's are the pixels of none."""
+
+    label: Int32
+    """[N] instance id of each mask, ascending, 0 = background."""
+    origin: UInt8
+    """[N] where the mask came from: FOUND, PROMPTED or DRAWN."""
+    held: Int32
+    """[N] pixels of the mask on which a dense point falls."""
+    contradicted: Int32
+    """[N] those of them whose point has another label."""
+
+
+@dataclass(frozen=True)
 class InstanceMasks(ViewMasks):
     """One instance after Split: its points and view-consistent masks, exclusive between instances (Split&Splat,
     M~_{k,l}). Id 0 is background."""

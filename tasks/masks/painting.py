@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, Visibility
+from ss_flow.tasks.artifacts import Bool, Float32, Int32, Visibility
 from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.geometry.zbuffer import paint
 from ss_flow.tasks.masks.overlap import weighted_iou
@@ -93,9 +93,11 @@ def stack_exclusive(shown: dict[int, Bool], height: int, width: int) -> Int32:
     return ids
 
 
-def contradicted(painted: PaintedView, ids: Int32, num_labels: int) -> tuple[Float64, Float64]:
-    """For each label the painted pixels that its mask holds, and those of them with another label: [L + 1] each."""
+def contradicted(painted: PaintedView, ids: Int32, labels: Int32) -> tuple[Int32, Int32]:
+    """For each of some labels [L] the painted pixels that its mask holds, and those of them with another label: [L]
+    each. ids: [H, W] the label whose mask holds each pixel."""
     under = ids.ravel()[painted.pixel]
-    held = np.bincount(under, minlength=num_labels + 1).astype(np.float64)
     other = (painted.label > 0) & (painted.label != under)
-    return held, np.bincount(under[other], minlength=num_labels + 1).astype(np.float64)
+    count = int(labels.max(initial=0)) + 1
+    held, against = (np.bincount(of, minlength=count)[labels].astype(np.int32) for of in (under, under[other]))
+    return held, against

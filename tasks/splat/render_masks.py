@@ -5,19 +5,16 @@ Beyond Split&Splat.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Gaussians, LabelMap
+from ss_flow.tasks.artifacts import DepthMap, Frame, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
-from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid, near_border, resampled
 from ss_flow.tasks.ranges import Fraction
@@ -60,13 +57,15 @@ class RenderMasksParams:
     environment=backend_identity,
 )
 def render_masks(
-    views: Views,
+    frame: Frame,
+    camera: Camera,
+    depth: DepthMap,
     scene: Gaussians,
-    refined: Sequence[LabelMap],
+    refined: LabelMap,
     *,
     params: RenderMasksParams,
-) -> tuple[LabelMap, ...]:
-    """The instance that weighs most in each pixel of each view, all Gaussians composited together (spec P5).
+) -> LabelMap:
+    """The instance that weighs most in each pixel of a view, all Gaussians composited together (spec P5).
 
     0 where that is the background, where the scene leaves a hole, and where a frame is not valid. A pixel keeps its
     refined id where that weighs half as much or more, and where `params` holds the other instance or the background
@@ -74,27 +73,23 @@ def render_masks(
     some pixels apart, so are Gaussians and photo: thin strips are settled by the photo. A mask of which others would
     take most loses nothing to them.
 
-    views: all of the scene. refined: their exclusive masks after refinement.
+    refined: the view's exclusive masks after refinement.
     """
-    absent = np.setdiff1d(np.arange(np.iinfo(np.uint16).max + 1), scene.instance_id)
-    maps = []
-    for view, (frame, depth, known) in enumerate(zip(views.frames, views.depths, refined, strict=True)):
-        ids = _ids_of_view(scene, views.cameras[view], known, params.share)
-        reach = round(at_diagonal(_FRINGE, *known.ids.shape))
-        keeps = np.isin(known.ids, absent)
-        if params.background == "fringe":
-            keeps |= ~(near_border(known.ids, reach) & (resampled(depth.depth, *known.ids.shape) > 0))
-        ids = np.where((ids == 0) & keeps, known.ids, ids)
-        if params.strips == "photo":
-            ids = settled_by_photo(decode_rgb(frame), known.ids, ids, reach)
-        ids = _without_swallowed(known.ids, ids, params.most)
-        ids[~decode_valid(frame)] = 0
-        maps.append(LabelMap(known.name, ids))
-        progress(view + 1, len(refined), known.name)
-    return tuple(maps)
+    known = refined.ids
+    ids = _ids_of_view(scene, camera, known, params.share)
+    reach = round(at_diagonal(_FRINGE, *known.shape))
+    keeps = ~np.isin(known, scene.instance_id)
+    if params.background == "fringe":
+        keeps |= ~(near_border(known, reach) & (resampled(depth.depth, *known.shape) > 0))
+    ids = np.where((ids == 0) & keeps, known, ids)
+    if params.strips == "photo":
+        ids = settled_by_photo(decode_rgb(frame), known, ids, reach)
+    ids = _without_swallowed(known, ids, params.most)
+    ids[~decode_valid(frame)] = 0
+    return LabelMap(refined.name, ids)
 
 
-def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap, share: float) -> np.ndarray:
+def _ids_of_view(scene: Gaussians, camera: Camera, known: np.ndarray, share: float) -> np.ndarray:
     """[H, W] uint16."""
     whole = render(scene, camera, winners=False)
     shown = select(scene, whole.visible)
@@ -107,11 +102,11 @@ def _ids_of_view(scene: Gaussians, camera: Camera, known: LabelMap, share: float
         for label, weight in zip(labels, weights, strict=True):
             ids[weight > heaviest] = label
             np.maximum(heaviest, weight, out=heaviest)
-            np.copyto(of_known, weight, where=known.ids == label)
+            np.copyto(of_known, weight, where=known == label)
     ids[whole.alpha < _SOLID] = 0
     keeps = (of_known > 0) & (of_known >= _BENEFIT * heaviest)
     keeps |= (ids > 0) & (heaviest < share * whole.alpha)
-    return np.where(keeps, known.ids, ids)
+    return np.where(keeps, known, ids)
 
 
 def _without_swallowed(masks: np.ndarray, shown: np.ndarray, most: float) -> np.ndarray:

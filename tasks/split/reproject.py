@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ss_flow.running import progress, warn
+from ss_flow.running import warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     DRAWN,
@@ -15,6 +15,7 @@ from ss_flow.tasks.artifacts import (
     PROMPTED,
     Bool,
     InstanceMasks,
+    InstancesInView,
     MaskSet,
     PointCloud,
     PointLabels,
@@ -36,6 +37,7 @@ from ss_flow.tasks.masks.pool import smoothed
 from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
 from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.unread import by_default
 
 _DENSE = 2.5
 """Pixels, of an image with a diagonal of 800, between a label's points up to which `reach` is meant as it stands."""
@@ -60,45 +62,71 @@ class ReprojectParams:
     min_views: Count = 2
     """Views with a mask below which an instance is weak: kept as points, not reconstructed."""
 
+    def in_view(self) -> ReprojectParams:
+        """For the steps of single views: what these do not read is as by default, so that it does not enter the key."""
+        return by_default(self, "min_views")
+
+
+@task(name="split.instances_in_view", resources=Resources(cores=1, memory_mb=700))
+def instances_in_view(
+    view: Visibility,
+    pool: MaskSet,
+    labels: PointLabels,
+    prompted: Sequence[PromptedMasks] = (),
+    *,
+    params: ReprojectParams,
+) -> InstancesInView:
+    """One mask at most of each label in a view (M~_{k,l}; spec S5); they do not overlap: smaller ones are on top.
+
+    pool: the view's masks. prompted: masks of the view from `split.reprompt`, if it was asked; they stand in where the
+    view's own masks do not show a label, or show it less well; where there is none either, the label's points do
+    (`draw_missing`).
+    """
+    painted = paint_for_selection(view, labels.label, params.selection)
+    shown, origin = _masks_of_view(painted, view, pool, prompted, params)
+    ids = stack_exclusive(shown, view.height, view.width)
+    label = np.unique(ids)
+    held, against = contradicted(painted, ids, label)
+    return InstancesInView(
+        **vars(Masks.of(ids == i for i in label)),
+        name=view.name,
+        height=view.height,
+        width=view.width,
+        label=label,
+        origin=np.array([origin.get(int(i), FOUND) for i in label], np.uint8),
+        held=held,
+        contradicted=against,
+    )
+
 
 @task(resources=Resources(cores=1, memory_mb=1500))
 def reproject(
     points: PointCloud,
-    visibility: Sequence[Visibility],
-    masks: Sequence[MaskSet],
     labels: PointLabels,
     parts: PointParts,
-    prompted: Sequence[PromptedMasks],
+    views: Sequence[InstancesInView],
     *,
-    params: ReprojectParams,
+    min_views: int,
 ) -> tuple[InstanceMasks, ...]:
-    """The instances that the labelled points make, with one mask at most in each view (M~_{k,l}; spec S5).
+    """The instances that the labelled points make, with their masks in all views.
 
-    visibility, masks: one of each per view. prompted: masks from `split.reprompt`, for any of the views, by name; they
-    stand in where the view's own masks do not show a label, or show it less well; where there is none either, the
-    label's points do (`draw_missing`). The masks of one view do not overlap: smaller ones are on top. The first
-    instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id. An
+    The first instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id. An
     instance's confidence is its points' mean share of votes, less the share of its painted pixels that other labels
-    contradict. Warns where there is none but the background, and where every other one is weak.
+    contradict. min_views: as in `ReprojectParams`. Warns where there is none but the background, and where every other
+    one is weak.
     """
-    by_name = {extra.name: extra for extra in prompted}
     num_labels = int(labels.label.max(initial=0))
     held, against = np.zeros(num_labels + 1), np.zeros(num_labels + 1)
-    views: list[dict[int, tuple[Masks, int]]] = []
-    for k, (view, pool) in enumerate(zip(visibility, masks, strict=True)):
-        progress(k, len(masks), view.name)
-        painted = paint_for_selection(view, labels.label, params.selection)
-        shown, origin = _masks_of_view(painted, view, pool, by_name.get(view.name), params)
-        ids = stack_exclusive(shown, view.height, view.width)
-        views.append({int(i): (Masks.of([ids == i]), origin.get(int(i), FOUND)) for i in np.unique(ids)})
-        for total, part in zip((held, against), contradicted(painted, ids, num_labels), strict=True):
-            total += part
+    shown_in: dict[int, list[tuple[InstancesInView, int]]] = {}
+    for view in views:
+        held[view.label] += view.held
+        against[view.label] += view.contradicted
+        for row, label in enumerate(view.label.tolist()):
+            shown_in.setdefault(label, []).append((view, row))
     agreed = 1 - against / np.maximum(held, 1)
-    names = tuple(view.name for view in visibility)
     found = []
     for label in np.union1d([0], labels.label).tolist():
-        rows = labels.label == label
-        shown_in = {name: view[label] for name, view in zip(names, views, strict=True) if label in view}
+        rows, shown = labels.label == label, shown_in.get(label, [])
         share = labels.confidence[rows]
         found.append(
             InstanceMasks(
@@ -108,10 +136,10 @@ def reproject(
                 point_confidence=share,
                 point_part=parts.part[rows],
                 confidence=float(share.mean(dtype=np.float64)) * float(agreed[label]) if share.size else 0.0,
-                views=tuple(shown_in),
-                **vars(Masks.joined([mask for mask, _ in shown_in.values()])),
-                origin=np.array([kind for _, kind in shown_in.values()], np.uint8),
-                weak=label > 0 and len(shown_in) < params.min_views,
+                views=tuple(view.name for view, _ in shown),
+                **vars(Masks.joined([view.rows([row]) for view, row in shown])),
+                origin=np.array([view.origin[row] for view, row in shown], np.uint8),
+                weak=label > 0 and len(shown) < min_views,
             )
         )
     if len(found) == 1:
@@ -121,20 +149,20 @@ def reproject(
         )
     elif all(instance.weak for instance in found[1:]):
         warn(
-            f"No instance has masks in as many views as split.reproject.min_views ({params.min_views}), so none is "
+            f"No instance has masks in as many views as split.reproject.min_views ({min_views}), so none is "
             "reconstructed: give more photos, or lower it."
         )
     return tuple(found)
 
 
 def _masks_of_view(
-    painted: PaintedView, view: Visibility, pool: MaskSet, prompted: PromptedMasks | None, params: ReprojectParams
+    painted: PaintedView, view: Visibility, pool: MaskSet, prompted: Sequence[PromptedMasks], params: ReprojectParams
 ) -> tuple[dict[int, Bool], dict[int, int]]:
     """A mask of each label that a view shows, not yet exclusive, and where it comes from."""
     shown = select_masks(painted, pool, params.selection)
     origin = dict.fromkeys(shown, FOUND)
-    if prompted is not None:
-        for label, mask in zip(prompted.label.tolist(), prompted.dense(), strict=True):
+    for asked in prompted:
+        for label, mask in zip(asked.label.tolist(), asked.dense(), strict=True):
             agrees = agreement(painted, mask, label)
             own = agreement(painted, shown[label], label) if label in shown else 0.0
             if agrees >= params.selection.min_iou and agrees > own:

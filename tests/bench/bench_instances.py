@@ -57,7 +57,7 @@ from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.hierarchy import hierarchy
 from ss_flow.tasks.split.observe import observe
 from ss_flow.tasks.split.propagate import propagate
-from ss_flow.tasks.split.reproject import reproject
+from ss_flow.tasks.split.reproject import instances_in_view, reproject
 from ss_flow.tasks.split.segment import segment
 from ss_flow.tasks.split.tally import tally
 from ss_flow.tasks.split.visibility import visibility
@@ -193,7 +193,10 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
     order = np.random.default_rng(1).permutation(len(seen))
     again, _ = labelled(room, *([of[k] for k in order] for of in (seen, masks, observed)), split)
     whole = PointParts(np.zeros_like(labels.label))
-    instances = reproject(room.cloud, seen, masks, labels, whole, (), params=split.reproject)
+    in_views = tuple(
+        instances_in_view(view, pool, labels, params=split.reproject) for view, pool in zip(seen, masks, strict=True)
+    )
+    instances = reproject(room.cloud, labels, whole, in_views, min_views=split.reproject.min_views)
     maps = resolve(room.cameras, instances)
     values = evaluate_masks(maps, room.truth, tree).values
     table = contingency(*pooled(maps, room.truth)).without(truth=0, predicted=0)

@@ -99,7 +99,10 @@ RUNS: dict[str, tuple[Make, str]] = {
         lambda base, scene: [scene, "--dry-run", "--out", file(folder(base / "papers") / "a.txt").parent],
         "papers holds something else than an earlier result",
     ),
-    "an unknown executor": (lambda base, scene: [scene, "--executor", "slurm"], "choose one of: mixed, threads, processes"),
+    "an unknown executor": (
+        lambda base, scene: [scene, "--executor", "slurm"],
+        "choose one of: mixed, threads, processes",
+    ),
     "a negative number of jobs": (lambda base, scene: [scene, "--jobs", "-1"], "--jobs -1 is out of range"),
     "an output that is a file": (
         lambda base, scene: [scene, "--out", file(base / "f")],

@@ -357,12 +357,9 @@ def test_thinning_keeps_points_spread_over_the_whole_surface():
 
 def drawn(built, scene, maps=None, frames=None, depths=None, **params):
     """The masks that a finished scene shows."""
-    return render_masks(
-        replace(built.views, frames=frames or built.scene.frames, depths=depths or built.scene.depths),
-        scene,
-        maps or built.scene.maps,
-        params=RenderMasksParams(**params),
-    )
+    params = RenderMasksParams(**params)
+    views = (frames or built.scene.frames, built.views.cameras, depths or built.scene.depths, maps or built.scene.maps)
+    return [render_masks(f, c, d, scene, known, params=params) for f, c, d, known in zip(*views, strict=True)]
 
 
 def test_the_merged_scene_draws_the_masks_it_was_trained_with(built, whole):

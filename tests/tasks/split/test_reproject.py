@@ -26,7 +26,8 @@ from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.split.dense import DenseParams, dense
 from ss_flow.tasks.split.observe import ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
-from ss_flow.tasks.split.reproject import ReprojectParams, reproject
+from ss_flow.tasks.split.reproject import ReprojectParams, instances_in_view
+from ss_flow.tasks.split.reproject import reproject as gather
 from ss_flow.tasks.split.visibility import visibility
 
 ALL = ReprojectParams(SelectionParams(masks="all"), draw_missing=False)
@@ -48,6 +49,15 @@ def labelled(image, confidence=1.0):
     labels = PointLabels(flat, np.full(H * W, confidence, np.float32), int(flat.max()), none, none, none)
     places = np.random.default_rng(0).random((H * W, 3)).astype(np.float32)
     return PointCloud(places, np.zeros((H * W, 3), np.uint8), 1.0, 0.1), labels
+
+
+def reproject(cloud, views, masks, labels, parts, prompted, *, params):
+    """The instances of all views; prompted: of any of them, by name."""
+    in_views = [
+        instances_in_view(view, pool, labels, [p for p in prompted if p.name == view.name], params=params)
+        for view, pool in zip(views, masks, strict=True)
+    ]
+    return gather(cloud, labels, parts, in_views, min_views=params.min_views)
 
 
 def columns(low, high):
