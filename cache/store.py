@@ -181,6 +181,10 @@ class Store:
                     rename_folder(place, target)
         return object_digest
 
+    def limit_memory(self, most_bytes: int) -> None:
+        """Keep about so many bytes of what was read lately in memory, and forget what is there."""
+        self._recent = Recent(most_bytes)
+
     def get(self, object_digest: str) -> Any:
         """The stored value. Shared between callers: its arrays are read-only, its lists and tables the caller's own.
 

@@ -18,7 +18,8 @@ from typing import Any, overload
 import psutil
 
 from ss_flow.cache.location import open_store
-from ss_flow.cache.store import Action, Store
+from ss_flow.cache.store import MEMORY_BYTES, Action, Store
+from ss_flow.control_groups import usable_cores
 from ss_flow.errors import InputError
 from ss_flow.keys import Components, Value
 from ss_flow.own_copy import own_copy
@@ -133,7 +134,9 @@ def execute_here(invocation: Invocation, listener: Listener) -> Action:
 
 @functools.cache
 def _store_of_this_process(location: str) -> Store:
-    return open_store(location)
+    store = open_store(location)
+    store.limit_memory(MEMORY_BYTES // usable_cores())  # a process a core
+    return store
 
 
 def reference_to(task: Task[..., Any]) -> str:

@@ -193,12 +193,13 @@ def module_without_stars(name: str) -> Module | None:
     module = Module(name, source.is_package)
     statements = list(_top_level(ast.parse(source.text, str(source.path)).body, ()))
     bound = {name for statement, _ in statements for name in _bound_at_top(statement)}
-    changing = {s.name: _changed_by_call(s) for s, _ in statements if isinstance(s, ast.FunctionDef)}
-    bound |= {name for several in changing.values() for name in several[0]}
+    functions = {s.name: s for s, _ in statements if isinstance(s, ast.FunctionDef)}
+    if "global" in source.text:  # a look at every function takes as long as all else here
+        bound |= {name for function in functions.values() for name in _declared_global(function)}
     for statement, tests in statements:
-        called = (changing[name] for name in _called_at_once(statement) if name in changing)
+        called = (_changed_by_call(functions[name]) for name in _called_at_once(statement) if name in functions)
         at_once = () if isinstance(statement, DEFINITIONS) else _changed_in(statement)
-        changed = [*at_once, *itertools.chain(*itertools.chain(*called))]
+        changed = [*at_once, *itertools.chain(*called)]
         for name in dict.fromkeys([*_bound_at_top(statement), *(name for name in changed if name in bound)]):
             module.add(name, *tests, statement)
         nodes = ast.walk(statement) if isinstance(statement, _BLOCKS) else (statement,)
@@ -258,11 +259,14 @@ DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 _BLOCKS = (ast.For, ast.AsyncFor, ast.While, ast.With, ast.AsyncWith, ast.Match)
 
 
-def _changed_by_call(function: ast.FunctionDef) -> tuple[list[str], list[str]]:
+def _declared_global(function: ast.FunctionDef) -> list[str]:
+    return [name for node in ast.walk(function) if isinstance(node, ast.Global) for name in node.names]
+
+
+def _changed_by_call(function: ast.FunctionDef) -> list[str]:
     """The names that a function declares global, and those whose objects it changes: where they are its module's."""
-    declared = [name for node in ast.walk(function) if isinstance(node, ast.Global) for name in node.names]
     own = {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
-    return declared, [name for name in _changed_in(function) if name not in own]
+    return [*_declared_global(function), *(name for name in _changed_in(function) if name not in own)]
 
 
 def _called_at_once(statement: ast.stmt) -> Iterator[str]:

@@ -12,5 +12,6 @@ The steps, in the order in which they run:
    labels: `agreement`, `stuff`, `surfaces` with `shadows`, `mounds`, `sheets`, `edges`. `parts`: masks inside the masks
    of a label.
 6. `correct`, with its `part_masks`: instances that the user joins or divides.
-7. `reprompt`, `reproject`: the instances' masks in each view. `appearances`: the views that show each instance.
+7. `reprompt`, `instances_in_view`, `reproject`: the instances' masks in each view. `appearances`: the views that show
+   each instance.
 """
