@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import importlib.util
 import json
 import platform
 import shutil
@@ -18,6 +17,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
+from ss_flow.distributions import ABSENT, version
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import InStore, PositionalText, StoreOptions, console
 from ss_flow.flows.cli.telling import print_table
@@ -229,8 +229,8 @@ def _cuda() -> tuple[str, str]:
 
     what = f"Gaussians on {device_here()}, networks on {'cuda' if lacks_cuda() is None else 'cpu'}"
     if torch.cuda.is_available():
-        gsplat = importlib.util.find_spec("gsplat")
-        return f"{torch.cuda.get_device_name()}: {what}", "" if gsplat else "to use it: pip install 'ss-flow[cuda]'"
+        lacks = version("gsplat") == ABSENT
+        return f"{torch.cuda.get_device_name()}: {what}", "to use it: pip install 'ss-flow[cuda]'" if lacks else ""
     if shutil.which("nvidia-smi"):
         return "a driver, but torch is built without CUDA", "to use the GPU: install a torch built for CUDA"
     return f"none: {what}", ""

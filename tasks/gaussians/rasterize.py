@@ -8,14 +8,13 @@ before its transmittance T would fall below 1e-4; weight = T * alpha. A Gaussian
 from __future__ import annotations
 
 import functools
-import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ss_flow.distributions import ABSENT, version
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.device import VARIABLE, has_device, wanted
@@ -109,7 +108,7 @@ def device_here() -> str:
     if wanted() == "cpu":
         return "cpu"
     missing = ""
-    if importlib.util.find_spec("gsplat") is None:
+    if version("gsplat") == ABSENT:  # keys name its version
         missing = "gsplat is not installed (pip install 'ss-flow[cuda]')"
     elif "+cpu" in version("torch"):
         missing = f"torch {version('torch')} was built without it"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from ss_flow.distributions import ABSENT
 from ss_flow.errors import InputError
 from ss_flow.tasks import device
 from ss_flow.tasks.gaussians import rasterize
@@ -15,8 +16,8 @@ def machine(monkeypatch):
 
     def be(*, gsplat: bool = True, torch: str = "2.13.0+cu130", driver: bool = True, asked: str = "") -> None:
         monkeypatch.setenv(device.VARIABLE, asked)
-        monkeypatch.setattr(rasterize.importlib.util, "find_spec", lambda name: object() if gsplat else None)
-        monkeypatch.setattr(rasterize, "version", lambda name: torch if name == "torch" else "1.5.3")
+        versions = {"torch": torch, "gsplat": "1.5.3" if gsplat else ABSENT}
+        monkeypatch.setattr(rasterize, "version", versions.__getitem__)
         monkeypatch.setattr(rasterize, "has_device", lambda: driver)
         device.wanted.cache_clear()
         rasterize.device_here.cache_clear()
