@@ -17,6 +17,8 @@ START_SECONDS = 1.0
 """About what a process takes to start and to load what a task needs."""
 LOOK_SECONDS = 0.01
 """How often a call that waits for room looks whether it should have a process."""
+IDLE_SECONDS = 20.0
+"""After so long without a call a process is ended: it holds what its tasks have loaded, a network of a gigabyte say."""
 
 
 class LocalPool:
@@ -38,11 +40,13 @@ class LocalPool:
         self._waited = 0.0
         """Seconds of calls, together, since a process was last given instead."""
         self._lock = threading.Lock()
-        self._idle: list[Worker] = []
+        self._idle: list[tuple[Worker, float]] = []
+        """Processes without a call, and since when: those that had one last at the end."""
         self._busy: set[Worker] = set()
         self._cancelled = False
 
     def submit(self, invocation: Invocation) -> Future[Action]:
+        self._end_idle()
         return self._pool.submit(contextvars.Context().run, self._run, invocation)
 
     def _run(self, invocation: Invocation) -> Action:
@@ -70,6 +74,7 @@ class LocalPool:
         def listener(done: int, total: int, note: str) -> None:
             if self._cancelled:
                 raise Cancelled(invocation.label)
+            self._end_idle()
             self._on_progress(invocation.key, done, total, note)
 
         if self._cancelled:
@@ -78,6 +83,7 @@ class LocalPool:
 
     def _run_in_process(self, invocation: Invocation) -> Action:
         def listener(done: int, total: int, note: str) -> None:
+            self._end_idle()
             self._on_progress(invocation.key, done, total, note)
 
         worker = self._take_worker(invocation)
@@ -92,7 +98,7 @@ class LocalPool:
                 # After a fault the process may be damaged.
                 keep = whole and not invocation.isolate and not self._cancelled
                 if keep:
-                    self._idle.append(worker)
+                    self._idle.append((worker, time.monotonic()))
             if not keep:
                 worker.stop()
 
@@ -100,9 +106,17 @@ class LocalPool:
         with self._lock:
             if self._cancelled:
                 raise Cancelled(invocation.label)
-            worker = self._idle.pop() if self._idle and not invocation.isolate else Worker()
+            worker = self._idle.pop()[0] if self._idle and not invocation.isolate else Worker()
             self._busy.add(worker)
         return worker
+
+    def _end_idle(self) -> None:
+        with self._lock:
+            kept = time.monotonic() - IDLE_SECONDS
+            ended = [worker for worker, since in self._idle if since < kept]
+            self._idle = self._idle[len(ended) :]
+        for worker in ended:
+            worker.stop()
 
     def cancel(self) -> None:
         with self._lock:
@@ -114,12 +128,12 @@ class LocalPool:
     def kill(self) -> None:
         self.cancel()
         with self._lock:
-            workers = [*self._busy, *self._idle]
+            workers = [*self._busy, *(worker for worker, _ in self._idle)]
         for worker in workers:
             worker.kill()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def close(self) -> None:
         self._pool.shutdown(wait=True)
-        for worker in self._idle:
+        for worker, _ in self._idle:
             worker.stop()

@@ -253,6 +253,19 @@ def test_what_runs_beside_a_long_call_gets_a_process_which_the_next_one_has_too(
     assert len(set(where)) == 2
 
 
+def test_a_process_without_a_call_for_a_while_is_ended_when_another_call_says_how_far_it_is(store, monkeypatch):
+    monkeypatch.setattr("ss_flow.executors.local.IDLE_SECONDS", 0.5)
+    opened = Opened("processes", store)
+    running = [opened.pool.submit(call(store, toy.located, float(x), seconds=1.0)) for x in range(2)]
+    for future in running:
+        future.result(PATIENCE)
+    first = {int(note) for _, _, _, note in opened.heard}
+    assert all(map(psutil.pid_exists, first)) and len(first) == 2
+    opened.run(call(store, toy.crawl, 3.0, seconds=3.0))
+    assert sum(map(psutil.pid_exists, first)) == 1
+    opened.pool.close()
+
+
 # Dask alone
 
 
