@@ -6,7 +6,7 @@ from typing import Any
 
 from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import Params
-from ss_flow.flows.splat import described, shown_masks
+from ss_flow.flows.splat import described, final_masks
 from ss_flow.flows.split import Networks, Split
 from ss_flow.graph import each, labelled
 from ss_flow.tasks.artifacts import Gaussians, LabelMap
@@ -43,7 +43,7 @@ def label_given(
     for number in range(settings.label.rounds):
         with labelled(str(number)):
             scene = voted(masks)
-            masks = shown_masks(capture, scene, masks, params)
+            masks = final_masks(capture, scene, masks, params)
     return {
         "refine": found.instances,
         "scene": scene,

@@ -95,12 +95,12 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
         "masks_refined": masks_refined,
         "merge": merged,
         "scene": scene,
-        "masks": shown_masks(capture, scene, masks_refined, params),
+        "masks": final_masks(capture, scene, masks_refined, params),
         "describe": described(capture, found, networks, params, refined, reconstructed),
     }
 
 
-def shown_masks(
+def final_masks(
     capture: Capture, scene: Gaussians, masks: tuple[LabelMap, ...], params: Params
 ) -> tuple[LabelMap, ...]:
     """The masks that the finished scene shows in all views; masks: the exclusive ones before."""
