@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from ss_flow.errors import InputError
 from ss_flow.flows.capture import Capture
 from ss_flow.flows.params import SplitParams
-from ss_flow.graph import each
+from ss_flow.graph import INDEX, each
 from ss_flow.tasks.artifacts import (
     Appearances,
     Clicks,
@@ -285,20 +285,14 @@ def _in_views(
     params: SplitParams,
 ) -> tuple[InstancesInView, ...]:
     """The masks of the instances in each view, by its own masks and those that the segmenter was asked for."""
-    settings = params.reproject.in_view()
-    if not prompted:
-        return each(
-            seen,
-            shown,
-            names=capture.names,
-            build=lambda visible, pool: instances_in_view(visible, pool, labels, params=settings),
-        )
     return each(
         seen,
         shown,
-        prompted,
+        INDEX,
         names=capture.names,
-        build=lambda visible, pool, asked: instances_in_view(visible, pool, labels, (asked,), params=settings),
+        build=lambda visible, pool, view: instances_in_view(
+            visible, pool, labels, (prompted[view],) if prompted else (), params=params.reproject.in_view()
+        ),
     )
 
 

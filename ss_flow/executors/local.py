@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextvars
+import functools
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -74,22 +75,17 @@ class LocalPool:
         def listener(done: int, total: int, note: str) -> None:
             if self._cancelled:
                 raise Cancelled(invocation.label)
-            self._end_idle()
-            self._on_progress(invocation.key, done, total, note)
+            self._progressed(invocation.key, done, total, note)
 
         if self._cancelled:
             raise Cancelled(invocation.label)
         return execute(invocation, self._store, listener)
 
     def _run_in_process(self, invocation: Invocation) -> Action:
-        def listener(done: int, total: int, note: str) -> None:
-            self._end_idle()
-            self._on_progress(invocation.key, done, total, note)
-
         worker = self._take_worker(invocation)
         whole = False
         try:
-            action = worker.run(invocation, listener)
+            action = worker.run(invocation, functools.partial(self._progressed, invocation.key))
             whole = True
             return action
         finally:
@@ -109,6 +105,10 @@ class LocalPool:
             worker = self._idle.pop()[0] if self._idle and not invocation.isolate else Worker()
             self._busy.add(worker)
         return worker
+
+    def _progressed(self, key: str, done: int, total: int, note: str) -> None:
+        self._end_idle()
+        self._on_progress(key, done, total, note)
 
     def _end_idle(self) -> None:
         with self._lock:

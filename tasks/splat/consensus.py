@@ -60,9 +60,9 @@ def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator
 
     scene: at least the views that have a mask. Yields, for each of these, the channels [H, W] that `group_view` takes.
     """
-    rows = _rows(scene, instance)
-    near = (_surface(scene, rows, k, *_border(instance.mask(k))) for k in range(len(rows)))
-    for some, votes, held in _votes(scene, instance, rows, near):
+    views = _views(scene, instance)
+    near = (_surface(scene, views, k, *_border(instance.mask(k))) for k in range(len(views)))
+    for some, votes, held in _votes(scene, instance, views, near):
         mask = instance.mask(some.place)
         channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
         same = np.where(mask[some.row, some.column], held, votes - held) + 1
@@ -85,19 +85,19 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
         return instance
     tree = cKDTree(instance.points)
     found: list[tuple[Float32, UInt8, Float32]] = []
-    rows = _rows(scene, instance)
+    views = _views(scene, instance)
 
     def missing(place: int) -> _Pixels:
         row, column = np.nonzero(instance.mask(place)[::STRIDE, ::STRIDE])
-        some = _surface(scene, rows, place, STRIDE * row, STRIDE * column)
+        some = _surface(scene, views, place, STRIDE * row, STRIDE * column)
         distance, _ = tree.query(some.points, distance_upper_bound=BEYOND * spacing, workers=1)
         far = np.isinf(distance)
         return _Pixels(place, some.row[far], some.column[far], some.points[far])
 
-    for some, votes, held in _votes(scene, instance, rows, map(missing, range(len(rows)))):
+    for some, votes, held in _votes(scene, instance, views, map(missing, range(len(views)))):
         joins = (held + 1 >= LEAST_VIEWS) & (held + 1 >= share * (votes + 1))
         if joins.any():
-            photo = shared_rgb(scene.frames[rows[some.place]])
+            photo = shared_rgb(scene.frames[views[some.place]])
             colors = photo[some.row[joins], some.column[joins]]
             found.append((some.points[joins], colors, ((held + 1) / (votes + 1))[joins].astype(np.float32)))
     if not found:
@@ -116,7 +116,7 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     )
 
 
-def _rows(scene: SceneViews, instance: InstanceMasks) -> list[int]:
+def _views(scene: SceneViews, instance: InstanceMasks) -> list[int]:
     """The scene's row of each view with a mask."""
     row_of = scene.row_of()
     return [row_of[name] for name in instance.views]
@@ -134,9 +134,9 @@ def _border(mask: Bool) -> tuple[_Rows, _Rows]:
     return top + row, left + column
 
 
-def _surface(scene: SceneViews, rows: list[int], place: int, row: _Rows, column: _Rows) -> _Pixels:
+def _surface(scene: SceneViews, views: list[int], place: int, row: _Rows, column: _Rows) -> _Pixels:
     """Those of some pixels of a view whose depth is known."""
-    view = rows[place]
+    view = views[place]
     camera = scene.cameras[view]
     depth = depth_at(scene.depths[view], column, row, camera.width, camera.height)
     known = depth > 0
@@ -145,17 +145,17 @@ def _surface(scene: SceneViews, rows: list[int], place: int, row: _Rows, column:
 
 
 def _votes(
-    scene: SceneViews, instance: InstanceMasks, rows: list[int], of_views: Iterable[_Pixels]
+    scene: SceneViews, instance: InstanceMasks, views: list[int], of_views: Iterable[_Pixels]
 ) -> Iterator[tuple[_Pixels, Int32, Int32]]:
     """The pixels of each view, [N] how many other views see each one's point, and how many of these have it in their
     mask."""
-    asked = [(k, instance.mask(k)) for k in range(0, len(rows), -(-len(rows) // MOST_VIEWS))]
+    asked = [(k, instance.mask(k)) for k in range(0, len(views), -(-len(views) // MOST_VIEWS))]
     for some in _some_together(of_views):
         sizes = [len(pixels.points) for pixels in some]
         points, place = np.concatenate([p.points for p in some]), np.repeat([p.place for p in some], sizes)
         seen, held = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
         for k, mask in asked:
-            visible, column, row, _ = scene.surface_points(rows[k], points)
+            visible, column, row, _ = scene.surface_points(views[k], points)
             other = place[visible] != k
             seen[visible] += other
             held[visible] += other & mask[row, column]
