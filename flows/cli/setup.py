@@ -227,10 +227,15 @@ def _cuda() -> tuple[str, str]:
     from ss_flow.tasks.gaussians.rasterize import device_here
     from ss_flow.tasks.models.onnx import lacks_cuda
 
-    what = f"Gaussians on {device_here()}, networks on {'cuda' if lacks_cuda() is None else 'cpu'}"
+    lacks = lacks_cuda()
+    what = f"Gaussians on {device_here()}, networks on {'cuda' if lacks is None else 'cpu'}"
     if torch.cuda.is_available():
-        lacks = version("gsplat") == ABSENT
-        return f"{torch.cuda.get_device_name()}: {what}", "to use it: pip install 'ss-flow[cuda]'" if lacks else ""
+        to_do = {
+            "to train and draw on it: pip install 'ss-flow[cuda]'": version("gsplat") == ABSENT,
+            "to run networks on it: pip uninstall onnxruntime; pip install 'onnxruntime-gpu[cuda,cudnn]'": lacks,
+        }
+        why = f", since {lacks}" if lacks else ""
+        return f"{torch.cuda.get_device_name()}: {what}{why}", "; ".join(text for text, so in to_do.items() if so)
     if shutil.which("nvidia-smi"):
         return "a driver, but torch is built without CUDA", "to use the GPU: install a torch built for CUDA"
     return f"none: {what}", ""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+import io
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from importlib.metadata import distributions, version
 from pathlib import Path
 from types import ModuleType
@@ -34,6 +35,8 @@ _AS_ASKED = 1
 _ONE_AT_A_TIME = threading.Lock()
 _SLOW_FUSIONS = ("SkipLayerNormFusion", "BiasGeluFusion")
 """What ONNX Runtime puts in the place of two operators and, on a CPU, computes without vector instructions."""
+_NO_MEMORY = ("Failed to allocate memory", "out of memory", "bad_alloc", "bad allocation")
+"""What ONNX Runtime says where there is none, on CUDA or a CPU; all its errors are of one kind."""
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 
@@ -67,10 +70,23 @@ def lacks_cuda() -> str | None:
     runtime = load_onnxruntime()
     if _CUDA not in runtime.get_available_providers():
         return f"{_GPU_BUILD} is installed, but another onnxruntime hides it"
+    missing = _load_cuda(runtime)
     quiet = runtime.SessionOptions()
     quiet.log_severity_level = 4
     tried = runtime.InferenceSession(_one_node(), quiet, providers=[(_CUDA, _CUDA_OPTIONS), _CPU])
-    return None if _CUDA in tried.get_providers() else f"the CUDA provider of {_GPU_BUILD} does not start here"
+    if _CUDA in tried.get_providers():
+        return None
+    return f"the CUDA provider of {_GPU_BUILD} does not start here" + (f" ({missing})" if missing else "")
+
+
+def _load_cuda(runtime: ModuleType) -> str:
+    """Load CUDA's libraries from the packages that pip installs, where the loader does not look; gives what ONNX
+    Runtime says of one that is missing."""
+    if not hasattr(runtime, "preload_dlls"):  # before 1.21
+        return ""
+    with redirect_stdout(io.StringIO()) as said:
+        runtime.preload_dlls()
+    return next(iter(said.getvalue().splitlines()), "")
 
 
 def providers() -> list[Any]:
@@ -206,11 +222,13 @@ def imagenet_input(image: UInt8) -> Float32:
 def run(session: onnxruntime.InferenceSession, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
     """All outputs of a network, in its own order.
 
-    Raises InputError when the network refuses the arrays' names, types or shapes.
+    Raises InputError when the network refuses the arrays' names, types or shapes, MemoryError.
     """
     try:
         return list(session.run(None, dict(inputs)))
     except Exception as error:
+        if any(words in str(error) for words in _NO_MEMORY):
+            raise MemoryError("not enough memory to run a network") from error
         shapes = ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in inputs.items())
         raise InputError(
             f"the network refuses the inputs {shapes} ({_first_line(error)}); "

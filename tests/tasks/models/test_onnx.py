@@ -114,6 +114,21 @@ def test_networks_share_the_memory_that_they_work_in(tmp_path):
     subprocess.run([sys.executable, "-c", code, str(file)], check=True)
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        "[ONNXRuntimeError] : 6 : RUNTIME_EXCEPTION : Failed to allocate memory for requested buffer of size 268435456",
+        "[ONNXRuntimeError] : 1 : FAIL : CUDA failure 2: out of memory ; GPU=0 ; expr=cudaMalloc",
+    ],
+)
+def test_a_network_without_memory_is_told_as_the_host_is(said):
+    def run(outputs, inputs):
+        raise RuntimeError(said)
+
+    with pytest.raises(MemoryError, match="to run a network"):
+        networks.run(types.SimpleNamespace(run=run), {})
+
+
 class Runtime:
     """An ONNX Runtime with the CUDA provider; whether that starts is said when it is made."""
 
@@ -125,6 +140,10 @@ class Runtime:
 
     def SessionOptions(self):
         return onnxruntime.SessionOptions()
+
+    def preload_dlls(self):
+        if not self.starts:
+            print("Failed to load libcublasLt.so.13: no such file\nPlease follow a page to install CUDA.")
 
     def InferenceSession(self, source, options, providers):
         self.asked.append(providers)
@@ -168,7 +187,7 @@ def test_networks_run_on_cuda_where_it_starts_and_their_keys_say_so(machine):
         ({"device": True, "installed": True, "wanted": "cpu"}, None),
         (
             {"device": True, "installed": True, "starts": False},
-            "the CUDA provider of onnxruntime-gpu does not start here",
+            "the CUDA provider of onnxruntime-gpu does not start here (Failed to load libcublasLt.so.13: no such file)",
         ),
         ({"device": True, "installed": False, "wanted": "cuda"}, "onnxruntime-gpu is not installed"),
         ({"device": False, "installed": True, "wanted": "cuda"}, "there is no CUDA device with a driver"),
