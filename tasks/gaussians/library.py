@@ -98,6 +98,7 @@ _INTERFACE: dict[str, tuple[Any, list[Any]]] = {
     "ss_entries": (_INT64, [_POINTER]),
     "ss_rasterize": (_INT, [_POINTER, _SCENE, _IMAGES, _INT]),
     "ss_rasterize_backward": (_INT, [_POINTER, _SCENE, _IMAGES, _IMAGES, _GRADIENTS, _INT]),
+    "ss_shares": (_INT, [_POINTER, _SCENE, _POINTER, _POINTER, _INT]),
     "ss_photometric": (_INT, [_POINTER, *[_INT] * 3, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER, _INT]),
     "ss_surface_loss": (None, [_INT64, *[_POINTER] * 9, _FLOAT, _FLOAT, _INT, *[_POINTER] * 3]),
     "ss_adam": (None, [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE]),

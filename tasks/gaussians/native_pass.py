@@ -99,6 +99,18 @@ class NativePass:
         if self._workspace.turn != self._turn:
             raise RuntimeError("the workspace of this rendering holds another one by now")
 
+    def shares(self) -> tuple[Float32, Float32]:
+        """[N] the sum of each Gaussian's weights over all pixels, and over those whose id is its label.
+
+        Of a pass with `ids`. Raises RuntimeError when another pass has used the workspace.
+        """
+        self._check_workspace()
+        every, own = np.empty_like(self.radii), np.empty_like(self.radii)
+        scene = ctypes.byref(self._scene)
+        if library().ss_shares(self._workspace.handle, scene, address(every), address(own), self._threads):
+            raise MemoryError("not enough memory for the weights of a rendering")
+        return every, own
+
     def backward(
         self,
         rgb: Float32 | None,

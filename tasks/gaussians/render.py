@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
 from ss_flow.tasks.gaussians.initialise import SH_ZERO
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
@@ -85,10 +86,20 @@ def render(
                 there.radii.cpu().numpy() > 0,
                 there.max_contribution.cpu().numpy(),
             )
-    done = NativePass(parameters, labels, camera, settings)  # type: ignore[arg-type]
+    done = NativePass(parameters, labels, camera, settings, threads=cores())  # type: ignore[arg-type]
     none = np.full(done.alpha.shape, -1, np.int32), np.zeros(len(gaussians), np.float32)
     top, strongest = none if done.top is None or done.strongest is None else (done.top, done.strongest)
     return Rendering(done.rgb, done.alpha, done.depth, done.masks, top, done.radii > 0, strongest)
+
+
+def weights_shown(gaussians: Gaussians, camera: Camera, ids: Int32) -> tuple[Float32, Float32]:
+    """[N] the sum of each Gaussian's weights T * alpha over the image, and over the pixels of its own instance.
+
+    ids: [H, W] the instance that each pixel shows, of the camera's size. Always on the CPU.
+    """
+    parameters = tuple(np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in PARAMETERS)
+    labels, settings = np.ascontiguousarray(gaussians.instance_id, np.int32), Settings((0.0, 0.0, 0.0), 0, 0, False)
+    return NativePass(parameters, labels, camera, settings, ids=ids, threads=cores()).shares()  # type: ignore[arg-type]
 
 
 def weights_by_id(gaussians: Gaussians, camera: Camera, ids: NDArray[np.integer]) -> Iterator[tuple[int, Float32]]:
@@ -121,7 +132,7 @@ def _weigher(
 
         with suppress(MemoryError):
             return weigher(device, parameters, camera, settings)
-    drawn = NativePass(parameters, None, camera, settings)  # type: ignore[arg-type]
+    drawn = NativePass(parameters, None, camera, settings, threads=cores())  # type: ignore[arg-type]
     return lambda towards: drawn.backward(towards, None, None, None)["sh"][:, 0]
 
 

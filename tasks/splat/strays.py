@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
-from ss_flow.tasks.gaussians.render import weights_by_id
+from ss_flow.tasks.gaussians.render import weights_shown
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
 from ss_flow.tasks.geometry.images import resampled, size_within
@@ -43,10 +43,7 @@ def without_strays(cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[
     rows = np.flatnonzero(piece >= 0)
     if not len(rows):
         return scene
-    own, everywhere = (
-        np.bincount(piece[rows], weights[rows])
-        for weights in _weights(cameras, scene, masks, np.unique(scene.instance_id[rows]))
-    )
+    own, everywhere = (np.bincount(piece[rows], weights[rows]) for weights in _weights(cameras, scene, masks))
     instance = np.zeros(len(own), np.int32)
     instance[piece[rows]] = scene.instance_id[rows]
     order = np.lexsort((-own, instance))
@@ -92,17 +89,13 @@ def _spacing(points: Float32) -> float:
     return float(np.median(np.asarray(distance)[:, -1]))
 
 
-def _weights(
-    cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[LabelMap], asked: Int32
-) -> tuple[Float64, Float64]:
-    """[N] the weight of each Gaussian over all views: in pixels of its instance, where that is one of those asked for;
-    and in all pixels."""
+def _weights(cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[LabelMap]) -> tuple[Float64, Float64]:
+    """[N] the weight of each Gaussian over all views: in pixels of its instance, and in all pixels."""
     own, everywhere = np.zeros(len(scene)), np.zeros(len(scene))
-    rest = np.iinfo(np.uint16).max + 1
     for camera, shown in zip(cameras, masks, strict=True):
         small = camera.scaled(*size_within(MOST_PIXELS, camera.width, camera.height))
         ids = resampled(shown.ids, small.height, small.width).astype(np.int32)
-        for instance, weights in weights_by_id(scene, small, np.where(np.isin(ids, asked), ids, rest)):
-            everywhere += weights
-            own += np.where(scene.instance_id == instance, weights, 0)
+        of_all, of_own = weights_shown(scene, small, ids)
+        everywhere += of_all
+        own += of_own
     return own, everywhere

@@ -37,6 +37,11 @@ struct alignas(64) Sums {
     float value[16];
 };
 
+// Sums of one splat's weights in one band: over all pixels, and over those whose id is its label.
+struct Shares {
+    float all, own;
+};
+
 struct Span {
     int32_t splat, block, length;
 };
@@ -56,6 +61,7 @@ struct Band {
     Buffer<int32_t> used;          // [blocks] entries up to the one that made the block opaque
     Buffer<Sums> sums;
     Buffer<float> strongest;
+    Buffer<Shares> shares;
 };
 
 struct Frame {

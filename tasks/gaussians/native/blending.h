@@ -334,4 +334,27 @@ void backward(const Scene& s, const Frame& frame, Band& band, const Images& imag
     }
 }
 
+// How much each splat shows, in all and where the image has its label: the weights of the forward pass once more.
+inline void weigh(const Scene& s, const Frame& frame, Band& band) {
+    binning::Shares* shares = band.shares.room(band.count);
+    std::fill(shares, shares + band.count, binning::Shares{});
+    for (int index = 0; index < band.rows * frame.blocks_x; ++index) {
+        const Block block(s, frame, band, index);
+        const V16 column = lanes::load(kColumn) + (block.x + 0.5f), row = lanes::load(kRow) + (block.y + 0.5f);
+        V16 T = block.whole ? splat(1) : block.inside();
+        const I16 ids = block.gather_ids(s.ids);
+        const int32_t* entries = band.entries.data() + band.first[index];
+        for (int e = 0; e < band.used[index]; ++e) {
+            __builtin_prefetch(&band.splats[entries[e + binning::kAhead]]);
+            const Splat& p = band.splats[entries[e]];
+            const V16 alpha = Touch::of(column, row, p).alpha, after = T * (1.0f - alpha);
+            const V16 weight = where_less(after, splat(kMinTransmittance), splat(0), T * alpha);
+            T = where_less(after, splat(kMinTransmittance), splat(0), after);
+            binning::Shares& to = shares[entries[e]];
+            to.all += lanes::sum(weight);
+            to.own += lanes::sum(lanes::where_equal(ids, p.label, weight, splat(0)));
+        }
+    }
+}
+
 }  // namespace blending

@@ -261,6 +261,23 @@ INLINE float largest(const Pair<H>& v) {
     return largest(where_less(v.lo, v.hi, v.hi, v.lo));
 }
 
+// The sum of all lanes, likewise.
+template <int stride, class F>
+INLINE F added(const F& v) {
+    F a = v, b = v;
+    exchange<stride>(a, b);
+    return a + b;
+}
+INLINE float sum(const f4& v) { return added<1>(added<2>(v))[0]; }
+INLINE float sum(const f8& v) { return added<1>(added<2>(added<4>(v)))[0]; }
+#if defined(__AVX512F__)
+INLINE float sum(const f16& v) { return added<1>(added<2>(added<4>(added<8>(v))))[0]; }
+#endif
+template <class H>
+INLINE float sum(const Pair<H>& v) {
+    return sum(v.lo + v.hi);
+}
+
 // A square of as many vectors as each has lanes: rows become columns.
 INLINE void transpose(f4 (&v)[4]) { exchange_all<2>(v), exchange_all<1>(v); }
 INLINE void transpose(f8 (&v)[8]) { exchange_all<4>(v), exchange_all<2>(v), exchange_all<1>(v); }

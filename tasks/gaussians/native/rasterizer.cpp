@@ -101,6 +101,21 @@ int ss_rasterize(void* workspace, const Scene* scene, const Images* images, int 
     });
 }
 
+// For each row, the sums of its weights over all pixels, and over those whose id is its label; the workspace must still
+// hold this scene's rendering. 0 = done, 1 = out of memory.
+int ss_shares(void* workspace, const Scene* scene, float* all, float* own, int threads) {
+    return guarded([&] {
+        Frame& frame = static_cast<Workspace*>(workspace)->frame;
+        parallel::each(threads, frame.num_bands, [&](int64_t b) { blending::weigh(*scene, frame, frame.bands[b]); });
+        std::fill(all, all + scene->count, 0.0f), std::fill(own, own + scene->count, 0.0f);
+        for (int b = 0; b < frame.num_bands; ++b)
+            for (int64_t k = 0; k < frame.bands[b].count; ++k) {
+                const int32_t row = frame.bands[b].splats[k].row;
+                all[row] += frame.bands[b].shares[k].all, own[row] += frame.bands[b].shares[k].own;
+            }
+    });
+}
+
 // Writes the gradients of all rows; the workspace must still hold this scene's rendering. 0 = done, 1 = out of memory.
 int ss_rasterize_backward(void* workspace, const Scene* scene, const Images* images, const Images* towards,
                           const Gradients* out, int threads) {

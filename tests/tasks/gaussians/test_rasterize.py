@@ -292,6 +292,25 @@ def test_threads_and_a_used_workspace_change_no_byte():
         assert len(found) == 1
 
 
+@pytest.mark.parametrize("name", BUILDS)
+def test_how_much_each_gaussian_shows_is_the_sum_of_its_weights(name, on_build):
+    on_build(name)
+    rng = np.random.default_rng(14)
+    n, width, height = 120, 61, 77
+    arrays = tuple(t.detach().numpy() for t in scene(rng, n).tensors())
+    camera = camera_at(rng, width, height)
+    each = NativePass(
+        arrays, np.arange(n, dtype=np.int32), camera, Settings((0.0, 0.0, 0.0), n, 0, winners=False)
+    ).masks
+    labels, ids = rng.integers(0, 3, n).astype(np.int32), rng.integers(-1, 3, (height, width)).astype(np.int32)
+    for threads in (1, 3):
+        setting = Settings((0.0, 0.0, 0.0), 0, 0, winners=False)
+        every, own = NativePass(arrays, labels, camera, setting, ids=ids, threads=threads).shares()
+        np.testing.assert_allclose(every, each.sum(axis=(1, 2)), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(own, (each * (ids == labels[:, None, None])).sum(axis=(1, 2)), rtol=1e-4, atol=1e-5)
+        assert (own > 0.5).sum() > 30 and (own < every).sum() > 30
+
+
 def test_a_pass_whose_workspace_was_used_again_does_not_go_back():
     arrays = tuple(t.detach().numpy() for t in one().tensors())
     workspace, setting = Workspace(), Settings((0.0, 0.0, 0.0), 0, 0, winners=False)
@@ -299,6 +318,8 @@ def test_a_pass_whose_workspace_was_used_again_does_not_go_back():
     NativePass(arrays, None, CAMERA, setting, workspace=workspace)
     with pytest.raises(RuntimeError, match="another one by now"):
         first.backward(None, None, None, None)
+    with pytest.raises(RuntimeError, match="another one by now"):
+        first.shares()
 
 
 @pytest.mark.parametrize("device", DEVICES)
