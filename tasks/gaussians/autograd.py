@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,13 @@ def draw(
         *gaussians.tensors(), background, channels, camera, settings, center_gradient
     )
     return Rendered(rgb, alpha, depth, masks, top, radii, strongest, center_gradient)
+
+
+def alphas(parts: Sequence[tuple[GaussianTensors, Camera]]) -> list[Tensor]:
+    """See `Renderer`."""
+    settings = Settings((0.0, 0.0, 0.0), 0, 0, winners=False)
+    background = torch.zeros(3)
+    return [draw(g, camera, background, None, settings, torch.zeros(len(g), 2)).alpha for g, camera in parts]
 
 
 class _Rasterize(torch.autograd.Function):

@@ -6,7 +6,7 @@ torch share by name (`Backend.xp`); what they do not share, it asks of the backe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import ModuleType
@@ -86,6 +86,14 @@ class Backend(Protocol):
         labels: [N] the label of each Gaussian, < 0 = none; None without mask loss.
         """
 
+    def towards_parts(
+        self, values: Values, parts: Sequence[tuple[slice, Any]], weight: float
+    ) -> Iterator[tuple[slice, Values]]:
+        """For the rows of each part, the gradients of `weight` times the error of the alpha of these rows alone.
+
+        parts: rows, and a target whose alpha alone counts.
+        """
+
     def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
         """One step down the gradients, in place; first, second: Adam's moments (Kingma and Ba 2015, Alg. 1)."""
 
@@ -130,6 +138,17 @@ class NativeBackend:
             self._gradients = None
         self._gradients = rendered.backward(*towards, out=self._gradients)
         return Descent(loss, self._gradients, rendered.radii)
+
+    def towards_parts(
+        self, values: Values, parts: Sequence[tuple[slice, Target]], weight: float
+    ) -> Iterator[tuple[slice, Values]]:
+        settings = Settings((0.0, 0.0, 0.0), 0, 0, winners=False)
+        weights = Weights(ssim=0.0, alpha=1.0, depth=0.0, mask=0.0)
+        for rows, target in parts:
+            own = {name: value[rows] for name, value in values.items()}
+            found = self.descent(own, None, target, settings, weights)
+            # The product is a copy, too: the next descent writes where this one did.
+            yield rows, {name: weight * found.gradients[name] for name in own}
 
     def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
         before = values["means"].copy()

@@ -6,6 +6,7 @@ with the CPU's to about a grey level, and with those of another run to rounding.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -36,9 +37,9 @@ class DeviceCamera(NamedTuple):
     photo: tuple[int, int]
     """Its width and height."""
     corner: Tensor
-    """[2] where the image lies in it."""
+    """[1, 1, 2] where the image lies in it."""
     half: Tensor
-    """[2] half of the image's width and height."""
+    """[1, 1, 2] half of the image's width and height."""
     center: Tensor
     """[3] world."""
 
@@ -52,8 +53,8 @@ def camera_on(device: torch.device, camera: Camera) -> DeviceCamera:
         torch.tensor(values, dtype=torch.float32, device=device)
         for values in (
             [[[camera.fx, 0, cx], [0, camera.fy, cy], [0, 0, 1]]],
-            [cx - camera.cx, cy - camera.cy],
-            [camera.width / 2, camera.height / 2],
+            [[[cx - camera.cx, cy - camera.cy]]],
+            [[[camera.width / 2, camera.height / 2]]],
             camera.center.tolist(),
         )
     )
@@ -62,20 +63,20 @@ def camera_on(device: torch.device, camera: Camera) -> DeviceCamera:
 
 
 class _Splats(NamedTuple):
-    """Gaussians on the screen, and gsplat's list of those in each tile, front to back."""
+    """Gaussians on the screens of C cameras, and gsplat's list of those in each tile, front to back."""
 
     means: Tensor
-    """[1, N, 2] pixels."""
+    """[C, N, 2] pixels."""
     conics: Tensor
-    """[1, N, 3]."""
+    """[C, N, 3]."""
     opacities: Tensor
-    """[1, N]."""
+    """[C, N]."""
     depths: Tensor
-    """[1, N]."""
+    """[C, N]."""
     radii: Tensor
-    """[1, N, 2] int32, 0 = not in view."""
+    """[C, N, 2] int32, 0 = not in view."""
     offsets: Tensor
-    """[1, tile rows, tile columns] where each tile's list begins."""
+    """[C, tile rows, tile columns] where each tile's list begins."""
     listed: Tensor
     """[I] rows of Gaussians."""
 
@@ -92,7 +93,7 @@ def draw(
     from gsplat import rasterize_to_pixels, spherical_harmonics
 
     width, height = camera.camera.width, camera.camera.height
-    splats = _projected(gaussians, camera)
+    splats = _projected(gaussians, [camera], width, height)
     if splats.means.requires_grad:
 
         def note(towards: Tensor) -> None:  # what a hook returns would take the gradient's place
@@ -145,22 +146,54 @@ def _padded(channels: Tensor) -> Tensor:
     return torch.nn.functional.pad(channels, (0, next(known for known in _CHANNELS if known >= count) - count))
 
 
-def _projected(gaussians: GaussianTensors, camera: DeviceCamera) -> _Splats:
+def alphas(parts: Sequence[tuple[GaussianTensors, DeviceCamera]]) -> list[Tensor]:
+    """See `Renderer`: all by the same kernels, as one picture of the largest size from each camera."""
+    from gsplat import rasterize_to_pixels
+
+    groups, cameras = zip(*parts, strict=True)
+    sizes = [(camera.camera.height, camera.camera.width) for camera in cameras]
+    height, width = (max(side) for side in zip(*sizes, strict=True))
+    together = GaussianTensors(*(torch.cat(tensors) for tensors in zip(*(g.tensors() for g in groups), strict=True)))
+    owner = torch.zeros(len(parts), len(together), dtype=torch.bool, device=together.means.device)
+    start = 0
+    for own, group in zip(owner, groups, strict=True):
+        own[start : start + len(group)] = True
+        start += len(group)
+    splats = _projected(together, cameras, width, height, owner)
+    _, drawn = rasterize_to_pixels(
+        splats.means, splats.conics, torch.zeros_like(splats.depths)[..., None], splats.opacities, width, height, _TILE,
+        splats.offsets, splats.listed,
+    )  # fmt: skip
+    return [alpha[:rows, :columns, 0] for alpha, (rows, columns) in zip(drawn, sizes, strict=True)]
+
+
+def _projected(
+    gaussians: GaussianTensors,
+    cameras: Sequence[DeviceCamera],
+    width: int,
+    height: int,
+    owner: Tensor | None = None,
+) -> _Splats:
+    """width, height: of the pictures. owner: [C, N] the Gaussians that each camera sees, by default all."""
     from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles
 
-    width, height = camera.camera.width, camera.camera.height
     opacities = torch.sigmoid(gaussians.opacity_logits)
+    pose, intrinsics, corner, half = (
+        of_each[0] if len(cameras) == 1 else torch.cat(of_each)
+        for of_each in zip(*((c.pose, c.intrinsics, c.corner, c.half) for c in cameras), strict=True)
+    )
+    photo = (max(side) for side in zip(*(c.photo for c in cameras), strict=True))
     radii, means, depths, conics, _ = fully_fused_projection(
-        gaussians.means, None, gaussians.quaternions, torch.exp(gaussians.log_scales), camera.pose, camera.intrinsics,
-        *camera.photo, near_plane=NEAR_PLANE, opacities=opacities,
+        gaussians.means, None, gaussians.quaternions, torch.exp(gaussians.log_scales), pose, intrinsics,
+        *photo, near_plane=NEAR_PLANE, opacities=opacities,
     )  # fmt: skip
-    means = means - camera.corner
-    shown = ((means.detach() - camera.half).abs() < radii + camera.half).all(dim=-1, keepdim=True)
-    radii = torch.where(shown, radii, 0)
+    means = means - corner
+    shown = ((means.detach() - half).abs() < radii + half).all(dim=-1)
+    radii = torch.where((shown if owner is None else shown & owner)[..., None], radii, 0)
     columns, rows = -(-width // _TILE), -(-height // _TILE)
     _, keys, listed = isect_tiles(means, radii, depths, _TILE, columns, rows)
-    offsets = isect_offset_encode(keys, 1, columns, rows).reshape(1, rows, columns)
-    return _Splats(means, conics, opacities[None], depths, radii, offsets, listed)
+    offsets = isect_offset_encode(keys, len(cameras), columns, rows).reshape(len(cameras), rows, columns)
+    return _Splats(means, conics, opacities.expand(len(cameras), -1), depths, radii, offsets, listed)
 
 
 def _find_winners(splats: _Splats, alpha: Tensor, top: Tensor, strongest: Tensor) -> None:

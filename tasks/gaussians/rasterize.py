@@ -95,6 +95,8 @@ class Renderer(NamedTuple):
     draw: Callable[[GaussianTensors, Any, Tensor, Tensor | None, Settings, Tensor], Rendered]
     """`rasterize` of one view. Takes Gaussians, camera, background (that of the settings, for its gradient), labels,
     settings, and [N, 2] zeros that become `center_gradient`."""
+    alphas: Callable[[Sequence[tuple[GaussianTensors, Any]]], list[Tensor]]
+    """[H, W] the alpha of each group of Gaussians before its camera."""
 
 
 @functools.cache
@@ -173,13 +175,12 @@ def rasterize(
 def renderer_on(device: torch.device) -> Renderer:
     """What draws on a device of torch."""
     if device.type == "cpu":
-        from ss_flow.tasks.gaussians.autograd import camera_on, draw
+        from ss_flow.tasks.gaussians import autograd
 
-        return Renderer(camera_on, draw)
-    from ss_flow.tasks.gaussians.cuda import camera_on as camera_on_cuda
-    from ss_flow.tasks.gaussians.cuda import draw as draw_on_cuda
+        return Renderer(autograd.camera_on, autograd.draw, autograd.alphas)
+    from ss_flow.tasks.gaussians import cuda
 
-    return Renderer(camera_on_cuda, draw_on_cuda)
+    return Renderer(cuda.camera_on, cuda.draw, cuda.alphas)
 
 
 def _check(gaussians: GaussianTensors, labels: Tensor | None, num_labels: int, cameras: Sequence[Camera]) -> int:

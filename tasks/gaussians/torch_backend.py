@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -205,6 +205,24 @@ class TorchBackend:
         found = torch.autograd.grad(images, tuple(leaves.values()), towards, materialize_grads=True)
         gradients = dict(zip(leaves, found, strict=True)) | {"centers": out.center_gradient}
         return Descent(loss, gradients, out.radii)
+
+    def towards_parts(
+        self, values: Values, parts: Sequence[tuple[slice, _Target]], weight: float
+    ) -> Iterator[tuple[slice, Values]]:
+        if not parts:
+            return
+        leaves = [{name: value[rows].detach().requires_grad_() for name, value in values.items()} for rows, _ in parts]
+        groups = [(GaussianTensors(**own), target.camera) for own, (_, target) in zip(leaves, parts, strict=True)]
+        drawn = self._renderer.alphas(groups)
+        with torch.no_grad():
+            towards = [
+                (alpha - target.inside).sign_().mul_(weight * target.judged)
+                for alpha, (_, target) in zip(drawn, parts, strict=True)
+            ]
+        shaped = [name for name in values if name != "sh"]  # no colour is seen
+        found = iter(torch.autograd.grad(drawn, [own[name] for own in leaves for name in shaped], towards))
+        for rows, _ in parts:
+            yield rows, {name: next(found) for name in shaped}
 
     def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
         # A step of Adam is as long as its rate, and rates differ by parameter and by row: what one call, all rates 1,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from ss_flow.control_groups import usable_cores
 from ss_flow.running import cores, last_try, load_checkpoint, progress, save_checkpoint, warn
 from ss_flow.tasks.artifacts import Float32, Gaussians
-from ss_flow.tasks.gaussians.backends import AdamStep, Backend, Values, backend_for
+from ss_flow.tasks.gaussians.backends import AdamStep, Backend, backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecord, Schedule, Seen
 from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import Settings
-from ss_flow.tasks.gaussians.objective import Objective, Target, Targets, Weights
+from ss_flow.tasks.gaussians.objective import Objective, Target, Targets
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.gaussians.render import channels_of
@@ -231,7 +231,7 @@ class _Training:
         settings = Settings(behind, self._num_labels, degree, winners=False)
         weights = params.objective.at(done_share, params.mask_weight)
         labels = None if self._channels is None else self._channels[parameters.origin]
-        towards_parts = list(self._towards_parts(settings))
+        towards_parts = list(self._backend.towards_parts(parameters.values, self._seen_alone(), params.part_weight))
         found = self._backend.descent(parameters.values, labels, self._there[view], settings, weights)
         for rows, towards in towards_parts:
             for name, gradient in towards.items():
@@ -245,17 +245,11 @@ class _Training:
             seen = Seen(found.gradients["centers"], found.radii, self._pixels[view])
             self._control.after(self.step, parameters, seen, self._generator)
 
-    def _towards_parts(self, settings: Settings) -> Iterator[tuple[slice, Values]]:
-        """Of each part whose turn it is, its rows and the gradients of its alpha."""
-        alone = replace(settings, background=(0.0, 0.0, 0.0), num_labels=0)
-        weights = Weights(ssim=0.0, alpha=1.0, depth=0.0, mask=0.0)
+    def _seen_alone(self) -> list[tuple[slice, Any]]:
+        """The parts whose turn it is."""
         most = self._params.parts_per_step if self._parts else 0
-        for turn in range(most * self.step, most * (self.step + 1)):
-            rows, there = self._parts[self._turns[turn % len(self._turns)]]
-            own = {name: value[rows] for name, value in self.parameters.values.items()}
-            found = self._backend.descent(own, None, there, alone, weights)
-            # The product is a copy, too: the next descent may write where this one did.
-            yield rows, {name: self._params.part_weight * found.gradients[name] for name in own}
+        turns = range(most * self.step, most * (self.step + 1))
+        return [self._parts[self._turns[turn % len(self._turns)]] for turn in turns]
 
     def losses(self) -> Float32:
         """Of the steps so far. Raises TrainingDiverged when one of them or a parameter is not finite.

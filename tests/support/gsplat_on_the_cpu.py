@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import torch
 
+NOBODY = -1
+"""In the place of a row that is not listed: how many are would depend on values."""
 LIMIT, END, CLIP = 1 / 255, 1e-4, 0.999
 KERNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
 """Of so many channels; gsplat 1.5.3 pads others itself, later versions refuse them."""
@@ -17,9 +19,16 @@ def fully_fused_projection(
     means, covars, quats, scales, viewmats, Ks, width, height, eps2d=0.3, near_plane=0.01, far_plane=1e10,
     radius_clip=0.0, packed=False, sparse_grad=False, calc_compensations=False, camera_model="pinhole", opacities=None,
 ):  # fmt: skip
-    """EWA splatting (Zwicker et al. 2001); the slope of what lies outside the picture is limited as in 3DGS."""
-    assert covars is None and not packed and len(viewmats) == len(Ks) == 1
-    (rotation, translation), k = (viewmats[0, :3, :3], viewmats[0, :3, 3]), Ks[0]
+    """EWA splatting (Zwicker et al. 2001), from each camera."""
+    assert covars is None and not packed and len(viewmats) == len(Ks)
+    seen = [_projection(means, quats, scales, *of, width, height, eps2d, near_plane, far_plane, opacities)
+            for of in zip(viewmats, Ks, strict=True)]  # fmt: skip
+    return (*(torch.stack(values) for values in zip(*seen, strict=True)), None)
+
+
+def _projection(means, quats, scales, viewmat, k, width, height, eps2d, near_plane, far_plane, opacities):
+    """From one camera; the slope of what lies outside the picture is limited as in 3DGS."""
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
     turn = torch.stack(
         [
@@ -56,7 +65,7 @@ def fully_fused_projection(
     seen = seen & (centres + radii > 0).all(dim=1)
     seen = seen & (centres[:, 0] - radii[:, 0] < width) & (centres[:, 1] - radii[:, 1] < height)
     centres = torch.where(seen[:, None], centres, 1e6)  # gsplat lists the others in no tile
-    return torch.where(seen[:, None], radii, 0).int()[None], centres[None], depth[None], conics[None], None
+    return torch.where(seen[:, None], radii, 0).int(), centres, depth, conics
 
 
 def spherical_harmonics(degrees_to_use, dirs, coeffs, masks=None):
@@ -73,23 +82,29 @@ def isect_tiles(
     means2d, radii, depths, tile_size, tile_width, tile_height, sort=True, segmented=False, packed=False,
     n_images=None, image_ids=None, gaussian_ids=None,
 ):  # fmt: skip
-    order = depths.detach()[0].argsort(stable=True)
-    each = torch.full_like(order, tile_width * tile_height)
-    return each[None].int(), order.repeat(tile_width * tile_height), order.repeat(tile_width * tile_height).int()
+    tiles, count = tile_width * tile_height, depths.shape[1]
+    order = depths.detach().argsort(dim=1, stable=True)
+    shown = (radii > 0).all(dim=2).gather(1, order)
+    order = order + count * torch.arange(len(depths), device=depths.device)[:, None]
+    listed = torch.where(shown, order, NOBODY).repeat(1, tiles).flatten()
+    return torch.full_like(order, tiles).int(), listed, listed.int()
 
 
 def isect_offset_encode(isect_ids, n_images, tile_width, tile_height):
-    tiles = tile_width * tile_height
+    tiles = n_images * tile_width * tile_height
     offsets = torch.arange(tiles, device=isect_ids.device, dtype=torch.int32) * (len(isect_ids) // tiles)
     return offsets.reshape(n_images, tile_height, tile_width)
 
 
 def _alphas(means2d, conics, opacities, rows, width, height):
-    """[pixels, rows] of the Gaussians in these rows, 0 where too little."""
+    """[pixels, rows] of the Gaussians in these rows of all cameras', 0 where too little."""
     y, x = torch.meshgrid(*(torch.arange(n, device=rows.device) + 0.5 for n in (height, width)), indexing="ij")
-    dx, dy = (means2d[0, rows, axis] - p.reshape(-1, 1) for axis, p in ((0, x), (1, y)))
-    a, b, c = conics[0, rows].unbind(1)
-    alpha = (opacities[0, rows] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=CLIP)
+    means2d, conics, opacities = means2d.flatten(0, 1), conics.flatten(0, 1), opacities.flatten()
+    dx, dy = (means2d[rows, axis] - p.reshape(-1, 1) for axis, p in ((0, x), (1, y)))
+    a, b, c = conics[rows].unbind(1)
+    alpha = (rows != NOBODY) * (opacities[rows] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(
+        max=CLIP
+    )
     return torch.where(alpha < LIMIT, 0, alpha)
 
 
@@ -98,17 +113,25 @@ def rasterize_to_pixels(
     backgrounds=None, masks=None, packed=False, absgrad=False,
 ):  # fmt: skip
     assert colors.shape[:2] == means2d.shape[:2] and colors.shape[2] in KERNELS
-    rows = flatten_ids[: means2d.shape[1]].long()
+    cameras, count = means2d.shape[:2]
+    listed = flatten_ids.view(cameras, -1, count)[:, 0].long()  # in all tiles the same
+    behind = [None] * cameras if backgrounds is None else backgrounds
+    drawn = [_pixels(means2d, conics, colors.flatten(0, 1), opacities, image_height, image_width, *of)
+             for of in zip(listed, behind, strict=True)]  # fmt: skip
+    return tuple(torch.stack(images) for images in zip(*drawn, strict=True))
+
+
+def _pixels(means2d, conics, colors, opacities, image_height, image_width, rows, background):
     alpha = _alphas(means2d, conics, opacities, rows, image_width, image_height)
     left = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], dim=1)
     weight = torch.where(left > END, before * alpha, 0)
     opaque = weight.sum(dim=1, keepdim=True)
-    images = weight @ torch.nan_to_num(colors[0, rows])  # of weight 0
-    if backgrounds is not None:
-        assert backgrounds.shape == (1, colors.shape[2])
-        images = images + (1 - opaque) * backgrounds
-    size = (1, image_height, image_width)
+    images = weight @ torch.nan_to_num(colors[rows])  # of weight 0
+    if background is not None:
+        assert background.shape == colors.shape[1:]
+        images = images + (1 - opaque) * background
+    size = (image_height, image_width)
     return images.reshape(*size, -1), opaque.reshape(*size, 1)
 
 

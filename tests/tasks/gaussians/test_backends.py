@@ -120,6 +120,39 @@ def test_a_view_without_a_pixel_that_counts_pulls_nowhere(backend):
         assert all(not one.host(found.gradients[name]).any() for name in PARAMETERS)
 
 
+def outline(camera: Camera) -> Target:
+    """A target whose alpha alone counts."""
+    rng = np.random.default_rng(camera.width)
+    blank = np.zeros((camera.height, camera.width), np.float32)
+    inside, judged = (rng.random(blank.shape).astype(np.float32).round() for _ in range(2))
+    image = np.zeros((*blank.shape, 3), np.float32)
+    return Target(camera, image, blank, inside, judged / judged.sum(), np.ones_like(blank), blank, None, None)
+
+
+def moved(*offset: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = offset
+    return pose
+
+
+def test_every_backend_finds_the_same_way_towards_parts_seen_alone(backend):
+    values, _, _ = example(3, Objective(), with_labels=False)
+    parts = [
+        (slice(0, 70), outline(Camera(46, 33, 40.0, 40.0, 23.0, 16.5, np.eye(4)))),
+        (slice(50, 120), outline(Camera(30, 41, 35.0, 38.0, 15.0, 20.0, moved(0.1, -0.2, 0.3)))),
+    ]
+    expected = list(NATIVE.towards_parts(values, parts, 0.3))
+    there = [(rows, backend.target(target, 0)) for rows, target in parts]
+    found = list(backend.towards_parts(put(backend, values), there, 0.3))
+    for (rows, a), (same, b) in zip(expected, found, strict=True):
+        assert rows == same
+        for name in ("means", "quaternions", "log_scales", "opacity_logits"):
+            limit = tolerance(backend) * np.linalg.norm(a[name])
+            assert np.linalg.norm(a[name]) > 0 and np.linalg.norm(a[name] - backend.host(b[name])) <= limit, name
+        assert not a["sh"].any()
+    assert list(backend.towards_parts(put(backend, values), [], 0.3)) == []
+
+
 def test_every_backend_tells_what_weighs_most_in_a_view(backend):
     values, _, target = example(5, Objective(), with_labels=False)
     ours = NATIVE.strongest(values, target)
@@ -273,12 +306,14 @@ def test_a_step_carries_nothing_to_the_host_or_from_it(stand_in, with_labels):
     with FromTheHost() as heard:
         settings, weights = Settings((0.2, 0.4, 0.6), 7, 1, winners=False), Objective().at(0.5, 0.7)
         found = backend.descent(moved, channels, there, settings, weights)
+        parts = list(backend.towards_parts(moved, [(slice(0, 60), there), (slice(30, 120), there)], 0.5))
         backend.adam(moved, found.gradients, first, second, AdamStep(1, {**rates, "means": 0.1 * longest}, 1))
         record.add(found.gradients["centers"], found.radii, int(target.counted.sum()))
         parameters.limit_scale(longest)
     assert heard.moves == []
     for name in PARAMETERS:
         assert found.gradients[name].shape == values[name].shape == moved[name].shape
+    assert [gradients["means"].shape for _, gradients in parts] == [(60, 3), (90, 3)]
     assert (found.loss.shape, found.radii.shape, found.gradients["centers"].shape) == ((), (120,), (120, 2))
     with pytest.raises((NotImplementedError, RuntimeError)):
         backend.host(found.loss)
