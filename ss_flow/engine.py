@@ -103,6 +103,7 @@ def run_flows(
     memory_mb: int = 0,
     gpus: int | None = None,
     executor: str = "threads",
+    processes: int | None = None,
     dry: bool = False,
     recorded: bool = True,
 ) -> list[Report]:
@@ -110,7 +111,7 @@ def run_flows(
 
     jobs: how many cores to use, 0 = all. memory_mb: how much memory tasks may declare together, 0 = what is free. Both
     are this machine's, or those of the cluster that the executor speaks to. gpus: how many of this machine's GPUs tasks
-    will use, None = one where the driver shows any.
+    will use, None = one where the driver shows any. processes: the most that "mixed" starts, None = a job each.
     recorded: whether the run is kept among the store's runs; a question about a result need not be.
 
     Raises InputError for a negative number, or an executor that is unknown, not installed or does not answer, TypeError
@@ -126,7 +127,7 @@ def run_flows(
         stack.callback(claims.release_all)
         run = _Run(requests, store, claims)
         stack.callback(run.close)
-        workers = open_executor(executor, jobs or usable_cores(), store, run.progressed)
+        workers = open_executor(executor, jobs or usable_cores(), store, run.progressed, processes=processes)
         try:
             run.begin(recorded=recorded and not dry)  # only now: a run that nobody can compute leaves no record
             room = workers.capacity or _this_machine(gpus)

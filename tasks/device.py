@@ -12,6 +12,8 @@ import os
 from ss_flow.errors import InputError
 
 VARIABLE = "SS_FLOW_DEVICE"
+PROCESS_BYTES = 1_500_000_000
+"""Memory of a device for each process that computes there: they held about .9 GB each (docs/device.md)."""
 
 
 @functools.cache
@@ -31,3 +33,12 @@ def has_device() -> bool:
     except OSError:
         return False
     return bool(driver.cuInit(0) == 0)
+
+
+def processes_with_room() -> int:
+    """How many processes may compute on the device side by side: one at least, as many as its memory is enough for."""
+    driver, number, size = ctypes.CDLL("libcuda.so.1"), ctypes.c_int(), ctypes.c_size_t()
+    driver.cuInit(0)
+    driver.cuDeviceGet(ctypes.byref(number), 0)
+    driver.cuDeviceTotalMem_v2(ctypes.byref(size), number)
+    return max(1, size.value // PROCESS_BYTES)

@@ -30,6 +30,7 @@ from ss_flow.resolution import Failure
 from ss_flow.tasks.capture.layout_stray import steadiest
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.device import processes_with_room
 from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.models.catalogue import DISTANCES
 from ss_flow.tasks.models.onnx import lacks_cuda
@@ -59,8 +60,7 @@ class RunOptions:
     """How much memory tasks may declare together, such as 8GB; what is free, when left out."""
     executor: OptionalText = None
     """mixed (one task in this process, those beside it in processes of their own), threads, processes, dask (a cluster
-    on this machine) or dask://HOST:PORT; when left out, mixed, but threads where tasks compute on a GPU, whose memory
-    they then share."""
+    on this machine) or dask://HOST:PORT; when left out, mixed, with as many processes as a GPU has memory for."""
     dry_run: bool = False
     """Tell what would run and why, and run nothing."""
     verify: bool = False
@@ -105,7 +105,8 @@ class RunOptions:
             "jobs": self.jobs,
             "memory_mb": memory_mb,
             "gpus": int(on_gpu),
-            "executor": self.executor or ("threads" if on_gpu else "mixed"),
+            "executor": self.executor or "mixed",
+            "processes": processes_with_room() - 1 if on_gpu else None,
             "dry": self.dry_run,
         }
 

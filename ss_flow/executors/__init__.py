@@ -43,19 +43,23 @@ class Executor(Protocol):
         ...
 
 
-def open_executor(name: str, workers: int, store: Store, on_progress: OnProgress) -> Executor:
+def open_executor(
+    name: str, workers: int, store: Store, on_progress: OnProgress, *, processes: int | None = None
+) -> Executor:
     """The executor "threads", "processes", "mixed" (one call in a thread of this process, and those beside it in
     processes of their own), "dask" (a cluster on this machine) or "dask://HOST:PORT".
 
-    workers: how many calls may run at once on this machine; another cluster's `capacity` says it for itself.
+    workers: how many calls may run at once on this machine; another cluster's `capacity` says it for itself. processes:
+    how many of them may have processes of their own in "mixed", where the others run in threads; None = all but one.
 
     Raises InputError for another name, or when Dask is not installed or does not answer.
     """
-    here = {"threads": workers, "processes": 0, "mixed": 1}
-    if name in here:
+    apart = {"threads": 0, "processes": workers, "mixed": workers - 1}
+    if name in apart:
         from ss_flow.executors.local import LocalPool
 
-        return LocalPool(workers, store, on_progress, here=here[name])
+        most = apart[name] if processes is None or name != "mixed" else min(processes, apart[name])
+        return LocalPool(workers, store, on_progress, processes=most)
     if found := re.fullmatch(r"dask(?:://(.+))?", name):
         from ss_flow.executors.dask import open_dask
 

@@ -25,22 +25,25 @@ IDLE_SECONDS = 20.0
 class LocalPool:
     """Executors of this machine: as many calls at once as there are workers.
 
-    here: how many of them may run in threads of this process; the others get processes of their own, which are kept for
-    the next call. Where there are both, no process is started before calls have waited for room here as long as its
-    start takes: short runs need none. A task marked `isolate` always gets a process to itself.
+    processes: how many of them may have processes of their own, which are kept for the next call; the others run in
+    threads of this process. Where there are both, one call runs here, those beside it apart, and only what these have
+    no room for beside the first. No process is started before calls have waited for room here as long as its start
+    takes: short runs need none. A task marked `isolate` always gets a process to itself.
     """
 
     capacity: Resources | None = None
 
-    def __init__(self, workers: int, store: Store, on_progress: OnProgress, *, here: int) -> None:
+    def __init__(self, workers: int, store: Store, on_progress: OnProgress, *, processes: int) -> None:
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="task")
         self._store = store
         self._on_progress = on_progress
-        self._only_processes = here == 0
-        self._here = threading.Semaphore(here)
+        self._threads, self._processes = workers - processes, processes
+        self._here = self._apart = 0
+        """Calls that run in threads, and in processes, but for those of isolated tasks."""
         self._waited = 0.0
         """Seconds of calls, together, since a process was last given instead."""
         self._lock = threading.Lock()
+        self._ended = threading.Condition(self._lock)
         self._idle: list[tuple[Worker, float]] = []
         """Processes without a call, and since when: those that had one last at the end."""
         self._busy: set[Worker] = set()
@@ -51,25 +54,34 @@ class LocalPool:
         return self._pool.submit(contextvars.Context().run, self._run, invocation)
 
     def _run(self, invocation: Invocation) -> Action:
-        if invocation.isolate or self._only_processes or not self._finds_room_here():
+        if invocation.isolate:
             return self._run_in_process(invocation)
+        here = self._finds_room_here()
         try:
-            return self._run_here(invocation)
+            return self._run_here(invocation) if here else self._run_in_process(invocation)
         finally:
-            self._here.release()
+            with self._ended:
+                self._here -= here
+                self._apart -= not here
+                self._ended.notify()
 
     def _finds_room_here(self) -> bool:
-        """Whether a call got room in this process; else it should have a process of its own."""
+        """Whether a call got room in this process; else it got that of a process of its own."""
         since = time.monotonic()
-        while not self._here.acquire(timeout=LOOK_SECONDS):
-            with self._lock:
+        with self._ended:
+            while True:
+                apart = self._apart < self._processes
+                if self._here < self._threads and not (self._here and apart):
+                    self._here += 1
+                    return True
                 now = time.monotonic()
                 self._waited += now - since
                 since = now
-                if self._idle or self._waited > START_SECONDS:
+                if apart and (self._idle or self._waited > START_SECONDS or not self._threads):
                     self._waited = 0.0
+                    self._apart += 1
                     return False
-        return True
+                self._ended.wait(LOOK_SECONDS)
 
     def _run_here(self, invocation: Invocation) -> Action:
         def listener(done: int, total: int, note: str) -> None:

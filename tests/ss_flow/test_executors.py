@@ -58,9 +58,9 @@ def cluster():
 class Opened:
     """An executor, and what was heard of its calls."""
 
-    def __init__(self, name, store, workers=2):
+    def __init__(self, name, store, workers=2, processes=None):
         self.heard = []
-        self.pool = open_executor(name, workers, store, lambda *sign: self.heard.append(sign))
+        self.pool = open_executor(name, workers, store, lambda *sign: self.heard.append(sign), processes=processes)
 
     def run(self, invocation):
         return self.pool.submit(invocation).result(PATIENCE)
@@ -233,9 +233,9 @@ def test_a_call_that_failed_may_be_tried_again(store, executor, tmp_path):
 # "mixed" alone
 
 
-def located(store, seconds, count):
-    """In which process each of some calls was that begin at once, two at a time."""
-    opened = Opened("mixed", store)
+def located(store, seconds, count, **options):
+    """In which process each of some calls was that begin at once, two at a time if not told otherwise."""
+    opened = Opened("mixed", store, **options)
     futures = [opened.pool.submit(call(store, toy.located, float(x), seconds=seconds)) for x in range(count)]
     for future in futures:
         future.result(PATIENCE)
@@ -251,6 +251,12 @@ def test_what_runs_beside_a_long_call_gets_a_process_which_the_next_one_has_too(
     where = located(store, 2.5, 4)
     assert where.count(os.getpid()) == 2
     assert len(set(where)) == 2
+
+
+@pytest.mark.parametrize(("processes", "here"), [(0, 3), (1, 2), (5, 1)])
+def test_calls_that_there_are_no_processes_for_run_here(store, processes, here):
+    where = located(store, 4.0, 3, workers=3, processes=processes)
+    assert where.count(os.getpid()) == here
 
 
 def test_a_process_without_a_call_for_a_while_is_ended_when_another_call_says_how_far_it_is(store, monkeypatch):

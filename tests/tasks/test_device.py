@@ -52,6 +52,23 @@ def test_without_a_part_of_cuda_the_cpu_does_it_unless_cuda_was_asked_for(machin
         rasterize.device_here()
 
 
+@pytest.mark.parametrize(("size", "processes"), [(80 << 30, 57), (8 << 30, 5), (1 << 30, 1)])
+def test_a_device_has_room_for_as_many_processes_as_its_memory_is_enough_for(monkeypatch, size, processes):
+    class Driver:
+        def cuInit(self, flags):
+            return 0
+
+        def cuDeviceGet(self, device, number):
+            return 0
+
+        def cuDeviceTotalMem_v2(self, found, device):
+            found._obj.value = size
+            return 0
+
+    monkeypatch.setattr(device.ctypes, "CDLL", lambda name: Driver())
+    assert device.processes_with_room() == processes
+
+
 def test_another_device_is_refused(machine):
     machine(asked="tpu")
     with pytest.raises(InputError, match="must be cpu, cuda or empty, not 'tpu'"):
