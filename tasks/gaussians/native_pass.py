@@ -99,17 +99,21 @@ class NativePass:
         if self._workspace.turn != self._turn:
             raise RuntimeError("the workspace of this rendering holds another one by now")
 
-    def shares(self) -> tuple[Float32, Float32]:
-        """[N] the sum of each Gaussian's weights over all pixels, and over those whose id is its label.
+    def shares(self, ids: Int32) -> tuple[Int32, Int32, Float32]:
+        """Rows, ids and the sums of these rows' weights over the ids' pixels; a row and id may be there several times.
 
-        Of a pass with `ids`. Raises RuntimeError when another pass has used the workspace.
+        ids: [H, W], < 0 = none. Raises RuntimeError when another pass has used the workspace.
         """
         self._check_workspace()
-        every, own = np.empty_like(self.radii), np.empty_like(self.radii)
-        scene = ctypes.byref(self._scene)
-        if library().ss_shares(self._workspace.handle, scene, address(every), address(own), self._threads):
+        count, ids = ctypes.c_int64(), np.ascontiguousarray(ids, np.int32)
+        if library().ss_shares(
+            self._workspace.handle, ctypes.byref(self._scene), address(ids), ctypes.byref(count), self._threads
+        ):
             raise MemoryError("not enough memory for the weights of a rendering")
-        return every, own
+        rows, found = (np.empty(count.value, np.int32) for _ in range(2))
+        weights = np.empty(count.value, np.float32)
+        library().ss_take_shares(self._workspace.handle, *(address(a) for a in (rows, found, weights)))
+        return rows, found, weights
 
     def backward(
         self,

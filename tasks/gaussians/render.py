@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
@@ -92,48 +91,58 @@ def render(
     return Rendering(done.rgb, done.alpha, done.depth, done.masks, top, done.radii > 0, strongest)
 
 
-def weights_shown(gaussians: Gaussians, camera: Camera, ids: Int32) -> tuple[Float32, Float32]:
-    """[N] the sum of each Gaussian's weights T * alpha over the image, and over the pixels of its own instance.
+class Shares(NamedTuple):
+    """How much Gaussians show where an image has some id: sums of weights T * alpha, those above 0."""
 
-    ids: [H, W] the instance that each pixel shows, of the camera's size. Always on the CPU.
+    row: Int32
+    """[A] of the Gaussian."""
+    id: Int32
+    """[A] ascending; rows of one id ascend."""
+    weight: Float32
+    """[A] over the pixels of that id."""
+
+
+def shares(gaussians: Gaussians, camera: Camera, ids: Int32) -> Shares:
+    """How much each Gaussian shows in the pixels of each id.
+
+    ids: [H, W] of the camera's size; pixels below 0 count for none. No colour matters.
     """
-    parameters = tuple(np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in PARAMETERS)
-    labels, settings = np.ascontiguousarray(gaussians.instance_id, np.int32), Settings((0.0, 0.0, 0.0), 0, 0, False)
-    return NativePass(parameters, labels, camera, settings, ids=ids, threads=cores()).shares()  # type: ignore[arg-type]
-
-
-def weights_by_id(gaussians: Gaussians, camera: Camera, ids: NDArray[np.integer]) -> Iterator[tuple[int, Float32]]:
-    """For each id of an image, ascending: the sum of each Gaussian's weights T * alpha over the id's pixels: [N].
-
-    ids: [H, W] integers from 0 on, of the camera's size; pixels below 0 count for none. A rendering is linear in the
-    colours, so these sums are its gradient towards them, where the gradient of the image is 1 in the id's pixels; the
-    three channels hold three ids at once.
-    """
-    grey = replace(gaussians, sh=np.zeros((len(gaussians), 1, 3), np.float32))  # no colour is cut off at 0
+    grey = replace(gaussians, sh=np.zeros((len(gaussians), 1, 3), np.float32))
     parameters = tuple(np.ascontiguousarray(getattr(grey, name), np.float32) for name in PARAMETERS)
-    weigh = _weigher(_device(grey), parameters, camera, Settings((0.0, 0.0, 0.0), 0, 0, winners=False))
-    found = np.unique(ids[ids >= 0]).tolist()
-    for start in range(0, len(found), 3):
-        some = found[start : start + 3]
-        towards = np.zeros((camera.height, camera.width, 3), np.float32)
-        for channel, one in enumerate(some):
-            towards[..., channel] = ids == one
-        weights = weigh(towards) / np.float32(SH_ZERO)
-        for channel, one in enumerate(some):
-            yield one, weights[:, channel]
+    found = _shares(_device(grey), parameters, camera, ids)
+    key, place = np.unique(found.id.astype(np.int64) * len(gaussians) + found.row, return_inverse=True)
+    one, row = np.divmod(key, max(len(gaussians), 1))
+    return Shares(
+        row.astype(np.int32), one.astype(np.int32), np.bincount(place, found.weight, len(key)).astype(np.float32)
+    )
 
 
-def _weigher(
-    device: str, parameters: tuple[Float32, ...], camera: Camera, settings: Settings
-) -> Callable[[Float32], Float32]:
-    """What gives the gradient towards the constant colours [N, 3] for one towards the picture [H, W, 3]."""
+def _shares(device: str, parameters: tuple[Float32, ...], camera: Camera, ids: Int32) -> Shares:
+    """In any order, and in several pieces."""
+    settings = Settings((0.0, 0.0, 0.0), 0, 0, winners=False)
     if device != "cpu":
         from ss_flow.tasks.gaussians.torch_render import weigher
 
         with suppress(MemoryError):
-            return weigher(device, parameters, camera, settings)
-    drawn = NativePass(parameters, None, camera, settings, threads=cores())  # type: ignore[arg-type]
-    return lambda towards: drawn.backward(towards, None, None, None)["sh"][:, 0]
+            return _by_gradients(weigher(device, parameters, camera, settings), ids)
+    return Shares(*NativePass(parameters, None, camera, settings, threads=cores()).shares(ids))  # type: ignore[arg-type]
+
+
+def _by_gradients(weigh: Callable[[Float32], Float32], ids: Int32) -> Shares:
+    """A rendering is linear in the colours, so the sums are its gradient towards them, where the gradient of the image
+    is 1 in an id's pixels; the three channels hold three ids at once.
+
+    weigh: the gradient towards the constant colours [N, 3] for one towards the picture [H, W, 3].
+    """
+    pieces = [(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))]
+    known = np.unique(ids[ids >= 0])
+    for some in np.split(known, range(3, len(known), 3)):
+        towards = np.zeros((*ids.shape, 3), np.float32)
+        towards[..., : len(some)] = ids[..., None] == some
+        weights = weigh(towards)[:, : len(some)] / np.float32(SH_ZERO)
+        row, channel = np.nonzero(weights > 0)
+        pieces.append((row.astype(np.int32), some[channel].astype(np.int32), weights[row, channel]))
+    return Shares(*(np.concatenate(of_all) for of_all in zip(*pieces, strict=True)))
 
 
 def _device(gaussians: Gaussians) -> str:

@@ -23,7 +23,7 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
-from ss_flow.tasks.gaussians.render import weights_by_id
+from ss_flow.tasks.gaussians.render import shares
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.ranges import Count, NonNegative
@@ -67,19 +67,9 @@ def vote(scene: Gaussians, frame: Frame, camera: Camera, shown: LabelMap) -> Vie
     frame does not count have none. camera, shown: of this view; shown: its exclusive ids.
     """
     ids = np.where(decode_valid(frame), shown.ids.astype(np.int32), -1)
-    rows, labels, weights = [], [], []
-    for one, weight in weights_by_id(scene, camera, ids):
-        own = np.flatnonzero(weight >= _LEAST)
-        rows.append(own.astype(np.int32))
-        labels.append(np.full(len(own), one, np.int32))
-        weights.append(weight[own])
-    nothing = np.zeros(0, np.int32)
-    return ViewVotes(
-        frame.name,
-        np.concatenate([nothing, *rows]),
-        np.concatenate([nothing, *labels]),
-        np.concatenate([nothing.astype(np.float32), *weights]),
-    )
+    found = shares(scene, camera, ids)
+    enough = found.weight >= _LEAST
+    return ViewVotes(frame.name, found.row[enough], found.id[enough], found.weight[enough])
 
 
 @task(name="splat.label")

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
-from ss_flow.tasks.gaussians.render import weights_shown
+from ss_flow.tasks.gaussians.render import shares
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
 from ss_flow.tasks.geometry.images import resampled, size_within
@@ -95,7 +95,8 @@ def _weights(cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[LabelM
     for camera, shown in zip(cameras, masks, strict=True):
         small = camera.scaled(*size_within(MOST_PIXELS, camera.width, camera.height))
         ids = resampled(shown.ids, small.height, small.width).astype(np.int32)
-        of_all, of_own = weights_shown(scene, small, ids)
-        everywhere += of_all
-        own += of_own
+        found = shares(scene, small, ids)
+        mine = found.id == scene.instance_id[found.row]
+        everywhere += np.bincount(found.row, found.weight, len(scene))
+        own += np.bincount(found.row[mine], found.weight[mine], len(scene))
     return own, everywhere

@@ -37,9 +37,10 @@ struct alignas(64) Sums {
     float value[16];
 };
 
-// Sums of one splat's weights in one band: over all pixels, and over those whose id is its label.
-struct Shares {
-    float all, own;
+// How much one splat shows in one band, in the pixels of one id: a sum of weights. A splat's shares are linked.
+struct Share {
+    int32_t splat, id, next;
+    float weight;
 };
 
 struct Span {
@@ -61,7 +62,8 @@ struct Band {
     Buffer<int32_t> used;          // [blocks] entries up to the one that made the block opaque
     Buffer<Sums> sums;
     Buffer<float> strongest;
-    Buffer<Shares> shares;
+    Buffer<int32_t> first_share;   // of each splat, -1 = none
+    std::vector<Share> shares;
 };
 
 struct Frame {

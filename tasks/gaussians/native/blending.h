@@ -334,25 +334,43 @@ void backward(const Scene& s, const Frame& frame, Band& band, const Images& imag
     }
 }
 
-// How much each splat shows, in all and where the image has its label: the weights of the forward pass once more.
-inline void weigh(const Scene& s, const Frame& frame, Band& band) {
-    binning::Shares* shares = band.shares.room(band.count);
-    std::fill(shares, shares + band.count, binning::Shares{});
+// Adds up each splat's weights in the pixels of each id >= 0: the weights of the forward pass once more.
+inline void weigh(const Scene& s, const Frame& frame, Band& band, const int32_t* ids) {
+    int32_t* first = band.first_share.room(band.count);
+    std::fill(first, first + band.count, -1);
+    band.shares.clear();
+    const auto add = [&](int32_t number, int32_t id, float weight) {
+        int32_t* at = &first[number];
+        while (*at >= 0 && band.shares[*at].id != id) at = &band.shares[*at].next;
+        if (*at >= 0) {
+            band.shares[*at].weight += weight;
+        } else {
+            *at = (int32_t)band.shares.size();  // before the vector moves
+            band.shares.push_back({number, id, -1, weight});
+        }
+    };
     for (int index = 0; index < band.rows * frame.blocks_x; ++index) {
         const Block block(s, frame, band, index);
+        const I16 shown = block.gather_ids(ids);
+        int32_t known[16];
+        V16 of[16];
+        int count = 0;
+        block.pixels([&](int, int64_t p) {
+            if (ids[p] < 0 || std::find(known, known + count, ids[p]) != known + count) return;
+            known[count] = ids[p];
+            of[count++] = lanes::where_equal(shown, ids[p], splat(1), splat(0));
+        });
+        if (!count) continue;
         const V16 column = lanes::load(kColumn) + (block.x + 0.5f), row = lanes::load(kRow) + (block.y + 0.5f);
         V16 T = block.whole ? splat(1) : block.inside();
-        const I16 ids = block.gather_ids(s.ids);
         const int32_t* entries = band.entries.data() + band.first[index];
         for (int e = 0; e < band.used[index]; ++e) {
             __builtin_prefetch(&band.splats[entries[e + binning::kAhead]]);
-            const Splat& p = band.splats[entries[e]];
-            const V16 alpha = Touch::of(column, row, p).alpha, after = T * (1.0f - alpha);
+            const V16 alpha = Touch::of(column, row, band.splats[entries[e]]).alpha, after = T * (1.0f - alpha);
             const V16 weight = where_less(after, splat(kMinTransmittance), splat(0), T * alpha);
             T = where_less(after, splat(kMinTransmittance), splat(0), after);
-            binning::Shares& to = shares[entries[e]];
-            to.all += lanes::sum(weight);
-            to.own += lanes::sum(lanes::where_equal(ids, p.label, weight, splat(0)));
+            for (int k = 0; k < count; ++k)
+                if (const float sum = lanes::sum(weight * of[k]); sum > 0) add(entries[e], known[k], sum);
         }
     }
 }

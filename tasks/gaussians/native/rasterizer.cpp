@@ -101,19 +101,27 @@ int ss_rasterize(void* workspace, const Scene* scene, const Images* images, int 
     });
 }
 
-// For each row, the sums of its weights over all pixels, and over those whose id is its label; the workspace must still
-// hold this scene's rendering. 0 = done, 1 = out of memory.
-int ss_shares(void* workspace, const Scene* scene, float* all, float* own, int threads) {
+// Finds how much each Gaussian shows in the pixels of each id >= 0 of [H, W]: the sums of its weights, in `count` pieces
+// that `ss_take_shares` gives. The workspace must still hold this scene's rendering. 0 = done, 1 = out of memory.
+int ss_shares(void* workspace, const Scene* scene, const int32_t* ids, int64_t* count, int threads) {
     return guarded([&] {
         Frame& frame = static_cast<Workspace*>(workspace)->frame;
-        parallel::each(threads, frame.num_bands, [&](int64_t b) { blending::weigh(*scene, frame, frame.bands[b]); });
-        std::fill(all, all + scene->count, 0.0f), std::fill(own, own + scene->count, 0.0f);
-        for (int b = 0; b < frame.num_bands; ++b)
-            for (int64_t k = 0; k < frame.bands[b].count; ++k) {
-                const int32_t row = frame.bands[b].splats[k].row;
-                all[row] += frame.bands[b].shares[k].all, own[row] += frame.bands[b].shares[k].own;
-            }
+        parallel::each(threads, frame.num_bands,
+                       [&](int64_t b) { blending::weigh(*scene, frame, frame.bands[b], ids); });
+        *count = 0;
+        for (int b = 0; b < frame.num_bands; ++b) *count += (int64_t)frame.bands[b].shares.size();
     });
+}
+
+// The rows, ids and sums of these pieces, from the upper to the lower bands, in which a row may be again.
+void ss_take_shares(const void* workspace, int32_t* rows, int32_t* ids, float* weights) {
+    const Frame& frame = static_cast<const Workspace*>(workspace)->frame;
+    for (int b = 0; b < frame.num_bands; ++b)
+        for (const binning::Share& share : frame.bands[b].shares) {
+            *rows++ = frame.bands[b].splats[share.splat].row;
+            *ids++ = share.id;
+            *weights++ = share.weight;
+        }
 }
 
 // Writes the gradients of all rows; the workspace must still hold this scene's rendering. 0 = done, 1 = out of memory.

@@ -13,7 +13,7 @@ from made_gaussians import made_cameras, made_gaussians
 
 from ss_flow.tasks.artifacts import Gaussians, LabelMap, PointCloud, PointLabels, PointParts
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
-from ss_flow.tasks.gaussians.render import render, weights_by_id
+from ss_flow.tasks.gaussians.render import render, shares
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.splat.label import LabelParams, ViewVotes, label, own_gaussians, vote
@@ -87,16 +87,18 @@ def test_the_votes_of_a_view_are_its_pixels_shared_out_by_weight(boxes):
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_weights_by_id_are_those_of_the_mask_channels(degree):
+def test_what_a_gaussian_shows_of_an_id_is_its_mask_channel_there(degree):
     """The weights of one Gaussian in the pixels of an id: the mask image of a label that only this Gaussian has."""
     scene, camera = made_gaussians(12, degree), camera_of(made_cameras(), 0)
     ids = np.add.outer(np.arange(camera.height) // 30, np.arange(camera.width) // 40) % 5 - 1
-    found = dict(weights_by_id(scene, camera, ids))
-    assert sorted(found) == [0, 1, 2, 3]
+    found = shares(scene, camera, ids)
+    assert np.unique(found.id).tolist() == [0, 1, 2, 3] and (np.diff(found.id * 12 + found.row) > 0).all()
     alone = replace(scene, instance_id=np.arange(12, dtype=np.int32))
     images = render(alone, camera, label_ids=range(12)).label_masks
-    for one, weights in found.items():
-        np.testing.assert_allclose(weights, images[:, ids == one].sum(axis=1), rtol=1e-4, atol=1e-4)
+    weights = np.zeros((4, 12), np.float32)
+    weights[found.id, found.row] = found.weight
+    for one in range(4):
+        np.testing.assert_allclose(weights[one], images[:, ids == one].sum(axis=1), rtol=1e-4, atol=1e-4)
 
 
 def test_the_label_with_most_votes_over_all_views_wins_and_the_lower_one_of_equals():
