@@ -160,6 +160,7 @@ class NativeBackend:
             library().ss_adam(
                 len(value), width, active, head, address(value), address(gradients[name]), address(first[name]),
                 address(second[name]), rate, step.rates["sh_rest"] if name == "sh" else rate, step.number, EPSILON,
+                self._threads,
             )  # fmt: skip
         # A step of Adam is as long as its rate: those of the means, taken with rate 1, are cut to size here.
         means = values["means"]

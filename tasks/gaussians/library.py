@@ -102,7 +102,7 @@ _INTERFACE: dict[str, tuple[Any, list[Any]]] = {
     "ss_take_shares": (None, [*[_POINTER] * 4]),
     "ss_photometric": (_INT, [_POINTER, *[_INT] * 3, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER, _INT]),
     "ss_surface_loss": (None, [_INT64, *[_POINTER] * 9, _FLOAT, _FLOAT, _INT, *[_POINTER] * 3]),
-    "ss_adam": (None, [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE]),
+    "ss_adam": (None, [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE, _INT]),
     "ss_patchmatch": (_INT, [_PROBLEM]),
 }
 """What each function returns and takes."""

@@ -262,26 +262,31 @@ void ss_surface_loss(int64_t n, const float* alpha, const float* depth, const fl
 // One step of Adam (Kingma & Ba 2015, betas 0.9 and 0.999), in place, on the first `active` of each row's `width`
 // values; the first `head` of them have a rate of their own.
 void ss_adam(int64_t rows, int64_t width, int64_t active, int64_t head, float* value, const float* gradient,
-             float* first, float* second, double head_rate, double rate, int64_t step, double epsilon) {
+             float* first, float* second, double head_rate, double rate, int64_t step, double epsilon, int threads) {
+    constexpr int64_t kRows = 1 << 14;  // in one piece: fewer take less time than a thread to start
     const float correct = (float)(1 / std::sqrt(1 - std::pow(0.999, (double)step)));
     const double debias = 1 / (1 - std::pow(0.9, (double)step));
-    const float small = (float)epsilon;
-    const auto update = [&](int64_t begin, int64_t end, double of_these) {
-        const float scale = (float)(of_these * debias);
+    // By value: what is reached through a reference may change with every write, and no loop would become vector code.
+    const auto update = [=](int64_t begin, int64_t end, double of_these) {
+        const float scale = (float)(of_these * debias), small = (float)epsilon, upright = correct;
+        float *const v = value, *const m = first, *const n = second;
         for (int64_t i = begin; i < end; ++i) {
             const float g = gradient[i];
-            first[i] = 0.9f * first[i] + 0.1f * g;
-            second[i] = 0.999f * second[i] + 0.001f * g * g;
-            value[i] -= scale * first[i] / (std::sqrt(second[i]) * correct + small);
+            m[i] = 0.9f * m[i] + 0.1f * g;
+            n[i] = 0.999f * n[i] + 0.001f * g * g;
+            v[i] -= scale * m[i] / (std::sqrt(n[i]) * upright + small);
         }
     };
-    if (active == width && (head == 0 || head == width)) {  // in one go, since short loops do not become vector code
-        update(0, rows * width, head == 0 ? rate : head_rate);
-        return;
-    }
-    for (int64_t r = 0; r < rows; ++r) {
-        update(r * width, r * width + head, head_rate);
-        update(r * width + head, r * width + active, rate);
-    }
+    parallel::each(threads, (rows + kRows - 1) / kRows, [&](int64_t piece) {
+        const int64_t begin = piece * kRows, end = std::min(rows, begin + kRows);
+        if (active == width && (head == 0 || head == width)) {  // in one go: short loops do not become vector code
+            update(begin * width, end * width, head == 0 ? rate : head_rate);
+            return;
+        }
+        for (int64_t r = begin; r < end; ++r) {
+            update(r * width, r * width + head, head_rate);
+            update(r * width + head, r * width + active, rate);
+        }
+    });
 }
 }

@@ -142,7 +142,25 @@ def test_adam_agrees_with_torch():
         parts[0].grad, parts[1].grad = torch.tensor(gradient[:, :2]), torch.tensor(gradient[:, 2:5])
         optimizer.step()
         library().ss_adam(
-            10, 6, 5, 2, address(ours), address(gradient), address(first), address(second), 0.01, 0.1, step, 1e-15
+            10, 6, 5, 2, address(ours), address(gradient), address(first), address(second), 0.01, 0.1, step, 1e-15, 1
         )
     expected = np.concatenate([*(part.detach().numpy() for part in parts), value[:, 5:]], axis=1)
     assert np.allclose(ours, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("width", "active", "head"), [(3, 3, 0), (12, 6, 3)])
+def test_threads_change_no_byte_of_adam(width, active, head):
+    """More rows than fit in one piece of a thread's work."""
+    rng = np.random.default_rng(5)
+    start, gradient = rng.normal(size=(2, 40_001, width)).astype(np.float32)
+    found = set()
+    for threads in (1, 3):
+        ours, first, second = start.copy(), np.zeros_like(start), np.zeros_like(start)
+        for step in (1, 2):
+            library().ss_adam(
+                len(ours), width, active, head, address(ours), address(gradient), address(first), address(second),
+                0.01, 0.1, step, 1e-15, threads,
+            )  # fmt: skip
+        found.add(ours.tobytes())
+    assert len(found) == 1
+    assert (ours[:, :active] != start[:, :active]).all() and (ours[:, active:] == start[:, active:]).all()
