@@ -20,8 +20,8 @@ from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid,
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.splat.photo_borders import settled_by_photo
 
-_LABELS_AT_ONCE = 16
-"""So many mask images are held at once."""
+_MASK_BYTES = 100_000_000
+"""Of the mask images that are held at once: fewer take more renderings, each of which bins all Gaussians again."""
 _SOLID = 0.5
 """Alpha from which a pixel shows anything."""
 _BENEFIT = 0.5
@@ -96,8 +96,9 @@ def _ids_of_view(scene: Gaussians, camera: Camera, known: np.ndarray, share: flo
     ids = np.zeros((camera.height, camera.width), np.uint16)
     heaviest, of_known = np.zeros(ids.shape, np.float32), np.zeros(ids.shape, np.float32)
     present = np.unique(shown.instance_id)
-    for start in range(0, len(present), _LABELS_AT_ONCE):
-        labels = present[start : start + _LABELS_AT_ONCE]
+    at_once = max(1, _MASK_BYTES // heaviest.nbytes)
+    for start in range(0, len(present), at_once):
+        labels = present[start : start + at_once]
         weights = render(shown, camera, label_ids=labels.tolist(), winners=False).label_masks
         for label, weight in zip(labels, weights, strict=True):
             ids[weight > heaviest] = label
