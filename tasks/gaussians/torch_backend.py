@@ -159,13 +159,13 @@ class TorchBackend:
     def target(self, target: Target, num_labels: int) -> _Target:
         height, width = target.inside.shape
         channel_of_label = np.zeros(num_labels, np.int32)
-        one_hot = np.zeros((0, height, width), np.float32)
+        one_hot = torch.zeros((0, height, width), device=self._device)
         if target.ids is not None:
             present = np.unique(target.ids[target.ids >= 0])
             channel_of_label[:] = len(present)
             channel_of_label[present] = np.arange(len(present))
-            one_hot = np.zeros((len(present) + 1, height, width), np.float32)
-            one_hot[: len(present)] = target.ids == present[:, None, None]
+            one_hot = torch.zeros((len(present) + 1, height, width), device=self._device)
+            one_hot[: len(present)] = self.put(target.ids) == self.put(present)[:, None, None]
         return _Target(
             self._renderer.camera_on(self._device, target.camera),
             _Photo.of(self.put(target.image), self.put(target.counted)) if target.counted.any() else None,
@@ -174,7 +174,7 @@ class TorchBackend:
             self.put(1 / target.depth),
             self.put(target.known),
             None if target.labelled is None else self.put(target.labelled),
-            self.put(one_hot),
+            one_hot,
             self.put(channel_of_label),
         )
 

@@ -66,12 +66,13 @@ def quality(gaussians: Gaussians, views: Sequence[TrainView], ids: Int32) -> Qua
     overlaps: list[float] = []
     error, count = 0.0, 0
     for view in views:
-        rendering = render(gaussians, view.camera, label_ids=ids.tolist(), winners=False)
+        assert view.ids is not None
+        channels = np.unique(view.ids[view.inside])
+        rendering = render(gaussians, view.camera, label_ids=ids[channels].tolist(), winners=False)
         error += float(((rendering.rgb - view.image)[view.inside].astype(np.float64) ** 2).sum())
         count += 3 * int(view.inside.sum())
-        assert view.ids is not None
         counts = view.ids != -1
-        for channel in np.unique(view.ids[view.inside]):
-            overlaps.append(iou((rendering.label_masks[channel] >= 0.5) & counts, view.ids == channel))
+        for channel, weight in zip(channels, rendering.label_masks, strict=True):
+            overlaps.append(iou((weight >= 0.5) & counts, view.ids == channel))
     mse = max(error / max(1, count), 1e-10)
     return Quality(float(np.mean(overlaps)) if overlaps else 1.0, -10 * float(np.log10(mse)))
