@@ -23,7 +23,7 @@ from ss_flow.flows.generated import generate
 
 PAGES = sorted({block.page for block in BLOCKS if list(commands(block))})
 INSTALLS = "it installs, from the network"
-CLUSTER = "it needs a cluster; tests/ss_flow/test_executors.py runs one"
+CLUSTER = "it needs a cluster; tests/ss_flow/test_dask.py runs one"
 NOT_RUN = {
     "python3 -m venv": INSTALLS,
     ".venv/bin/": "it installs, or is what runs this test",
