@@ -23,7 +23,7 @@ from ss_flow.flows.generated import generate
 
 PAGES = sorted({block.page for block in BLOCKS if list(commands(block))})
 INSTALLS = "it installs, from the network"
-CLUSTER = "it needs a cluster; tests/ss_flow/test_executors.py runs one"
+CLUSTER = "it needs a cluster; tests/ss_flow/test_dask.py runs one"
 NOT_RUN = {
     "python3 -m venv": INSTALLS,
     ".venv/bin/": "it installs, or is what runs this test",
@@ -37,7 +37,7 @@ NOT_RUN = {
     "ss-flow run /shared/kitchen": CLUSTER,
     "ss-flow run /scenes/kitchen": CLUSTER,
     "export AWS_ACCESS_KEY_ID": "it names a bucket",
-    "ss-flow run SCENE --cache s3:": "it needs a bucket; tests/cache/test_remote.py serves one",
+    "ss-flow run SCENE --cache s3:": "it needs a bucket; tests/cache/test_remote_flows.py serves one",
     "ss-flow demo": "its room takes minutes; test_demo.py runs it with fewer photos",
     "ss-flow reproduce": "it runs many rooms or a data set; test_reproduce.py runs it with fewer",
     "ss-flow run kitchen --hints": "it needs the weights of a segmenter",

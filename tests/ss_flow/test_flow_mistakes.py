@@ -1,0 +1,75 @@
+"""Mistakes in a flow, or in what is asked of its run, are refused in one sentence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ss_flow_toy as toy
+from toy_runs import run, value
+
+from ss_flow.graph import INDEX, Flow, each, gather, pick, stored
+
+
+def test_an_unknown_executor_is_refused_in_one_sentence(store):
+    from ss_flow.errors import InputError
+
+    with pytest.raises(InputError, match="threads, processes"):
+        run(store, toy.flow, executor="mesos")
+
+
+@pytest.mark.parametrize("name", ["jobs", "memory_mb", "gpus"])
+def test_a_negative_number_is_refused_in_one_sentence(store, name):
+    from ss_flow.errors import InputError
+
+    with pytest.raises(InputError, match=f"{name} is -1; it must be 0 or more"):
+        run(store, toy.flow, **{name: -1})
+
+
+def test_an_input_that_is_no_node_is_refused():
+    flow = Flow()
+    with flow.building(), pytest.raises(TypeError, match="must be a node"):
+        gather([1.0])
+
+
+@pytest.mark.parametrize(
+    ("build", "said"),
+    [
+        (lambda: None, "a dict of nodes, not NoneType"),
+        (lambda: {"x": [toy.source(values=(1.0,))]}, "the output x must be a node, not list"),
+        (lambda: {"x": OF_ANOTHER_FLOW}, "the output x is a node of another flow"),
+        (lambda: {"x": toy.square(OF_ANOTHER_FLOW)}, "the input x of ss_flow_toy.square is a node of another flow"),
+        (lambda: {"x": toy.total((OF_ANOTHER_FLOW,))}, "is a node of another flow"),
+        (lambda: {"x": toy.source(values=(1.0, {2}))}, "the parameter values holds a set"),
+    ],
+)
+def test_a_mistake_in_a_flow_is_told_in_one_sentence(store, build, said):
+    with pytest.raises(TypeError, match=said):
+        run(store, build)
+
+
+with Flow().building():
+    OF_ANOTHER_FLOW = toy.source(values=(1.0,))
+
+
+def test_positions_alone_have_no_length_and_are_refused_at_the_call(store):
+    with pytest.raises(TypeError, match="INDEX alone says no length"):
+        run(store, lambda: {"all": each(INDEX, build=lambda i: toy.number(i))})
+
+
+def test_only_a_node_has_items_to_pick():
+    with Flow().building(), pytest.raises(TypeError, match="not a list"):
+        pick([1, 2], [0])
+
+
+def test_a_node_cannot_be_gone_through_as_a_list():
+    flow = Flow()
+    with flow.building(), pytest.raises(TypeError, match="use `each`"):
+        tuple(toy.source(values=(1.0,)))
+
+
+def test_an_artifact_at_hand_is_no_input_but_becomes_one_through_the_store(store):
+    for at_hand in (toy.number(1.0), np.zeros(2), None):
+        with pytest.raises(TypeError, match=r"the input x of ss_flow_toy\.clip is a \w+, no node; .* stored\("):
+            run(store, lambda at_hand=at_hand: {"x": toy.clip(at_hand, limit=2.0)})
+    report = run(store, lambda: {"x": toy.clip(stored("x", store.put(toy.number(3.0))), limit=2.0)})
+    assert value(store, report.values["x"]) == 2.0
