@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,7 +11,6 @@ import numpy as np
 
 from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
-from ss_flow.tasks.gaussians.initialise import SH_ZERO
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.geometry.cameras import Camera
@@ -105,44 +104,17 @@ class Shares(NamedTuple):
 def shares(gaussians: Gaussians, camera: Camera, ids: Int32) -> Shares:
     """How much each Gaussian shows in the pixels of each id.
 
-    ids: [H, W] of the camera's size; pixels below 0 count for none. No colour matters.
+    ids: [H, W] of the camera's size; pixels below 0 count for none. Always on the CPU: gsplat tells it by gradients
+    alone, three ids at once.
     """
-    grey = replace(gaussians, sh=np.zeros((len(gaussians), 1, 3), np.float32))
+    grey = replace(gaussians, sh=np.zeros((len(gaussians), 1, 3), np.float32))  # no colour matters
     parameters = tuple(np.ascontiguousarray(getattr(grey, name), np.float32) for name in PARAMETERS)
-    found = _shares(_device(grey), parameters, camera, ids)
-    key, place = np.unique(found.id.astype(np.int64) * len(gaussians) + found.row, return_inverse=True)
-    one, row = np.divmod(key, max(len(gaussians), 1))
-    return Shares(
-        row.astype(np.int32), one.astype(np.int32), np.bincount(place, found.weight, len(key)).astype(np.float32)
-    )
-
-
-def _shares(device: str, parameters: tuple[Float32, ...], camera: Camera, ids: Int32) -> Shares:
-    """In any order, and in several pieces."""
     settings = Settings((0.0, 0.0, 0.0), 0, 0, winners=False)
-    if device != "cpu":
-        from ss_flow.tasks.gaussians.torch_render import weigher
-
-        with suppress(MemoryError):
-            return _by_gradients(weigher(device, parameters, camera, settings), ids)
-    return Shares(*NativePass(parameters, None, camera, settings, threads=cores()).shares(ids))  # type: ignore[arg-type]
-
-
-def _by_gradients(weigh: Callable[[Float32], Float32], ids: Int32) -> Shares:
-    """A rendering is linear in the colours, so the sums are its gradient towards them, where the gradient of the image
-    is 1 in an id's pixels; the three channels hold three ids at once.
-
-    weigh: the gradient towards the constant colours [N, 3] for one towards the picture [H, W, 3].
-    """
-    pieces = [(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))]
-    known = np.unique(ids[ids >= 0])
-    for some in np.split(known, range(3, len(known), 3)):
-        towards = np.zeros((*ids.shape, 3), np.float32)
-        towards[..., : len(some)] = ids[..., None] == some
-        weights = weigh(towards)[:, : len(some)] / np.float32(SH_ZERO)
-        row, channel = np.nonzero(weights > 0)
-        pieces.append((row.astype(np.int32), some[channel].astype(np.int32), weights[row, channel]))
-    return Shares(*(np.concatenate(of_all) for of_all in zip(*pieces, strict=True)))
+    done = NativePass(parameters, None, camera, settings, threads=cores())  # type: ignore[arg-type]
+    rows, found, weights = done.shares(ids)
+    key, place = np.unique(found.astype(np.int64) * len(gaussians) + rows, return_inverse=True)
+    one, row = np.divmod(key, max(len(gaussians), 1))
+    return Shares(row.astype(np.int32), one.astype(np.int32), np.bincount(place, weights, len(key)).astype(np.float32))
 
 
 def _device(gaussians: Gaussians) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -37,27 +37,6 @@ def draw(
         drawn = _drawn(gaussians, labels, camera, settings)
         # NumPy goes through each mask by itself, and gsplat has them side by side in each pixel.
         return replace(drawn, label_masks=drawn.label_masks.contiguous())
-
-
-def weigher(
-    device: str, parameters: Sequence[Float32], camera: Camera, settings: Settings
-) -> Callable[[Float32], Float32]:
-    """The gradient of the picture's sum, weighted by [H, W, 3], towards the constant colours [N, 3].
-
-    Both raise MemoryError.
-    """
-    with memory_of(torch.device(device)):
-        gaussians = GaussianTensors(*(torch.tensor(a, device=device) for a in parameters))
-        gaussians.sh.requires_grad_()
-        picture = _drawn(gaussians, None, camera, settings).rgb
-
-    def weigh(towards: Float32) -> Float32:
-        with memory_of(torch.device(device)):
-            given = torch.tensor(towards, device=device)
-            (found,) = torch.autograd.grad(picture, gaussians.sh, given, retain_graph=True)
-            return found[:, 0].cpu().numpy()
-
-    return weigh
 
 
 def _drawn(gaussians: GaussianTensors, labels: Int32 | None, camera: Camera, settings: Settings) -> Rendered:

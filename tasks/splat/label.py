@@ -58,7 +58,7 @@ class ViewVotes:
     """[A] how large that part is: the sum of its weights T * alpha over these pixels."""
 
 
-@task(name="splat.vote", resources=Resources(cores=1, memory_mb=1000, gpus=0.1), environment=backend_identity)
+@task(name="splat.vote", resources=Resources(cores=1, memory_mb=1000), environment=backend_identity)
 def vote(scene: Gaussians, frame: Frame, camera: Camera, shown: LabelMap) -> ViewVotes:
     """What a view's masks say about a scene: each pixel has one vote for its instance, and every Gaussian in it gets as
     much of this vote as it makes up of the pixel.

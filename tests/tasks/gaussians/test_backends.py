@@ -25,7 +25,7 @@ from ss_flow.tasks.gaussians.native_pass import PARAMETERS, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
 from ss_flow.tasks.gaussians.optimizer import Parameters
 from ss_flow.tasks.gaussians.rasterize import GaussianTensors, device_here, renderer_on
-from ss_flow.tasks.gaussians.render import render, shares
+from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.torch_backend import TorchBackend
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
@@ -266,18 +266,10 @@ def test_renderings_by_torch_are_the_native_ones(monkeypatch, label_ids):
     drawing = sys.modules[render.__module__]
     monkeypatch.setattr(drawing, "_device", lambda gaussians: "cpu")
     expected = render(made, target.camera, background=(0.1, 0.2, 0.3), label_ids=label_ids)
-    ids = np.random.default_rng(0).integers(-1, 5, expected.alpha.shape)
-    shown = shares(made, target.camera, ids)
     monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))  # torch's, not "cpu", the native one
     found = render(made, target.camera, background=(0.1, 0.2, 0.3), label_ids=label_ids)
     for name, image in expected._asdict().items():
         assert getattr(found, name).dtype == image.dtype and np.array_equal(getattr(found, name), image), name
-    again = shares(made, target.camera, ids)
-    dense = np.zeros((2, 5, len(made)))
-    for known, weight in zip((shown, again), dense, strict=True):
-        weight[known.id, known.row] = known.weight
-    np.testing.assert_allclose(dense[1], dense[0], atol=1e-5)
-    assert len(shown.row) > 100
 
 
 class FromTheHost(TorchFunctionMode):
@@ -509,12 +501,10 @@ def test_what_a_device_has_no_memory_for_is_trained_on_the_cpu_in_the_last_try(m
 def test_what_a_device_has_no_memory_for_is_drawn_on_the_cpu(monkeypatch):
     made = initialise(np.array([[0, 0, 2.0]]), np.full((1, 3), 200, np.uint8), 1, 1.0)
     camera = Camera(32, 24, 30, 30, 16, 12, np.eye(4))
-    ids = np.zeros((24, 32), int)
-    expected, weights = render(made, camera), shares(made, camera, ids).weight
+    expected = render(made, camera)
     drawing = sys.modules[render.__module__]
     monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))
     by_torch = sys.modules["ss_flow.tasks.gaussians.torch_render"]
     monkeypatch.setattr(by_torch, "_drawn", no_memory)
     for name, image in expected._asdict().items():
         assert np.array_equal(getattr(render(made, camera), name), image), name
-    assert np.array_equal(shares(made, camera, ids).weight, weights) and len(weights) == 1
