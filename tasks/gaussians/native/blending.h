@@ -96,6 +96,15 @@ struct Touch {
     }
 };
 
+// A splat's weight in each pixel; T is what is left for those behind. A pixel that is done lets nothing through any more,
+// so it stays done.
+INLINE V16 weight_of(const V16& alpha, V16& T) {
+    const V16 after = T * (1.0f - alpha);
+    const V16 weight = where_less(after, splat(kMinTransmittance), splat(0), T * alpha);
+    T = where_less(after, splat(kMinTransmittance), splat(0), after);
+    return weight;
+}
+
 // What `mismatch` counts the weights of a label with: -1 where the pixel should show it, 1 elsewhere.
 INLINE V16 sign_of(int32_t label, const I16& ids) { return lanes::where_equal(ids, label, splat(-1), splat(1)); }
 
@@ -160,11 +169,7 @@ void forward(const Scene& s, const Frame& frame, Band& band, const Images& out) 
             for (const int end = std::min(e + kAskEvery, count); e < end; ++e) {
                 __builtin_prefetch(&band.splats[entries[e + binning::kAhead]]);
                 const Splat& p = band.splats[entries[e]];
-                const Touch t = Touch::of(column, row, p);
-                // A pixel that is done lets nothing through any more, so it stays done.
-                const V16 after = T * (1.0f - t.alpha);
-                const V16 weight = where_less(after, splat(kMinTransmittance), splat(0), T * t.alpha);
-                T = where_less(after, splat(kMinTransmittance), splat(0), after);
+                const V16 weight = weight_of(Touch::of(column, row, p).alpha, T);
                 red = red + weight * p.color[0];
                 green = green + weight * p.color[1];
                 blue = blue + weight * p.color[2];
@@ -366,9 +371,7 @@ inline void weigh(const Scene& s, const Frame& frame, Band& band, const int32_t*
         const int32_t* entries = band.entries.data() + band.first[index];
         for (int e = 0; e < band.used[index]; ++e) {
             __builtin_prefetch(&band.splats[entries[e + binning::kAhead]]);
-            const V16 alpha = Touch::of(column, row, band.splats[entries[e]]).alpha, after = T * (1.0f - alpha);
-            const V16 weight = where_less(after, splat(kMinTransmittance), splat(0), T * alpha);
-            T = where_less(after, splat(kMinTransmittance), splat(0), after);
+            const V16 weight = weight_of(Touch::of(column, row, band.splats[entries[e]]).alpha, T);
             for (int k = 0; k < count; ++k)
                 if (const float sum = lanes::sum(weight * of[k]); sum > 0) add(entries[e], known[k], sum);
         }

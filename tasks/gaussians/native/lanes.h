@@ -244,35 +244,29 @@ INLINE void exchange_all(V (&v)[count]) {
         if (!(k & stride)) exchange<stride>(v[k], v[k + stride]);
 }
 
-// The largest lane: exchanged with itself, a vector's lanes meet those that are `stride` away.
-template <int stride, class F>
-INLINE F larger(const F& v) {
+// All lanes of a vector put together, two by two: exchanged with itself, its lanes meet those that are `stride` away.
+template <class F, class Two, int stride = sizeof(F) / 8>
+INLINE float folded(const F& v, Two two) {
     F a = v, b = v;
     exchange<stride>(a, b);
-    return a < b ? b : a;
+    const F both = two(a, b);
+    if constexpr (stride > 1)
+        return folded<F, Two, stride / 2>(both, two);
+    else
+        return both[0];
 }
-INLINE float largest(const f4& v) { return larger<1>(larger<2>(v))[0]; }
-INLINE float largest(const f8& v) { return larger<1>(larger<2>(larger<4>(v)))[0]; }
-#if defined(__AVX512F__)
-INLINE float largest(const f16& v) { return larger<1>(larger<2>(larger<4>(larger<8>(v))))[0]; }
-#endif
+template <class F>
+INLINE float largest(const F& v) {
+    return folded(v, [](const F& a, const F& b) { return a < b ? b : a; });
+}
 template <class H>
 INLINE float largest(const Pair<H>& v) {
     return largest(where_less(v.lo, v.hi, v.hi, v.lo));
 }
-
-// The sum of all lanes, likewise.
-template <int stride, class F>
-INLINE F added(const F& v) {
-    F a = v, b = v;
-    exchange<stride>(a, b);
-    return a + b;
+template <class F>
+INLINE float sum(const F& v) {
+    return folded(v, [](const F& a, const F& b) { return a + b; });
 }
-INLINE float sum(const f4& v) { return added<1>(added<2>(v))[0]; }
-INLINE float sum(const f8& v) { return added<1>(added<2>(added<4>(v)))[0]; }
-#if defined(__AVX512F__)
-INLINE float sum(const f16& v) { return added<1>(added<2>(added<4>(added<8>(v))))[0]; }
-#endif
 template <class H>
 INLINE float sum(const Pair<H>& v) {
     return sum(v.lo + v.hi);
