@@ -10,16 +10,20 @@ import contextlib
 import os
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+T = TypeVar("T")
+R = TypeVar("R")
 Listener = Callable[[int, int, str], None]
 
 
@@ -79,6 +83,35 @@ def progress(done: int, total: int, note: str = "") -> None:
 def cores() -> int:
     """How many threads the task may use."""
     return _surroundings.get().cores
+
+
+def in_threads(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """What a function makes of each item, in order, by as many threads as the task may use.
+
+    Items are taken in the caller's thread, each when there is room for it. NumPy, SciPy and OpenCV let other threads
+    run while they work. The function itself has one core there, and its own progress is not heard.
+    """
+    if cores() == 1:
+        yield from map(function, items)
+        return
+    alone = replace(_surroundings.get(), listener=_ALONE.listener, cores=1)
+
+    def one(item: T) -> R:
+        with running(alone):
+            return function(item)
+
+    with ThreadPoolExecutor(cores(), "view") as pool:
+        begun: deque[Future[R]] = deque()
+        try:
+            for item in items:
+                begun.append(pool.submit(one, item))
+                if len(begun) > cores():
+                    yield begun.popleft().result()
+            while begun:
+                yield begun.popleft().result()
+        finally:
+            for late in begun:
+                late.cancel()
 
 
 def last_try() -> bool:

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Float32, Float64, Gaussians, Int32, UInt8
 from ss_flow.tasks.geometry.shape import box_diagonal
 
@@ -70,7 +71,7 @@ def neighbour_spread(points: Float32) -> Float64:
     """[N] the root of the mean squared distance of each point to the three nearest others. points: [N, 3], N >= 2."""
     from scipy.spatial import cKDTree
 
-    near, _ = cKDTree(points).query(points, k=min(4, len(points)), workers=1)
+    near, _ = cKDTree(points).query(points, k=min(4, len(points)), workers=cores())
     return np.asarray(np.sqrt(np.square(np.asarray(near)[:, 1:]).mean(axis=1)))
 
 
@@ -86,7 +87,7 @@ def laid_flat(gaussians: Gaussians, thickness: float) -> Gaussians:
     if len(gaussians) < 4:
         return gaussians
     points = gaussians.means.astype(np.float64)
-    _, near = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)), workers=1)
+    _, near = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)), workers=cores())
     around = points[near] - points[near].mean(axis=1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     normal = axes[:, :, 0] * np.where(axes[:, 2:, 0] < 0, -1, 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
 
 
@@ -66,7 +67,7 @@ def nearest_spacing(points: Float32 | Float64) -> float:
 
     if len(points) < 2:
         return 0.0
-    distance = np.asarray(cKDTree(points).query(points, k=2)[0])
+    distance = np.asarray(cKDTree(points).query(points, k=2, workers=cores())[0])
     return float(np.median(distance[:, 1]))
 
 

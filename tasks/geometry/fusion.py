@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.running import in_threads
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import pixels_under
@@ -81,10 +82,15 @@ def _in_cubes(sums: VoxelSums, voxel: float) -> VoxelSums:
     position, weight = sums.position, sums.weight
     cell = np.floor(position / weight[:, None] / voxel + 0.5).astype(np.int64) & (_CELLS - 1)
     code = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
-    _, inverse = np.unique(code, return_inverse=True)
+    # Neighbours in a photo, and sums that came from earlier ones, stand nearly in order already, which makes a stable
+    # sort three to seven times as fast as the one that np.unique takes.
+    order = np.argsort(code, kind="stable")
+    ascending = code[order]
+    voxel_of = np.empty(len(code), np.int64)
+    voxel_of[order] = np.cumsum(np.diff(ascending, prepend=ascending[:1]) != 0)
 
     def added(values: Float64) -> Float64:
-        return np.bincount(inverse, values).astype(np.float64, copy=False)
+        return np.bincount(voxel_of, values).astype(np.float64, copy=False)
 
     return VoxelSums(
         np.stack([added(position[:, i]) for i in range(3)], axis=-1),
@@ -113,16 +119,20 @@ def consistent_points(
     the point when the two differ by less than max(tau, tau_relative * depth). Flying pixels at depth edges, which
     other views look through, fail.
     """
-    seen = np.zeros(len(points), np.int32)
-    confirmed = np.zeros(len(points), np.int32)
-    for view, depth in enumerate(depths):
+
+    def told(view: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         camera = camera_of(cameras, view)
         rows, column, row, z = pixels_in_view(points, camera)
-        measured = depth_at(depth, column, row, camera.width, camera.height)
+        measured = depth_at(depths[view], column, row, camera.width, camera.height)
         tolerance = np.maximum(tau, tau_relative * z)
         known = measured > 0
-        seen[rows] += known & (measured > z - tolerance)
-        confirmed[rows] += known & (np.abs(measured - z) < tolerance)
+        return rows[known & (measured > z - tolerance)], rows[known & (np.abs(measured - z) < tolerance)]
+
+    seen = np.zeros(len(points), np.int32)
+    confirmed = np.zeros(len(points), np.int32)
+    for sees, confirms in in_threads(told, range(len(depths))):
+        seen[sees] += 1
+        confirmed[confirms] += 1
     return confirmed >= np.clip(seen, 1, min_views)
 
 

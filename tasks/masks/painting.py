@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Float32, Int32, Visibility
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, Visibility
 from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.geometry.zbuffer import paint
 from ss_flow.tasks.masks.overlap import weighted_iou
@@ -85,10 +85,27 @@ def agreement(painted: PaintedView, mask: Bool, label: int) -> float:
     return weighted_iou(mask.ravel()[painted.pixel], painted.label == label, painted.area)
 
 
+def agreements(painted: PaintedView, ids: Int32, labels: Int32) -> Float64:
+    """The same of some labels [L] at once, whose masks do not overlap: [L]. ids: [H, W] the label whose mask holds each
+    pixel."""
+    under = ids.ravel()[painted.pixel]
+    count = int(max(under.max(initial=0), painted.label.max(initial=0), labels.max(initial=0))) + 1
+    same = under == painted.label
+    both, held, own = (
+        np.bincount(of, areas, count)
+        for of, areas in (
+            (under[same], painted.area[same]),
+            (under, painted.area),
+            (painted.label, painted.area),
+        )
+    )
+    return (both / np.maximum(held + own - both, 1))[labels]
+
+
 def stack_exclusive(shown: dict[int, Bool], height: int, width: int) -> Int32:
     """One label a pixel, smaller masks on top, equal ones by the lower label: [H, W], 0 = none."""
     ids = np.zeros((height, width), np.int32)
-    for label in sorted(shown, key=lambda label: (-int(shown[label].sum()), -label)):
+    for label in sorted(shown, key=lambda label: (-int(np.count_nonzero(shown[label])), -label)):
         ids[shown[label]] = label
     return ids
 

@@ -102,7 +102,11 @@ def smoothed(mask: Bool, radius: int) -> Bool:
     import cv2
 
     side = 2 * radius + 1
-    most = cv2.boxFilter(mask.astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE) > 0.5
+    x0, y0, x1, y1 = bounds(mask)
+    # Farther off than this nothing is seen of it.
+    near = (slice(max(y0 - side, 0), y1 + side), slice(max(x0 - side, 0), x1 + side))
+    most = np.zeros_like(mask)
+    most[near] = cv2.boxFilter(mask[near].astype(np.float32), -1, (side, side), borderType=cv2.BORDER_REPLICATE) > 0.5
     return large_pieces(most, _CRUMB)[0]
 
 

@@ -74,8 +74,11 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     order = canonical_order(dense)
     dense = dense[order]
     labels, index = np.unique(painted.label, return_inverse=True)
-    flat = dense.reshape(len(dense), -1)[:, painted.pixel]
-    count = np.stack([np.bincount(index[mask], painted.area[mask], len(labels)) for mask in flat])
+    row_at = np.full(pool.height * pool.width, -1, np.int32)
+    row_at[painted.pixel] = np.arange(len(painted.pixel), dtype=np.int32)
+    # The rows of `painted` that a mask holds: most masks are a small part of the picture.
+    held = [rows[rows >= 0] for rows in (row_at[np.flatnonzero(mask)] for mask in dense)]
+    count = np.stack([np.bincount(index[rows], painted.area[rows], len(labels)) for rows in held])
     total = np.bincount(index, painted.area, len(labels))
     area = count @ np.where(labels == 0, params.unlabelled, 1.0)
     fits = count / np.maximum(area[:, None] + total - count, 1)
@@ -91,13 +94,13 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     for row, column in pairs:
         if free[row] and column not in chosen:
             free[row] = False
-            chosen[column], shown[int(labels[column])] = flat[row], dense[row]
+            chosen[column], shown[int(labels[column])] = dense[row].ravel()[painted.pixel], dense[row]
 
     # An occluder may cut an object in two: what is left joins where it fits.
     for column in sorted(chosen):
         mine, label = index == column, int(labels[column])
         for row in np.flatnonzero(free & (count.argmax(axis=1) == column)):
-            both = chosen[column] | flat[row]
+            both = chosen[column] | dense[row].ravel()[painted.pixel]
             added = dense[row] & ~shown[label]
             backed = (mine & both & ~chosen[column]).sum() / max(1, added.sum())
             dense_enough = backed >= _BACKED * (mine & chosen[column]).sum() / shown[label].sum()

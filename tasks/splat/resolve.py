@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ss_flow.errors import InputError
+from ss_flow.running import in_threads
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import REFINED, Cameras, Float32, InstanceMasks, Int32, LabelMap, Visibility
 from ss_flow.tasks.gaussians.views import SceneViews, Views
@@ -42,7 +43,7 @@ def resolve(cameras: Cameras, instances: tuple[InstanceMasks, ...]) -> tuple[Lab
     return _painted(sizes, instances, kept_on_top=False)
 
 
-@task(resources=Resources(cores=1, memory_mb=1000))
+@task(resources=Resources(cores=1, most_cores=8, memory_mb=1000))
 def resolve_refined(
     views: Views,
     instances: tuple[InstanceMasks, ...],
@@ -61,7 +62,9 @@ def resolve_refined(
     scene = views.compared(visibility)
     points = np.concatenate([instance.points for instance in instances])
     labels = np.repeat([i.instance_id for i in instances], [len(i.points) for i in instances]).astype(np.int32)
-    for view, (frame, label_map) in enumerate(zip(views.frames, maps, strict=True)):
+
+    def settled(view: int) -> LabelMap:
+        frame, label_map = views.frames[view], maps[view]
         if by_points:
             nearest = _nearest(scene, view, points, labels)
             for instance in instances:
@@ -69,7 +72,9 @@ def resolve_refined(
                     mask = instance.mask(instance.views.index(frame.name))
                     label_map.ids[mask & (nearest == instance.instance_id)] = instance.instance_id
         label_map.ids[~decode_valid(frame)] = 0
-    return maps
+        return label_map
+
+    return tuple(in_threads(settled, range(len(maps))))
 
 
 def _nearest(scene: SceneViews, view: int, points: Float32, labels: Int32) -> Int32:

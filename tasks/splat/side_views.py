@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.running import in_threads
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import neighbour_spread
 from ss_flow.tasks.gaussians.objective import Target
@@ -62,14 +64,15 @@ def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], c
         return []
     surfaces = shown_surfaces(views, masks, float(np.median(list(spacings.values()))))
     shaped = sorted(spacings.keys() & surfaces.keys())
-    found = []
-    for instance in shaped:
+
+    def around(instance: int) -> list[PartView]:
         start = int(np.searchsorted(scene.instance_id, instance))
         stop = start + len(own[instance])
-        points = np.concatenate([own[instance], surfaces[instance]])
-        for camera in cameras_around(points, spacings[instance], min(count, -(-most // len(shaped)))):
-            found.append(PartView(start, stop, _target(camera, empty(camera, points, spacings[instance]))))
-    return found
+        points, spacing = np.concatenate([own[instance], surfaces[instance]]), spacings[instance]
+        cameras = cameras_around(points, spacing, min(count, -(-most // len(shaped))))
+        return [PartView(start, stop, _target(camera, empty(camera, points, spacing))) for camera in cameras]
+
+    return list(itertools.chain.from_iterable(in_threads(around, shaped)))
 
 
 def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) -> dict[int, Float32]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.render import shares
 from ss_flow.tasks.geometry.cameras import Camera
@@ -85,7 +86,7 @@ def _inside_own_box(scene: Gaussians, kept: Bool) -> Bool:
 def _spacing(points: Float32) -> float:
     from scipy.spatial import cKDTree
 
-    distance, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1, workers=1)
+    distance, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1, workers=cores())
     return float(np.median(np.asarray(distance)[:, -1]))
 
 

@@ -9,8 +9,8 @@ from typing import Annotated
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.running import progress
-from ss_flow.task import task
+from ss_flow.running import in_threads, progress
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, PointCloud, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
@@ -42,7 +42,7 @@ class DenseParams:
     """How many views must confirm a point, where as many see it."""
 
 
-@task()
+@task(resources=Resources(cores=1, most_cores=8))
 def dense(
     frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...], unit: SceneUnit, *, params: DenseParams
 ) -> PointCloud:
@@ -55,12 +55,16 @@ def dense(
     """
     voxel = voxel_side(cameras, depths, unit, params)
 
-    def views() -> Iterator[VoxelSums]:
-        for view, (frame, depth) in enumerate(zip(frames, depths, strict=True)):
+    def views() -> Iterator[int]:
+        for view, frame in enumerate(frames):
             progress(view, len(frames), frame.name)
-            yield sum_by_voxel([depth_samples(frame, cameras, view, depth)], voxel)
+            yield view
 
-    cloud = consistent_cloud(sum_by_voxel(views(), voxel), cameras, depths, voxel=voxel, unit=unit, params=params)
+    def sums(view: int) -> VoxelSums:
+        return sum_by_voxel([depth_samples(frames[view], cameras, view, depths[view])], voxel)
+
+    summed = sum_by_voxel(in_threads(sums, views()), voxel)
+    cloud = consistent_cloud(summed, cameras, depths, voxel=voxel, unit=unit, params=params)
     if not len(cloud.points):
         raise InputError(
             "The depth maps of this scene agree in no point; they should be z-depths in the unit of the camera poses."

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     Bool,
     Cameras,
@@ -96,7 +96,7 @@ class HierarchyParams:
     not looked for."""
 
 
-@task(name="split.hierarchy")
+@task(name="split.hierarchy", resources=Resources(cores=1, most_cores=8))
 def hierarchy(
     points: PointCloud,
     cameras: Cameras,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.running import in_threads
 from ss_flow.tasks.artifacts import Cameras, Float64, PointCloud, Visibility
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 
@@ -45,4 +46,5 @@ class Looks:
         """Of each view: row and column of the pixels at which it sees its points, to be searched."""
         from scipy.spatial import cKDTree
 
-        return [cKDTree(np.stack(np.divmod(v.pixel, v.width), axis=1)) for v in self.visibility]
+        pixels = (np.stack(np.divmod(v.pixel, v.width), axis=1) for v in self.visibility)
+        return list(in_threads(cKDTree, pixels))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ss_flow.running import in_threads
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
@@ -82,16 +83,20 @@ def find_mounds(
     apart = _ends(labels.label, names, ends)
     rows_of, eye, bins = rows_by_label(labels.label), middle_of(cameras), bins_of(points.colors)
     spread = TouchingParams().color_spread
-    for row in np.flatnonzero((size >= _FEW) & apart & (share > _BESIDE).any(axis=1)):
+
+    def rises(row: int) -> bool:
         inside = rows_of[int(names[row])]
         own = thinned(points.points[inside], _ENOUGH)
         rest = np.sort(np.concatenate([rows_of[name] for name in names[share[row] > _BESIDE].tolist()]))
         distance, _ = cKDTree(points.points[rest]).query(own)
         centre, normal = plane_through(own[distance <= np.quantile(distance, _FOOT)])
-        rises = np.quantile((own - centre) @ towards(normal, centre, eye), 0.9)
+        rise = np.quantile((own - centre) @ towards(normal, centre, eye), 0.9)
         alike = likeness(histogram(bins[inside], spread), histogram(bins[rest], spread))
         enough = height * max(2 * alike, _LEAST) * box_diagonal(own, _TRIM)
-        bulges[row] = rises >= max(enough, 2 * points.spacing)
+        return bool(rise >= max(enough, 2 * points.spacing))
+
+    asked = np.flatnonzero((size >= _FEW) & apart & (share > _BESIDE).any(axis=1)).tolist()
+    bulges[asked] = list(in_threads(rises, asked))
     return Mounds(share, size.astype(np.int32), bulges, around)
 
 

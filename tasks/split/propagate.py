@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ss_flow.running import warn
-from ss_flow.task import task
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     BORDER,
     INSIDE,
@@ -86,7 +86,7 @@ class PropagateParams:
         return replace(read, at_once=MaskClusteringParams(rate=self.at_once.rate))
 
 
-@task()
+@task(resources=Resources(cores=1, most_cores=8))
 def propagate(
     points: PointCloud,
     visibility: Sequence[Visibility],

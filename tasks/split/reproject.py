@@ -28,6 +28,7 @@ from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.masks.painting import (
     PaintedView,
     agreement,
+    agreements,
     contradicted,
     labels_in_front,
     nearest_painted,
@@ -180,7 +181,8 @@ def _drawn(painted: PaintedView, view: Visibility, shown: dict[int, Bool], param
     A label whose points lie so scattered that hardly any of them is left inside has none.
     """
     ids = stack_exclusive(shown, view.height, view.width)
-    good = {label for label in shown if agreement(painted, ids == label, label) >= params.min_agreement}
+    labels = np.array(sorted(shown), np.int32)
+    good = set(labels[agreements(painted, ids, labels) >= params.min_agreement].tolist())
     missing = [label for label in labels_in_front(painted, params.min_points) if label not in good]
     if not missing:
         return {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Int32
 
 _NEIGHBOURS = 8
@@ -23,7 +24,8 @@ def smooth(label: Int32, contested: Bool, points: Float32, spacing: float, round
     if not rows.size:
         return label
     count = min(_NEIGHBOURS + 1, len(points))
-    _, near = cKDTree(points).query(points[rows], k=count, distance_upper_bound=_REACH * spacing)
+    tree = cKDTree(points)
+    _, near = tree.query(points[rows], k=count, distance_upper_bound=_REACH * spacing, workers=cores())
     near = np.asarray(near).reshape(len(rows), count)
     padded = np.append(label, np.int32(0))  # a neighbour out of reach has the number len(points)
     changed = np.ones(len(padded), bool)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
+from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, PointCloud
 from ss_flow.tasks.ranges import Fraction, Positive, Range
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
@@ -129,7 +130,7 @@ def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> Borders:
 
 def _nearest(tree: cKDTree, rows: Int32, count: int, reach: float) -> Int32:
     """The points nearest to some points of the tree: [R, count]; the point itself where there are fewer in reach."""
-    _, near = tree.query(tree.data[rows], k=np.arange(1, count + 1), distance_upper_bound=reach)
+    _, near = tree.query(tree.data[rows], k=np.arange(1, count + 1), distance_upper_bound=reach, workers=cores())
     return np.where(near < tree.n, near, rows[:, None]).astype(np.int32)
 
 

@@ -9,8 +9,10 @@ from ss_flow.tasks.masks.overlap import drop_duplicates, intersections, mask_iou
 from ss_flow.tasks.masks.pool import (
     canonical_order,
     exclusive,
+    large_pieces,
     mask_tree,
     merge_union,
+    smoothed,
     whole_pictures,
     without_speckles,
 )
@@ -147,3 +149,16 @@ def test_taking_speckles_off_twice_is_taking_them_off_once_where_nothing_large_i
     mask = np.array([bits >> i & 1 for i in range(16)], bool).reshape(4, 4)
     once = without_speckles(mask, 1.0)
     assert not once.any() or np.array_equal(without_speckles(once, 1.0), once)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3))
+def test_a_smoothed_mask_is_where_most_of_the_square_around_belongs_to_it(seed, radius):
+    """Also at the picture's border, which goes on as it ends."""
+    rng = np.random.default_rng(seed)
+    mask = np.zeros((16, 14), bool)
+    y, x = rng.integers(0, 10), rng.integers(0, 8)
+    mask[y : y + 6, x : x + 6] = rng.random((6, 6)) < 0.8
+    wide = np.pad(mask, radius, mode="edge")
+    square = np.lib.stride_tricks.sliding_window_view(wide, (2 * radius + 1, 2 * radius + 1))
+    most = square.mean(axis=(2, 3)) > 0.5
+    np.testing.assert_array_equal(smoothed(mask, radius), large_pieces(most, 0.1)[0])
