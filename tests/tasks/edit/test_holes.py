@@ -12,7 +12,7 @@ from ss_flow.tasks.artifacts import DepthMap, PointCloud, PointLabels
 from ss_flow.tasks.edit import operations
 from ss_flow.tasks.edit.fill import fill
 from ss_flow.tasks.edit.holes import Measured, holes
-from ss_flow.tasks.gaussians.initialise import concatenate, initialise
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 
 SPACING = 0.03
@@ -90,6 +90,21 @@ def test_filling_continues_the_floor_under_the_box_and_says_so(seen, removed):
     before = holes(scene, removed, measured, instances=(BOX,), gone=(BOX,)).unmeasured.sum()
     left = holes(scene, after, measured, instances=(BOX,), gone=(BOX,)).unmeasured.sum()
     assert left < 0.1 * before
+
+
+@pytest.mark.parametrize("how", ["moved", "replaced"])
+def test_the_floor_that_a_box_leaves_is_not_the_boxs_that_stands_beside_its_hole(seen, how):
+    measured, scene = seen
+    if how == "moved":
+        after = operations.transform(scene, instances=(BOX,), motion=operations.Motion(move=(0.3, 0.0, 0.0)))
+    else:  # by half of it
+        half = select(scene, (scene.instance_id == BOX) & (scene.means[:, 0] > 0.45))
+        after = concatenate(
+            [operations.remove(scene, instances=(BOX,)), replace(half, instance_id=half.instance_id + 7)]
+        )
+    full = fill(scene, after, measured, instances=(BOX,), gone=(BOX,))
+    new = full.instance_id[full.filled > 0]
+    assert len(new) > 100 and (new == 0).all()
 
 
 def test_what_is_not_filled_is_the_scene_as_it_was(seen, removed):
