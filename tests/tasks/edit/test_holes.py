@@ -66,6 +66,19 @@ def test_the_floor_under_a_box_was_measured_by_no_view(seen, removed):
     assert 0.6 * pixels_under < found.unmeasured.sum() < 1.1 * pixels_under  # a spacing at each side counts as seen
 
 
+@pytest.mark.parametrize("how", ["moved", "replaced"])
+def test_what_shows_a_box_that_has_hardly_moved_or_its_like_is_no_hole(seen, removed, how):
+    measured, scene = seen
+    nudge = operations.Motion(move=(0.001, 0.0, 0.0))
+    after = operations.transform(scene, instances=(BOX,), motion=nudge)
+    if how == "replaced":
+        after = replace(after, instance_id=np.where(after.instance_id == BOX, 9, after.instance_id).astype(np.int32))
+    found = holes(scene, after, measured, instances=(BOX,), gone=(BOX,))
+    without = holes(scene, removed, measured, instances=(BOX,), gone=(BOX,))
+    assert np.array_equal(found.left, without.left)
+    assert found.unmeasured.sum() < 0.02 * without.unmeasured.sum()
+
+
 def test_the_area_is_that_of_the_pixels_at_the_depth_of_what_was_there(seen, removed):
     measured, scene = seen
     found = holes(scene, removed, measured, instances=(BOX,), gone=(BOX,))
