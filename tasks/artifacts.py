@@ -425,7 +425,7 @@ class Descriptors:
     views: tuple[str, ...]
     """[V] names of the views that went in."""
     weights: Float32
-    """[V] visible area of the instance in each of them, in pixels."""
+    """[V] visible area of the instance in each of them, in pixels; 1 each where views weigh the same."""
     encoder: str
     """Name of the text-image encoder."""
     vectors: Float32

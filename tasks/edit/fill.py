@@ -77,8 +77,8 @@ def fill(
     that nothing is continued beyond what was seen; further than 1.5 spacings from any of them; where nothing that is
     still there hides it; and where no view looked through it, by its depth map. One such place in each cube of the
     points' spacing becomes a Gaussian, with the median colour of the 32 nearest points of the plane and the ids of the
-    scene's nearest Gaussian. Small Gaussians near filled places that only came to light when the instances left are
-    taken away.
+    nearest Gaussian of all that stayed. Small Gaussians near filled places that only came to light when the instances
+    left are taken away.
 
     gone: labels of the dense points that are no longer there, those of the instances among them.
     """
@@ -104,7 +104,10 @@ def fill(
         of_plane = plane_of == number
         colors[of_plane] = _colors(places[of_plane], points, planes[number].rows)
     shaped = select(after, ~_came_to_light(before, after, instances, views, places, measured, gone))
-    return concatenate([shaped, _with_ids_of(shaped, _flat(places, colors, plane_of, planes, spacing))])
+    # What has moved, or come instead, may lie nearer to the floor that it left than the rest of the floor does.
+    stayed = np.isin(shaped.instance_id, before.instance_id) & ~np.isin(shaped.instance_id, instances)
+    filling = _flat(places, colors, plane_of, planes, spacing)
+    return concatenate([shaped, _with_ids_of(select(shaped, stayed), filling)])
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,8 @@ class Holes:
     left: Int32
     """[V] pixels that showed it."""
     unmeasured: Int32
-    """[V] those of them behind which no dense point lies: whatever they show now was measured by no view."""
+    """[V] those of them that show nothing that was put there, and behind which no dense point lies: whatever they show
+    now was measured by no view."""
     empty: Int32
     """[V] pixels that showed something before and show nothing now (accumulated alpha below 0.5)."""
     area: Float64
@@ -104,6 +105,8 @@ class Uncovered:
     """Cropped to that part."""
     left: Bool
     """[h, w] pixels that showed it."""
+    put: Bool
+    """[h, w] pixels that show what has moved, or come instead."""
     empty: Bool
     """[h, w] pixels that showed something and show nothing now."""
     depth: Float64
@@ -129,7 +132,7 @@ def holes(
     remains = Remains.of(measured, gone)
     filled = after.means[after.filled > 0]
     found = list(uncovered(before, after, measured.cameras, instances))
-    open_ = [view.left & ~remains.cover(view, filled) for view in found]
+    open_ = [view.left & ~view.put & ~remains.cover(view, filled) for view in found]
     return Holes(
         names=tuple(view.name for view in found),
         left=np.array([view.left.sum() for view in found], np.int32),
@@ -144,6 +147,8 @@ def uncovered(
 ) -> Iterator[Uncovered]:
     """The views that show the instances, each cropped to them."""
     own = select(before, np.isin(before.instance_id, instances))
+    was_there = np.isin(after.instance_id, before.instance_id) & ~np.isin(after.instance_id, instances)
+    put = np.unique(after.instance_id[~was_there]).tolist()
     for view, name in enumerate(cameras.names):
         progress(view + 1, len(cameras), name)
         camera = camera_of(cameras, view)
@@ -152,14 +157,14 @@ def uncovered(
             continue
         (y0, x0), (y1, x1) = reach.min(axis=0), reach.max(axis=0) + 1
         camera = camera.cropped(int(x0), int(y0), int(x1), int(y1))
-        old, new = render(before, camera, label_ids=instances), render(after, camera)
-        left = old.label_masks.sum(axis=0) >= _SHOWS
+        old, new = render(before, camera, label_ids=instances), render(after, camera, label_ids=put)
+        left, shows_put = (shown.label_masks.sum(axis=0) >= _SHOWS for shown in (old, new))
         if not left.any():
             continue
         empty = (old.alpha >= _SHOWS) & (new.alpha < _SHOWS)
         there = old.depth.astype(np.float64) / np.maximum(old.alpha, _SHOWS)
         now = np.where(new.alpha >= _HIDES, new.depth.astype(np.float64) / np.maximum(new.alpha, _HIDES), np.inf)
-        yield Uncovered(name, camera, left, empty, there, now)
+        yield Uncovered(name, camera, left, shows_put, empty, there, now)
 
 
 def _area(view: Uncovered, pixels: Bool) -> float:

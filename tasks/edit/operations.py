@@ -123,7 +123,7 @@ def put_in_place(
     """
     old = scene.instance_id == instance
     other = moved(edited(other, filled=0), Motion(axis=turn[0], degrees=turn[1]))
-    factor = box_diagonal(scene.means[old]) / max(box_diagonal(other.means), 1e-12) if scale is None else scale
+    factor = _size(select(scene, old)) / _size(other) if scale is None else scale
     way = _centre(scene.means[old]) - _centre(other.means)
     placed = moved(other, Motion(move=vector(way), scale=float(factor)))
     renamed = replace(placed, instance_id=np.full(len(placed), new_id, np.int32))
@@ -184,6 +184,11 @@ def with_rows(scene: EditedScene, rows: Bool, changed: EditedScene) -> EditedSce
     for name, array in arrays.items():
         array[rows] = getattr(changed, name)
     return EditedScene(**arrays)
+
+
+def _size(part: Gaussians) -> float:
+    """The diagonal of the box of the centres, world units; a single Gaussian is as large as it is itself."""
+    return max(box_diagonal(part.means), float(np.exp(part.log_scales.max())))
 
 
 def _centre(means: NDArray[np.float32]) -> Float64:

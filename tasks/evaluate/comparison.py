@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Float64
-from ss_flow.tasks.evaluate.contingency import Contingency, Labels
+from ss_flow.tasks.evaluate.contingency import Labels, added_up, contingency
 
 _PIECE = 0.1
 """Share of an instance that a piece of it must cover to count as one."""
@@ -46,7 +46,7 @@ def correspondence(views: Iterable[tuple[Labels, Labels]]) -> Correspondence:
     """
     from scipy.optimize import linear_sum_assignment
 
-    table = _added_up(views).without(truth=0, predicted=0)
+    table = added_up(contingency(*view) for view in views).without(truth=0, predicted=0)
     iou = table.iou
     rows, columns = linear_sum_assignment(-iou)
     first, second = table.truth_ids.tolist(), table.predicted_ids.tolist()
@@ -65,23 +65,6 @@ def correspondence(views: Iterable[tuple[Labels, Labels]]) -> Correspondence:
         len(first),
         len(second),
     )
-
-
-def _added_up(views: Iterable[tuple[Labels, Labels]]) -> Contingency:
-    """One table of the pixels of all views, which need not be in memory together."""
-    pairs: dict[tuple[int, int], int] = {}
-    for first, second in views:
-        if first.shape != second.shape:
-            raise ValueError(f"id images of different sizes: {first.shape} and {second.shape}")
-        both, count = np.unique(first.astype(np.int64) << 32 | second.astype(np.int64), return_counts=True)
-        for code, pixels in zip(both.tolist(), count.tolist(), strict=True):
-            pair = code >> 32, code & 0xFFFFFFFF
-            pairs[pair] = pairs.get(pair, 0) + pixels
-    ids = [np.unique([pair[side] for pair in pairs]).astype(np.int64) for side in (0, 1)]
-    shared = np.zeros((len(ids[0]), len(ids[1])), np.int64)
-    for (a, b), pixels in pairs.items():
-        shared[np.searchsorted(ids[0], a), np.searchsorted(ids[1], b)] = pixels
-    return Contingency(ids[0], ids[1], shared, shared.sum(axis=1), shared.sum(axis=0))
 
 
 def _pieces(of_whole: Float64, of_piece: Float64, wholes: list[int], pieces: list[int]) -> dict[int, tuple[int, ...]]:

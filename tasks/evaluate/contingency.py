@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +65,18 @@ class Contingency:
             self.predicted_area,
         )
 
+    def elements_of(self, kept: Bool) -> Contingency:
+        """The table of the elements with some true labels alone. kept: [G]."""
+        shared = self.intersection[kept]
+        met = shared.any(axis=0)
+        return Contingency(
+            self.truth_ids[kept],
+            self.predicted_ids[met],
+            shared[:, met],
+            self.truth_area[kept],
+            shared[:, met].sum(axis=0),
+        )
+
 
 def contingency(truth: Labels, predicted: Labels) -> Contingency:
     """Count label pairs with `bincount`: O(N) time, no mask per label.
@@ -81,6 +93,20 @@ def contingency(truth: Labels, predicted: Labels) -> Contingency:
         pairs += np.bincount(place(some) * shape[1] + predicted_place(some), minlength=len(pairs))
     pairs = pairs.reshape(shape)
     return Contingency(truth_ids, predicted_ids, pairs, pairs.sum(axis=1), pairs.sum(axis=0))
+
+
+def added_up(tables: Iterable[Contingency]) -> Contingency:
+    """One table of the elements of several; of an iterator, the labellings of one are held at a time."""
+    held = list(tables)
+    truth_ids, predicted_ids = (
+        np.unique(np.concatenate([np.zeros(0, np.int64), *(getattr(one, ids) for one in held)]))
+        for ids in ("truth_ids", "predicted_ids")
+    )
+    shared = np.zeros((len(truth_ids), len(predicted_ids)), np.int64)
+    for one in held:
+        rows, columns = np.searchsorted(truth_ids, one.truth_ids), np.searchsorted(predicted_ids, one.predicted_ids)
+        shared[np.ix_(rows, columns)] += one.intersection
+    return Contingency(truth_ids, predicted_ids, shared, shared.sum(axis=1), shared.sum(axis=0))
 
 
 def _indexed(labels: Labels) -> tuple[Counts, Callable[[slice], Counts]]:

@@ -12,7 +12,7 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Float64, Frame, Hierarchy, Int32, LabelMap, Metrics
-from ss_flow.tasks.evaluate.contingency import Labels, contingency
+from ss_flow.tasks.evaluate.contingency import Contingency, added_up, contingency
 from ss_flow.tasks.evaluate.panoptic import (
     hungarian_miou,
     over_segmentation,
@@ -48,23 +48,21 @@ def evaluate_masks(
     num_truth, num_predicted.
     Raises InputError when a view lacks its prediction, sizes differ, or nothing is annotated.
     """
-    true_ids, ids = pooled(predicted, truth, frames)
     stuff = tree.node[tree.stuff] if tree is not None else None
-    return Metrics(segmentation_metrics(true_ids, ids, zero_is_void=zero_is_void, stuff=stuff))
+    return Metrics(segmentation_metrics(pooled(predicted, truth, frames), zero_is_void=zero_is_void, stuff=stuff))
 
 
 def segmentation_metrics(
-    true_ids: Labels, ids: Labels, *, zero_is_void: bool, stuff: Int32 | None = None
+    everything: Contingency, *, zero_is_void: bool, stuff: Int32 | None = None
 ) -> dict[str, float]:
-    """The measures of `evaluate_masks` on any elements: true and predicted id of each [N], 0 = none.
+    """The measures of `evaluate_masks` on any elements.
 
-    stuff: predicted ids that are stuff. Raises InputError when nothing is annotated.
+    everything: how often true and predicted ids meet, 0 = none. stuff: predicted ids that are stuff. Raises InputError
+    when nothing is annotated.
     """
-    everything = contingency(true_ids, ids)
     ignored = None
     if zero_is_void:
-        annotated = true_ids > 0
-        table = contingency(true_ids[annotated], ids[annotated]).without(predicted=0)
+        table = everything.elements_of(everything.truth_ids > 0).without(predicted=0)
         # A prediction that lies on void alone is not in the table at all, hence it is no false positive either.
         kept = np.isin(everything.predicted_ids, table.predicted_ids)
         ignored = table.predicted_area < 0.5 * everything.predicted_area[kept]
@@ -92,18 +90,17 @@ def segmentation_metrics(
     }
 
 
-def pooled(
-    predicted: tuple[LabelMap, ...], truth: tuple[LabelMap, ...], frames: Sequence[Frame] = ()
-) -> tuple[Labels, Labels]:
-    """The pixels of all annotated views in one row: true ids [N], predicted ids [N].
+def pooled(predicted: tuple[LabelMap, ...], truth: tuple[LabelMap, ...], frames: Sequence[Frame] = ()) -> Contingency:
+    """How often true and predicted ids meet in the pixels of all annotated views, counted view by view: hundreds of
+    views in one row would take several times their memory.
 
     frames: the views; pixels that their `valid` masks exclude are left out.
     Raises InputError when a view lacks its prediction, or the sizes differ.
     """
     by_name = {m.name: m for m in predicted}
     counted = {frame.name: decode_valid(frame) for frame in frames if frame.valid.size}
-    pairs = [(np.zeros(0, np.uint16), np.zeros(0, np.uint16))]
-    for true_map in truth:
+
+    def table(true_map: LabelMap) -> Contingency:
         if true_map.name not in by_name:
             raise InputError(f"View {true_map.name} has ground truth masks but no predicted ones; both are needed.")
         true_ids, ids = true_map.ids, by_name[true_map.name].ids
@@ -113,9 +110,9 @@ def pooled(
                 f"truth has {true_ids.shape[1]} x {true_ids.shape[0]}; the sizes must agree."
             )
         inside = counted.get(true_map.name, np.True_)
-        pairs.append((true_ids[inside].ravel(), ids[inside].ravel()))
-    true_pixels, pixels = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    return true_pixels, pixels
+        return contingency(true_ids[inside], ids[inside])
+
+    return added_up(map(table, truth))
 
 
 def summary(best: Float64) -> dict[str, float]:

@@ -205,7 +205,7 @@ def point_metrics(
     table = contingency(truth, predicted).without(predicted=0)
     known = np.unique(truth[truth >= 0])
     return {
-        **segmentation_metrics(np.maximum(truth + 1, 0), predicted, zero_is_void=True),
+        **segmentation_metrics(contingency(np.maximum(truth + 1, 0), predicted), zero_is_void=True),
         **together,
         "ap": float(np.mean([scannet_ap(table, score, overlap) for overlap in _OVERLAPS])),
         "ap50": scannet_ap(table, score, 0.5),

@@ -22,7 +22,8 @@ _SOLID = 0.5
 def part_masks(cameras: Cameras, scene: Gaussians, maps: Sequence[LabelMap]) -> tuple[PartMasks, ...]:
     """The parts of all instances by instance and part, each in the views that show it.
 
-    A pixel of an instance's mask shows the part of the Gaussian of that instance with the largest weight there.
+    A pixel of an instance's mask shows the part of the Gaussian with the largest weight there, and none where that is
+    another instance's.
 
     maps: the ids that the finished scene shows in each view.
     """

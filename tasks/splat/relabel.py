@@ -13,7 +13,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import Gaussians, LabelMap
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.views import SceneViews, Views
-from ss_flow.tasks.geometry.images import decode_valid, size_within
+from ss_flow.tasks.geometry.images import decode_valid, resampled, size_within
 
 MOST_PIXELS = 160
 """Longer side of the renderings that tell what the scene shows."""
@@ -32,8 +32,6 @@ def shown_masks(views: Views, scene: Gaussians, masks: Sequence[LabelMap]) -> li
 
     masks: exclusive label maps of all views.
     """
-    import cv2
-
     labels = np.unique(scene.instance_id)
     found = []
     for frame, camera, known in zip(views.frames, views.cameras, masks, strict=True):
@@ -41,9 +39,8 @@ def shown_masks(views: Views, scene: Gaussians, masks: Sequence[LabelMap]) -> li
         drawn = render(scene, small, label_ids=labels.tolist(), winners=False)
         ids = labels[drawn.label_masks.argmax(axis=0)].astype(np.uint16)
         sure = (drawn.alpha >= SOLID) & (drawn.label_masks.max(axis=0) >= SOLID * drawn.alpha)
-        size = camera.width, camera.height
-        ids, sure = (cv2.resize(a, size, interpolation=cv2.INTER_NEAREST) for a in (ids, sure.astype(np.uint8)))
-        found.append(LabelMap(known.name, np.where((sure > 0) & decode_valid(frame), ids, known.ids)))
+        ids, sure = (resampled(image, camera.height, camera.width) for image in (ids, sure))
+        found.append(LabelMap(known.name, np.where(sure & decode_valid(frame), ids, known.ids)))
     return found
 
 

@@ -42,7 +42,7 @@ class SegmentRgbdParams:
     color_weight: NonNegative = 0.2
     """Strength that a difference of colour adds to a boundary whose depth is known."""
     color_scale: Positive = 30.0
-    """Lab distance at which colours count as different."""
+    """Distance at which colours count as different, in Lab of 8 bits (lightness runs to 255: it counts 2.55 times)."""
     superpixel: Count = 20
     """Least size of the regions that everything starts from, in pixels of the working image."""
     plane_share: Fraction = 0.05

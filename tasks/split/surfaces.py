@@ -196,7 +196,7 @@ def _meeting(touches: Touches, surface: Int32, label: Int32, params: ShadowParam
     pairs, of = np.unique(np.sort(np.stack([a[kept], b[kept]]), axis=0), axis=1, return_inverse=True)
     found = []
     for number, (low, high) in enumerate(pairs.T.tolist()):
-        here = kept[of.ravel() == number]
+        here = kept[of == number]
         share = max(len(np.unique(touches.point[here[a[here] == name]])) / max(length[name], 1) for name in (low, high))
         if len(here) < params.min_points or share < params.contact:
             continue

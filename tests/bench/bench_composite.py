@@ -43,7 +43,7 @@ from ss_flow.flows.generated import RoomParams, generate, write_scene
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import Frame, LabelMap
 from ss_flow.tasks.capture.scene import open_scene
-from ss_flow.tasks.evaluate.contingency import Contingency, contingency
+from ss_flow.tasks.evaluate.contingency import Contingency
 from ss_flow.tasks.evaluate.instances import evaluate_masks, pooled
 from ss_flow.tasks.evaluate.panoptic import pieces, whole
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
@@ -172,7 +172,7 @@ def main() -> None:
             print(f"\n| seed | {' | '.join(COLUMNS + COUNTS)} | seconds |")
             print("|---" * (len(cells) + 2) + "|")
             print(f"| {seed} | {' | '.join(cells)} | {found.seconds:.0f} | (load {os.getloadavg()[0]:.1f})\n")
-            table = contingency(*pooled(found.predicted, found.truth, found.frames)).without(truth=0, predicted=0)
+            table = pooled(found.predicted, found.truth, found.frames).without(truth=0, predicted=0)
             print("| thing | best IoU | ids on it | |\n|---|---|---|---|")
             print("\n".join(things(folder, table)), flush=True)
             if args.look:

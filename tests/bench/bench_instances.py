@@ -199,7 +199,7 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
     instances = reproject(room.cloud, labels, whole, in_views, min_views=split.reproject.min_views)
     maps = resolve(room.cameras, instances)
     values = evaluate_masks(maps, room.truth, tree).values
-    table = contingency(*pooled(maps, room.truth)).without(truth=0, predicted=0)
+    table = pooled(maps, room.truth).without(truth=0, predicted=0)
     confidence = {i.instance_id: i.confidence * np.sqrt(len(i.views)) for i in instances}
     known = room.true_label >= 0
     on_points = contingency(room.true_label[known], labels.label[known]).without(truth=0, predicted=0)

@@ -32,7 +32,6 @@ from ss_flow.flows.generated.render import Renderer
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, LabelMap, UInt8
 from ss_flow.tasks.deliver.contact_sheet import contact_sheet
-from ss_flow.tasks.evaluate.contingency import contingency
 from ss_flow.tasks.evaluate.instances import pooled
 from ss_flow.tasks.evaluate.novel_view import to_8bit
 from ss_flow.tasks.evaluate.objects import Likeness, cameras_beside, needles
@@ -66,7 +65,7 @@ class Held:
 def true_id_of(found: Outcome, room: Room) -> dict[int, int]:
     """By true id, the predicted one that covers it with an IoU of at least 0.5 in the finished scene's masks."""
     truth = [LabelMap(n, ids) for n, ids in zip(room.cameras.names, room.ids, strict=True)]
-    table = contingency(*pooled(found.masks, truth)).without(truth=0, predicted=0)
+    table = pooled(found.masks, truth).without(truth=0, predicted=0)
     best = table.iou.argmax(axis=1)
     return {
         int(i): int(table.predicted_ids[b])

@@ -189,8 +189,8 @@ class RegionGraph:
     def __init__(
         self, regions: Int32, lab: Float32, boundary: Boundary, color_weight: float, color_scale: float
     ) -> None:
-        """regions: [H, W] ids from 0, -1 = none. lab: [H, W, 3]. color_weight: strength that colour alone can add where
-        depth is known. color_scale: Lab distance at which colours count as different."""
+        """regions: [H, W] ids from 0, -1 = none. lab: [H, W, 3], each 0..255. color_weight: strength that colour alone
+        can add where depth is known. color_scale: distance in `lab` at which colours count as different."""
         flat = regions.ravel()
         self.size = count = int(flat.max()) + 1
         inside = flat >= 0

@@ -12,7 +12,7 @@ from ss_flow.tasks.artifacts import DepthMap, PointCloud, PointLabels
 from ss_flow.tasks.edit import operations
 from ss_flow.tasks.edit.fill import fill
 from ss_flow.tasks.edit.holes import Measured, holes
-from ss_flow.tasks.gaussians.initialise import concatenate, initialise
+from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 
 SPACING = 0.03
@@ -66,6 +66,19 @@ def test_the_floor_under_a_box_was_measured_by_no_view(seen, removed):
     assert 0.6 * pixels_under < found.unmeasured.sum() < 1.1 * pixels_under  # a spacing at each side counts as seen
 
 
+@pytest.mark.parametrize("how", ["moved", "replaced"])
+def test_what_shows_a_box_that_has_hardly_moved_or_its_like_is_no_hole(seen, removed, how):
+    measured, scene = seen
+    nudge = operations.Motion(move=(0.001, 0.0, 0.0))
+    after = operations.transform(scene, instances=(BOX,), motion=nudge)
+    if how == "replaced":
+        after = replace(after, instance_id=np.where(after.instance_id == BOX, 9, after.instance_id).astype(np.int32))
+    found = holes(scene, after, measured, instances=(BOX,), gone=(BOX,))
+    without = holes(scene, removed, measured, instances=(BOX,), gone=(BOX,))
+    assert np.array_equal(found.left, without.left)
+    assert found.unmeasured.sum() < 0.02 * without.unmeasured.sum()
+
+
 def test_the_area_is_that_of_the_pixels_at_the_depth_of_what_was_there(seen, removed):
     measured, scene = seen
     found = holes(scene, removed, measured, instances=(BOX,), gone=(BOX,))
@@ -90,6 +103,21 @@ def test_filling_continues_the_floor_under_the_box_and_says_so(seen, removed):
     before = holes(scene, removed, measured, instances=(BOX,), gone=(BOX,)).unmeasured.sum()
     left = holes(scene, after, measured, instances=(BOX,), gone=(BOX,)).unmeasured.sum()
     assert left < 0.1 * before
+
+
+@pytest.mark.parametrize("how", ["moved", "replaced"])
+def test_the_floor_that_a_box_leaves_is_not_the_boxs_that_stands_beside_its_hole(seen, how):
+    measured, scene = seen
+    if how == "moved":
+        after = operations.transform(scene, instances=(BOX,), motion=operations.Motion(move=(0.3, 0.0, 0.0)))
+    else:  # by half of it
+        half = select(scene, (scene.instance_id == BOX) & (scene.means[:, 0] > 0.45))
+        after = concatenate(
+            [operations.remove(scene, instances=(BOX,)), replace(half, instance_id=half.instance_id + 7)]
+        )
+    full = fill(scene, after, measured, instances=(BOX,), gone=(BOX,))
+    new = full.instance_id[full.filled > 0]
+    assert len(new) > 100 and (new == 0).all()
 
 
 def test_what_is_not_filled_is_the_scene_as_it_was(seen, removed):

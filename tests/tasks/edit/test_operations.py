@@ -22,6 +22,7 @@ from ss_flow.tasks.gaussians.initialise import SH_ZERO, select
 from ss_flow.tasks.gaussians.read_ply import read_columns
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera
+from ss_flow.tasks.geometry.shape import box_diagonal
 
 
 def scene_of(count: int = 60, degree: int = 3, seed: int = 0) -> EditedScene:
@@ -175,6 +176,21 @@ def test_an_object_from_a_world_whose_up_is_another_is_put_upright(there):
         for m in (scene.means[scene.instance_id == 1], fitted.means[fitted.instance_id == 8])
     ]
     assert diagonals[0] == pytest.approx(diagonals[1], rel=1e-4)
+
+
+@pytest.mark.parametrize(("single", "by"), [(1, 2), (1, 1)])
+def test_a_single_gaussian_is_replaced_and_replaces_by_its_own_size(single, by):
+    scene = scene_of()
+    rows = np.flatnonzero(scene.instance_id == single)
+    scene = select(scene, ~np.isin(np.arange(len(scene)), rows[1:]))
+    other = select(scene, scene.instance_id == by)
+    after = operations.put_in_place(scene, other, instance=3 - by, new_id=8, scale=None, turn=NO_TURN)
+    new, old = after.instance_id == 8, scene.instance_id == 3 - by
+    alone = np.exp(scene.log_scales[scene.instance_id == single].max())
+    if by == single:
+        assert np.exp(after.log_scales[new].max()) == pytest.approx(box_diagonal(scene.means[old]), rel=1e-5)
+    else:
+        assert box_diagonal(after.means[new]) == pytest.approx(alone, rel=1e-5)
 
 
 def test_a_file_without_gaussians_replaces_nothing(tmp_path):

@@ -61,5 +61,5 @@ def test_nothing_on_either_side_agrees() -> None:
 
 
 def test_images_of_different_sizes_are_refused() -> None:
-    with pytest.raises(ValueError, match="different sizes"):
+    with pytest.raises(ValueError, match="different shapes"):
         correspondence([(np.zeros((2, 2), int), np.zeros((3, 2), int))])

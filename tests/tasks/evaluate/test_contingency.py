@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from ss_flow.tasks.evaluate import contingency as module
-from ss_flow.tasks.evaluate.contingency import contingency
+from ss_flow.tasks.evaluate.contingency import Contingency, added_up, contingency
 
 _LABELS = hnp.arrays(np.int64, 40, elements=st.sampled_from([-1, 0, 1, 2, 7, 65535]))
 
@@ -52,6 +52,24 @@ def test_taking_a_label_out_leaves_its_elements_in_the_areas_of_the_others() -> 
     table = contingency(np.array([0, 1, 1, 1]), np.array([3, 3, 3, 0])).without(truth=0, predicted=0)
     assert table.predicted_area.tolist() == [3] and table.truth_area.tolist() == [3]
     assert table.iou.tolist() == [[0.5]]
+
+
+def assert_same(table: Contingency, other: Contingency) -> None:
+    for name, counts in vars(other).items():
+        np.testing.assert_array_equal(getattr(table, name), counts)
+
+
+@given(st.lists(st.tuples(_LABELS, _LABELS), max_size=3))
+def test_tables_add_up_to_that_of_all_elements(pairs: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    nothing = np.zeros(0, np.int64)
+    truth, predicted = (np.concatenate([nothing, *(pair[side] for pair in pairs)]) for side in (0, 1))
+    assert_same(added_up(contingency(*pair) for pair in pairs), contingency(truth, predicted))
+
+
+@given(_LABELS, _LABELS)
+def test_a_table_of_some_true_labels_is_that_of_their_elements(truth: np.ndarray, predicted: np.ndarray) -> None:
+    whole, kept = contingency(truth, predicted), truth > 0
+    assert_same(whole.elements_of(whole.truth_ids > 0), contingency(truth[kept], predicted[kept]))
 
 
 def test_no_elements_give_an_empty_table() -> None:

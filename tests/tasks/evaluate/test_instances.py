@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,18 @@ def test_masks_are_pooled_over_views_so_that_an_id_must_hold_in_all_of_them() ->
     swapped = evaluate_masks(_maps([[7, 7, 9, 9]], [[9, 9, 7, 7]]), truth).values
     assert swapped["miou"] == pytest.approx(1 / 3) and swapped["pq"] == 0
     assert swapped["macc25"] == 1 and swapped["macc50"] == 0
+
+
+@pytest.mark.parametrize("zero_is_void", [False, True])
+def test_measuring_many_views_takes_no_more_memory_than_a_few_of_them(zero_is_void) -> None:
+    ids = np.random.default_rng(0).integers(0, 9, (40, 40)).repeat(10, axis=0).repeat(10, axis=1).astype(np.uint16)
+    maps = tuple(LabelMap(f"{i:04d}", ids) for i in range(100))
+    tracemalloc.start()
+    try:
+        assert evaluate_masks(maps, maps, zero_is_void=zero_is_void).values["miou"] == 1
+        assert tracemalloc.get_traced_memory()[1] < 100 * ids.nbytes / 4
+    finally:
+        tracemalloc.stop()
 
 
 def test_mask_metrics_are_those_counted_by_hand() -> None:

@@ -10,8 +10,9 @@ from ball_and_box import VIEWS, SmallScene
 
 from ss_flow.tasks.artifacts import Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import initialise, select
+from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.views import SceneViews
-from ss_flow.tasks.geometry.images import encode_png
+from ss_flow.tasks.geometry.images import encode_png, size_within
 from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
@@ -99,6 +100,18 @@ def test_the_scene_shows_its_masks(small, scene, monkeypatch):
         assert iou(half[view].ids == BOX, small.ids[view] == BOX) > 0.55
         for shown in (whole[view], half[view]):
             assert (shown.ids == small.ids[view]).mean() > 0.93
+
+
+def test_a_pixel_shows_what_the_coarse_rendering_has_at_its_centre(small, scene, monkeypatch):
+    nothing = [replace(m, ids=np.zeros_like(m.ids)) for m in small.maps]
+    monkeypatch.setattr(relabel, "MOST_PIXELS", 45)
+    for camera, shown in zip(small.views.cameras, shown_masks(small.views, scene, nothing), strict=True):
+        coarse = camera.scaled(*size_within(45, camera.width, camera.height))
+        drawn = render(scene, coarse, label_ids=[FLOOR, BOX, BALL])
+        sure = (drawn.alpha >= 0.5) & (drawn.label_masks.max(axis=0) >= 0.5 * drawn.alpha)
+        v, u = (np.indices(shown.ids.shape) + 0.5) / [[[camera.height]], [[camera.width]]]
+        at = (v * coarse.height).astype(int), (u * coarse.width).astype(int)
+        assert np.array_equal(shown.ids, np.where(sure[at], drawn.label_masks.argmax(axis=0)[at], 0))
 
 
 def test_masks_stay_where_the_scene_has_a_hole_and_where_a_frame_is_not_valid(small, scene):
