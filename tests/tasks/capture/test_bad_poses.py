@@ -136,6 +136,13 @@ def colmap_lens_unknown(root):
     return root
 
 
+@case("images.txt", "lacks the line of image points below that of 2.png")
+def colmap_images_without_their_points(root):
+    file = made.colmap(root, binary=False) / "sparse" / "1" / "images.txt"
+    file.write_text("\n".join(line for line in file.read_text().splitlines() if ".png" in line))
+    return root
+
+
 @case("10.png", "does not exist")
 def colmap_photo_missing(root):
     (made.colmap(root) / "images" / "10.png").unlink()
