@@ -185,6 +185,11 @@ def tum_with_a_quaternion_of_zeros(root):
     return root
 
 
+@case("2.png", "its intrinsics are those of a photo of 640x480")
+def tum_of_another_size_without_intrinsics(root):
+    return made.tum(root)
+
+
 @case("camera.txt", "four numbers")
 def tum_with_bad_intrinsics(root):
     (made.tum(root) / "camera.txt").write_text("525 525")
