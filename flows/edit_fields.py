@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -10,6 +9,8 @@ from typing import Any, Generic, TypeVar
 from ss_flow.tasks.edit.operations import Vector
 
 T = TypeVar("T")
+_LARGEST = 1e9
+"""More than any scene needs; Gaussians are 32-bit floats, which end at 3e38."""
 
 
 class Unfit(ValueError):
@@ -54,7 +55,7 @@ def _flag(value: Any) -> bool:
 
 
 def _number(value: Any) -> float:
-    _only_if(isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value))
+    _only_if(isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST)
     return float(value)
 
 

@@ -219,7 +219,7 @@ def _found(patterns: Sequence[str], list_file: Path | None) -> list[Path]:
     named = [(Path(), pattern) for pattern in patterns]
     if list_file is not None:
         try:
-            lines = list_file.read_text(encoding="utf-8").splitlines()
+            lines = list_file.read_text(encoding="utf-8-sig").splitlines()
         except (OSError, ValueError) as error:
             raise InputError(f"--list {list_file} cannot be read: {error}.") from None
         named += [(list_file.parent, s) for line in lines if (s := line.strip()) and not s.startswith("#")]

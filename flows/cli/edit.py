@@ -52,7 +52,7 @@ class EditRun:
 
 def _read_script(file: Path) -> Any:
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"the edit script {file} cannot be read: {error.strerror}.") from None
     except ValueError as error:

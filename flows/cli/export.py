@@ -76,6 +76,11 @@ class Export:
             if "edit" in run.document:
                 raise not_of_an_edit(run.folder, run.document, "photos")
             return self._write_workspace(out, run)
+        if ids == ():
+            raise InputError(
+                f"no instance of {run.folder} has a file of its own (instances.json), so there is nothing to export; "
+                "--instance names others, 0 the background."
+            )
         if self.format != "coco":
             _check_there(run.results.one("scene"), ids, run.folder)
         pixels = _masks_and_photos(run) if self.format == "coco" else ((), ())

@@ -181,8 +181,6 @@ class Sweep:
             lists[full] = values_of(listed, separator=";" if _is_list(settings.type_of(params, path)) else ",")
         fixed = [f"{name}={values[0]}" for name, values in lists.items() if len(values) == 1]
         swept = {name: values for name, values in lists.items() if len(values) > 1}
-        if not swept:
-            raise InputError("there is nothing to sweep; give a parameter several values: --set tau_label=0.6,0.8.")
         if not self.zipped and (count := math.prod(map(len, swept.values()))) > MOST_ROWS:
             raise InputError(f"these values have {count:,} combinations; a sweep may have at most {MOST_ROWS:,}.")
         found: dict[str, tuple[Params, dict[str, Any]]] = {}  # a value that is named twice, 0.6 and 0.60, counts once
@@ -190,6 +188,8 @@ class Sweep:
             variant = settings.apply(params, [*fixed, *(f"{name}={text}" for name, text in values.items())])
             flat = settings.flat(variant)
             found.setdefault(digest(flat), (variant, {name: flat[name] for name in values}))
+        if len(found) < 2:
+            raise InputError("there is nothing to sweep; give a parameter several values: --set tau_label=0.6,0.8.")
         return list(found.values())
 
     def _check(self) -> None:
@@ -273,6 +273,7 @@ def _idle(variants: Sequence[Variant], rows: Sequence[Row], *, zipped: bool) -> 
         for variant, row in zip(variants, rows, strict=True):
             others = [] if zipped else [str(value) for other, value in row.values.items() if other != name]
             keys[variant.prepared.name, *others].add(frozenset(node["key"] for node in row.report.nodes))
-        if all(len(different) == 1 for different in keys.values()):
+        several = len({str(row.values[name]) for row in rows}) > 1
+        if several and all(len(different) == 1 for different in keys.values()):
             idle.append(name)
     return idle

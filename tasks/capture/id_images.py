@@ -41,9 +41,16 @@ def ground_truth(
 ) -> tuple[LabelMap, ...]:
     """The annotated instances of those frames that have any, at the frames' size.
 
-    Raises InputError when an image is damaged, holds no ids, or has not its photo's size.
+    Raises InputError when an image is damaged, holds no ids, or has not its photo's size, or there is no instance
+    in any.
     """
-    return tuple(LabelMap(frame.name, ids) for frame, ids in _id_images(frames, cameras, names, files, lenses))
+    found = tuple(LabelMap(frame.name, ids) for frame, ids in _id_images(frames, cameras, names, files, lenses))
+    if not any(of_view.ids.any() for of_view in found):
+        raise InputError(
+            f"the ground truth in instance/ holds no instance in any of the {len(frames)} views that are used; "
+            "annotate one of them, or move the folder away to measure nothing."
+        )
+    return found
 
 
 def _id_images(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -216,7 +217,7 @@ def _views_text(path: Path) -> list[_View]:
     while lines and not lines[0].strip():
         lines.pop(0)
     views = []
-    for line in lines[::2]:
+    for line, points in zip_longest(lines[::2], lines[1::2], fillvalue=""):
         if not line.strip():
             continue
         words = line.split(maxsplit=9)
@@ -224,6 +225,12 @@ def _views_text(path: Path) -> list[_View]:
             values, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9].strip()
         except (ValueError, IndexError) as error:
             raise InputError(f"{path} has a line that describes no image: {line[:60]!r}.") from error
+        # Where these lines are left out, every second image would be taken for one of them.
+        if points.strip() and not points.split()[-1].lstrip("-").isdecimal():
+            raise InputError(
+                f"{path} lacks the line of image points below that of {name}; COLMAP writes one below every image's, "
+                "empty where there are none."
+            )
         views.append(_View(name, _pose(values, path, name), camera))
     return views
 

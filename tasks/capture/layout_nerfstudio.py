@@ -160,6 +160,12 @@ def _lens(values: dict[str, Any], photo: Path, path: Path) -> Lens:
     def number(key: str) -> float:
         return _number(values[key], key, path) if key in values else 0.0
 
+    def focal(side: int, key: str) -> float:
+        angle = number(key)
+        if not 0 < angle < math.pi:  # whose tangent, in degrees say, may be that of another lens
+            raise InputError(f"{path} has `{key}` {angle:g}; an angle in radians is expected, above 0 and below pi.")
+        return 0.5 * side / math.tan(0.5 * angle)
+
     width, height = int(number("w")), int(number("h"))
     if not (width and height):
         width, height = header_size(photo)
@@ -167,9 +173,9 @@ def _lens(values: dict[str, Any], photo: Path, path: Path) -> Lens:
         fx = number("fl_x")
         fy = number("fl_y") if "fl_y" in values else fx
     elif "camera_angle_x" in values:
-        fx = fy = 0.5 * width / math.tan(0.5 * number("camera_angle_x"))
+        fx = fy = focal(width, "camera_angle_x")
         if "camera_angle_y" in values:
-            fy = 0.5 * height / math.tan(0.5 * number("camera_angle_y"))
+            fy = focal(height, "camera_angle_y")
     else:
         raise InputError(f"{path} has no intrinsics; give fl_x, fl_y, cx, cy, w and h in pixels.")
     cx = number("cx") if "cx" in values else width / 2

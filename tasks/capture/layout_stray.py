@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,16 +40,16 @@ def open_stray(root: Path) -> SceneFiles:
     track = root / "odometry.csv"
     rows = _rows(track)
     size, length = _video(root / "rgb.mp4")
-    common = None if all(key in rows[0] for key in _LENS) else _camera_matrix(root / "camera_matrix.csv")
+    common = None if all(key in rows[0] for key in _LENS) else _camera_matrix(root / "camera_matrix.csv", size)
     depths, confidences = by_stem(files_in(root / "depth")), by_stem(files_in(root / "confidence"))
-    stems = [f"{int(_number(row, 'frame', track)):06d}" for row in rows]
+    stems = _stems(rows, track)
     names = [f"frame-{stem}" for stem in stems]
     kept = [i for i, stem in enumerate(stems) if i < length and (stem in depths or not depths)]
     if not kept:
         raise InputError(f"{root / 'depth'} holds no depth map of a frame that {track.name} lists; 000000.png is one.")
     used = set(kept)
     lenses, poses = upright(
-        [_lens(rows[i], common, size, track) for i in kept],
+        [common or _lens(rows[i], size, track) for i in kept],
         [_pose(rows[i], track) for i in kept],
     )
     return SceneFiles(
@@ -115,24 +116,35 @@ def _number(row: dict[str, str], key: str, path: Path) -> float:
         raise InputError(f"{path} has a row without a number for `{key}`; {_EXPECTED}.") from error
 
 
+def _stems(rows: list[dict[str, str]], path: Path) -> list[str]:
+    """What the files of each row's frame are called."""
+    numbers = [_number(row, "frame", path) for row in rows]
+    number, times = Counter(numbers).most_common(1)[0]
+    if times > 1:
+        raise InputError(f"{path} lists frame {number:g} {times} times; each row is of a frame of its own.")
+    if odd := [number for number in numbers if number % 1]:  # as it is of what is not finite
+        raise InputError(f"{path} has the frame {odd[0]:g}; a whole number is expected.")
+    return [f"{int(number):06d}" for number in numbers]
+
+
 def _pose(row: dict[str, str], path: Path) -> Pose:
     where = f"{path} for frame {row['frame']}"
     turn, place = ([_number(row, key, path) for key in keys] for keys in (_TURN, _PLACE))
     return rigid_inverse(pose_matrix(turn, place, where), where)
 
 
-def _lens(row: dict[str, str], common: tuple[float, ...] | None, size: tuple[int, int], path: Path) -> Lens:
-    fx, fy, cx, cy = common or (_number(row, key, path) for key in _LENS)
+def _lens(row: dict[str, str], size: tuple[int, int], path: Path) -> Lens:
+    fx, fy, cx, cy = (_number(row, key, path) for key in _LENS)
     return check_lens(Lens(*size, fx, fy, cx, cy), str(path))
 
 
-def _camera_matrix(path: Path) -> tuple[float, ...]:
-    """fx, fy, cx, cy."""
+def _camera_matrix(path: Path, size: tuple[int, int]) -> Lens:
     try:
         matrix = np.array([float(word) for word in read_text(path).replace(",", " ").split()]).reshape(3, 3)
     except ValueError as error:
         raise InputError(f"{path} does not hold a 3x3 matrix of numbers.") from error
-    return tuple(float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return check_lens(Lens(*size, fx, fy, cx, cy), str(path))
 
 
 def _video(path: Path) -> tuple[tuple[int, int], int]:

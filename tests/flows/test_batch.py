@@ -95,7 +95,7 @@ def test_scenes_that_share_steps_compute_them_once(den, tmp_path):
 def test_scenes_are_named_by_path_pattern_or_list_and_each_runs_once(den, tmp_path, monkeypatch):
     for name in ("a", "b", "c"):
         shutil.copytree(den, tmp_path / "scans" / name)
-    (tmp_path / "scans/list.txt").write_text("# my scans\n\nc\n  b  \n")
+    (tmp_path / "scans/list.txt").write_text("\ufeff# my scans\n\nc\n  b  \n")
     monkeypatch.chdir(tmp_path)
     dry = ["--dry-run", "--until", "ingest"]
     plan = batch_tiny(

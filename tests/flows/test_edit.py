@@ -143,7 +143,13 @@ def test_a_bad_script_runs_nothing_and_writes_nothing(warm):
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"), [(None, "cannot be read"), ("{", "is not JSON"), ("[]", "an edit script is a JSON object")]
+    ("text", "sentence"),
+    [
+        (None, "cannot be read"),
+        ("{", "is not JSON"),
+        ("[]", "an edit script is a JSON object"),
+        ("\ufeff[]", "an edit script is a JSON object"),  # the mark that editors on Windows put in front
+    ],
 )
 def test_a_file_that_is_no_script_is_refused(tiny, tmp_path, text, sentence):
     script = tmp_path / "script.json"

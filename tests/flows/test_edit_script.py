@@ -46,6 +46,7 @@ def applied(*steps: object) -> tuple[EditedScene, Objects]:
         ({"op": "keep", "instances": {}}, "instances is {}; no instance goes by {}"),
         ({"op": "transform", "instances": 2, "move": [1, 2]}, "move is [1, 2]; it must be three numbers in world"),
         ({"op": "transform", "instances": 2, "move": [1, 2, "x"]}, "it must be three numbers"),
+        ({"op": "transform", "instances": 2, "move": [1e39, 0, 0]}, "it must be three numbers"),
         ({"op": "transform", "instances": 2, "scale": 0}, "scale is 0; it must be a number above 0."),
         ({"op": "transform", "instances": 2, "scale": float("nan")}, "it must be a number above 0."),
         ({"op": "transform", "instances": 2, "scale": 10**400}, "it must be a number above 0."),

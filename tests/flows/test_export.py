@@ -194,6 +194,17 @@ def test_a_scene_without_gaussians_is_not_written(warm, tmp_path, more):
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.parametrize("more", [["spz", "--each"], ["mesh-obj"], ["mesh-glb"], ["coco"]])
+def test_where_no_instance_has_a_file_nothing_is_written(warm, tmp_path, more):
+    file = warm.out / "instances.json"
+    document = json.loads(file.read_text())
+    document["instances"] = [entry | {"file": None} for entry in document["instances"]]
+    file.write_text(json.dumps(document))
+    answer = export(warm, "--format", *more, "--out", tmp_path / "a")
+    assert answer.code == 2 and f"no instance of {warm.out} has a file of its own" in answer.err
+    assert not (tmp_path / "a").exists()
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [

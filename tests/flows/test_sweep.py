@@ -106,6 +106,7 @@ def test_a_dry_run_says_what_is_there_and_why_the_rest_is_not_and_writes_nothing
     [
         ([], "there is nothing to sweep"),
         (["--set", "tau_label=0.7"], "there is nothing to sweep"),
+        (["--set", "tau_label=0.7,0.70"], "there is nothing to sweep"),
         (["--set", "tau_label=0.7,"], "has an empty value"),
         (["--set", "tau_label"], "is not of the form step.param=value"),
         (["--set", "tau_lable=0.6,0.7"], "did you mean"),
@@ -156,7 +157,8 @@ def test_with_a_text_the_search_is_a_step_and_its_threshold_can_be_swept(warm, t
 
 
 def test_a_parameter_that_no_step_depends_on_is_told_of(warm, tmp_path):
-    told = sweep_tiny(warm, "--set", "query.tau_corr=0.01,0.2", "--set", "tau_label=0.7,0.71", out=tmp_path / "swept")
+    values = ["--set", "query.tau_corr=0.01,0.2", "--set", "tau_label=0.7,0.71", "--set", "tau_depth=0.02,0.020"]
+    told = sweep_tiny(warm, *values, out=tmp_path / "swept")
     assert [line for line in told.err.splitlines() if "warning" in line] == [
         "warning: no step of these runs depends on semantics.query.tau_corr; --query TEXT adds one."
     ]

@@ -177,6 +177,8 @@ def test_a_script_is_read_back_as_it_was_saved(tmp_path):
     write_script(file, script)
     assert json.loads(file.read_text(encoding="utf-8")) == script
     assert session(*read_operations(file)).script() == script
+    file.write_text("\ufeff" + file.read_text())  # as editors on Windows save it
+    assert session(*read_operations(file)).script() == script
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"operations": 3}', "\0"])

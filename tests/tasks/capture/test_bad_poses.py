@@ -136,6 +136,13 @@ def colmap_lens_unknown(root):
     return root
 
 
+@case("images.txt", "lacks the line of image points below that of 2.png")
+def colmap_images_without_their_points(root):
+    file = made.colmap(root, binary=False) / "sparse" / "1" / "images.txt"
+    file.write_text("\n".join(line for line in file.read_text().splitlines() if ".png" in line))
+    return root
+
+
 @case("10.png", "does not exist")
 def colmap_photo_missing(root):
     (made.colmap(root) / "images" / "10.png").unlink()
@@ -176,6 +183,11 @@ def tum_with_a_quaternion_of_zeros(root):
     lines[2] = "101.005 1 0.5 -1 0 0 0 0"
     track.write_text("\n".join(lines))
     return root
+
+
+@case("2.png", "its intrinsics are those of a photo of 640x480")
+def tum_of_another_size_without_intrinsics(root):
+    return made.tum(root)
 
 
 @case("camera.txt", "four numbers")

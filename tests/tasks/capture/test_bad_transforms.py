@@ -55,6 +55,18 @@ def transforms_without_intrinsics(root):
     return root
 
 
+@case("transforms.json", "has `camera_angle_x` 0; an angle in radians is expected, above 0 and below pi")
+def transforms_that_see_nothing(root):
+    edit_json(made.nerfstudio(root, camera_angle_x=0), lambda d: d.pop("fl_x"))
+    return root
+
+
+@case("transforms.json", "has `camera_angle_y` 40; an angle in radians is expected")
+def transforms_with_an_angle_in_degrees(root):
+    edit_json(made.nerfstudio(root, camera_angle_x=0.8, camera_angle_y=40), lambda d: d.pop("fl_x"))
+    return root
+
+
 @case("transforms.json", "lists no frame")
 def transforms_with_no_frame(root):
     edit_json(made.nerfstudio(root), lambda d: d.update(frames=[]))

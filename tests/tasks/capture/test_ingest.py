@@ -459,6 +459,18 @@ def test_ground_truth_covers_the_annotated_views_only(tmp_path):
     assert maps[0].ids.dtype == np.uint16 and (maps[0].ids == 3).all()
 
 
+def test_ground_truth_without_an_instance_in_the_views_that_are_used_is_refused_before_all_else(tmp_path):
+    made.scannet(tmp_path)
+    for name in ("10", "11"):
+        (tmp_path / "instance" / f"{name}.png").unlink()
+    annotated = open_scene(tmp_path)
+    made.write(tmp_path / "instance" / "2.png", np.zeros((made.HEIGHT, made.WIDTH), np.uint16))
+    for scene in (annotated.pick([1, 2]), open_scene(tmp_path)):
+        views = ingested(scene)
+        with pytest.raises(InputError, match=rf"instance/ holds no instance in any of the {len(views)} views"):
+            ground_truth(views, made.cameras_of(views), names=scene.names, files=refs(scene.ground_truth))
+
+
 def test_a_jpeg_with_a_thumbnail_and_bytes_after_its_end_is_whole(tmp_path):
     jpeg = cv2.imencode(".jpg", made.photo())[1].tobytes()
     thumbnail = b"JFXX\0\x10" + jpeg

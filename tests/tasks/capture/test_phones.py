@@ -210,10 +210,18 @@ def test_a_turn_on_the_spot_counts_as_motion_too(tmp_path):
         ("polycam", lambda root: edit(root, fx=-1.0), r"2\.json have a focal length or size that is not positive"),
         ("stray", lambda root: column(root, "qw", "w"), "odometry.csv has no column `qw` in its first line; timestamp"),
         ("stray", lambda root: column(root, "\n100.0", "\n100.0, one"), "odometry.csv has a row without a number for"),
+        ("stray", lambda root: column(root, " 000001,", " nan,"), "odometry.csv has the frame nan; a whole number is"),
+        ("stray", lambda root: column(root, " 000001,", " inf,"), "odometry.csv has the frame inf; a whole number is"),
+        ("stray", lambda root: column(root, " 000001,", " 0,"), "odometry.csv lists frame 0 2 times; each row is of a"),
         ("stray", lambda root: (root / "odometry.csv").write_text(made.STRAY_HEADER), "odometry.csv lists no frame"),
         ("stray", lambda root: (root / "odometry.csv").write_text(""), "odometry.csv has no column `frame`"),
         ("stray", lambda root: (root / "camera_matrix.csv").unlink(), "camera_matrix.csv is missing"),
         ("stray", lambda root: (root / "camera_matrix.csv").write_text("1 2"), "camera_matrix.csv does not hold a 3x3"),
+        (
+            "stray",
+            lambda root: (root / "camera_matrix.csv").write_text("-1 0 1 0 1 1 0 0 1"),
+            "camera_matrix.csv have a focal length or size that is not positive",
+        ),
         ("stray", lambda root: (root / "rgb.mp4").write_bytes(b"no"), r"rgb\.mp4 cannot be opened as a video"),
     ],
 )
