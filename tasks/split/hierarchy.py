@@ -194,10 +194,10 @@ class _Pieces:
 
     def best_unions(self) -> list[tuple[tuple[int, ...], float]]:
         """The sets of pieces to unite now, each with its agreement: of sets that share a piece, the best alone."""
-        sets, group = self._sets()
+        sets, below = self._sets()
         presumed = self._presumed()
         unshown = sorted(presumed.keys() - set(sets))
-        sets, group = sets + unshown, group + [False] * len(unshown)
+        sets += unshown
         if not sets:
             return []
         member = np.zeros((len(sets), len(self.stuff)), np.float32)
@@ -209,6 +209,13 @@ class _Pieces:
         )
         agreement += (1 - agreement) * params.alone * self.contact.alone(member, self.stuff)
         agreement = np.minimum(agreement * (1 + params.contact * (2 * self.contact.own(member) - 1)), 1)
+        group = np.array([members in below for members in sets])
+        row_of = {members: row for row, members in enumerate(sets)}
+        # A mask that holds a page and the mug on it holds the page as one.
+        for members in below.keys() & row_of.keys():
+            row = row_of.get(below[members])
+            if row is not None and not group[row]:
+                agreement[row] = max(agreement[row], agreement[row_of[members]])
         agreement *= np.where(group, _ON_TOP, np.where(self.contact.hang_together(member), 1, 1 - params.apart))
         least = [presumed.get(members, 0.0) for members in sets]
         agreement = np.maximum(agreement, least).astype(np.float64).round(6)
@@ -222,23 +229,22 @@ class _Pieces:
             taken |= set(sets[row])
         return chosen
 
-    def _sets(self) -> tuple[list[tuple[int, ...]], list[bool]]:
+    def _sets(self) -> tuple[list[tuple[int, ...]], dict[tuple[int, ...], tuple[int, ...]]]:
         """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
-        on the others. With each, whether something still does."""
+        on the others. For each set in which something does, those below it."""
         shown: Counter[tuple[int, ...]] = Counter()
         for view in self.counted:
             for shows in view.shows:
                 members = tuple(np.flatnonzero(shows).tolist())
                 if len(members) > 1 and len(set(self.stuff[list(members)].tolist())) == 1:
                     shown[members] += 1
-        on_top = {members: self._standing(members) for members in shown}
+        left = {members: self._below(members) for members in shown}
         for members, times in list(shown.items()):
-            below = tuple(piece for piece in members if piece not in on_top[members])
-            if 1 < len(below) < len(members):
-                shown[below] += times
-                on_top.setdefault(below, self._standing(below))
+            if 1 < len(left[members]) < len(members):
+                shown[left[members]] += times
+                left.setdefault(left[members], self._below(left[members]))
         sets = [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
-        return sets, [bool(on_top[members]) for members in sets]
+        return sets, {members: below for members, below in left.items() if below != members}
 
     def _presumed(self) -> dict[tuple[int, ...], float]:
         """The pairs of things that are faces of one, or of which one lies in the other, unless the views deny it; with
@@ -263,10 +269,10 @@ class _Pieces:
         one = (together > 0) & (together >= _TOGETHER * both)
         return list(zip(a[one].tolist(), b[one].tolist(), strict=True))
 
-    def _standing(self, members: tuple[int, ...]) -> set[int]:
-        """Which of these pieces stand on the others."""
+    def _below(self, members: tuple[int, ...]) -> tuple[int, ...]:
+        """Those of these pieces that do not stand on the others."""
         labels = [row for piece in members for row in self.labels[piece]]
         on_top = dict(zip(labels, self.mounds.standing(labels).tolist(), strict=True))
         on_sheet = self.sheets.standing([self.labels[piece] for piece in members])
         risen = zip(members, on_sheet.tolist(), strict=True)
-        return {piece for piece, rises in risen if rises or all(on_top[row] for row in self.labels[piece])}
+        return tuple(piece for piece, rises in risen if not (rises or all(on_top[row] for row in self.labels[piece])))
