@@ -233,6 +233,7 @@ def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> t
             recording=reference(scene.recording),
             names=scene.names,
             entries=scene.entries,
+            valid=all_of(reference, scene.valid),
             skipped=scene.skipped,
             params=params.ingest,
         )
