@@ -19,8 +19,8 @@ def open_tum(root: Path) -> SceneFiles:
 
     Depth and poses are taken from the entry nearest in time, at most 0.02 s away; photos without are skipped. Depth
     files count 5000 to the metre and are registered to the photos. Intrinsics are four numbers, fx fy cx cy with
-    integer pixel centres, in `intrinsics.txt` or `camera.txt`; without that file, the ROS default of the benchmark:
-    525 525 319.5 239.5. Half a pixel is added to cx and cy (spec 3.0).
+    integer pixel centres, in `intrinsics.txt` or `camera.txt`; without that file, the ROS default of the benchmark, of
+    photos of 640 x 480 pixels: 525 525 319.5 239.5. Half a pixel is added to cx and cy (spec 3.0).
     Raises InputError when a file is missing or makes no sense, or no photo has a partner.
     """
     photos = _entries(root / "rgb.txt")
@@ -94,7 +94,7 @@ def _pose(words: list[str], path: Path, photo: str) -> tuple[float, ...]:
 def _lens(root: Path) -> Lens:
     path = next((root / n for n in ("intrinsics.txt", "camera.txt") if (root / n).is_file()), None)
     if path is None:
-        return Lens(0, 0, 525.0, 525.0, 320.0, 240.0)
+        return Lens(640, 480, 525.0, 525.0, 320.0, 240.0)
     try:
         fx, fy, cx, cy = (float(w) for w in read_text(path).split())
     except ValueError as error:

@@ -160,6 +160,14 @@ def test_where_a_size_is_not_stated_the_principal_point_tells_which_photo_the_in
         np.testing.assert_array_equal(decode_rgb(frame), plain)
 
 
+def test_photos_that_do_not_have_the_size_of_the_benchmark_need_intrinsics_of_their_own(tmp_path):
+    scene = open_scene(made.tum(tmp_path))
+    with pytest.raises(InputError, match="is 32x24 pixels, but its intrinsics are those of a photo of 640x480"):
+        ingested(scene)
+    (tmp_path / "intrinsics.txt").write_text("30 30 15.5 11.5")
+    assert len(ingested(open_scene(tmp_path))) == 3
+
+
 def test_undistortion_makes_a_pinhole_of_the_same_intrinsics(tmp_path):
     """A white dot at a distorted place lands where the pinhole sees it; by hand: r' = r (1 + k r^2)."""
     k, focal = 0.5, 100.0
