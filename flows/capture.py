@@ -179,7 +179,8 @@ def _placed(
         if params.refine_poses == "always":
             raise InputError(f"{scene.root} has no poses that could be refined; leave --refine-poses out.")
         if scene.lenses is None or sensed is None:
-            cameras = poses(frames, params.sfm, scene.names or None)
+            straight = any(not lens.pinhole for lens in scene.lenses or ())
+            cameras = poses(frames, params.sfm.straight() if straight else params.sfm, scene.names or None)
             return registered(frames, cameras), cameras, sensed
         unposed = replace(scene, poses=(NO_POSE,) * len(scene.names))
         cameras = poses_by_depth(frames, _given_cameras(unposed, reference, frames), sensed, params, scene.names)
@@ -233,6 +234,7 @@ def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> t
             recording=reference(scene.recording),
             names=scene.names,
             entries=scene.entries,
+            valid=all_of(reference, scene.valid),
             skipped=scene.skipped,
             params=params.ingest,
         )

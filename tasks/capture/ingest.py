@@ -52,8 +52,9 @@ def frames(
     """The photos as frames: upright, without distortion, not above `params.max_side`.
 
     A photo that is all this already keeps its bytes. Where intrinsics are known, a photo is turned upright (EXIF) only
-    if they refer to the turned one. Pixels that the lens does not reach after undistortion become invalid, as do those
-    that an alpha channel does not show. Warns of photos of 16 bits that are nearly black.
+    if they refer to the turned one, which their size tells, or else their principal point. Pixels that the lens does
+    not reach after undistortion become invalid, as do those that an alpha channel does not show. Warns of photos of 16
+    bits that are nearly black.
     skipped: views of the capture that are not among these, of which the run is to warn. black_borders: whether borders
     of the photos that are black become invalid, too.
     Raises InputError when a photo is damaged, or its size or that of its valid mask is not the stated one.
@@ -104,7 +105,7 @@ def frame_of(
     image = pixels.image
     stored = image.shape[1::-1]
     turn = _UPRIGHT.get(photo.orientation, (False, 0))
-    if lens is not None and (lens.turns or stored == (lens.width, lens.height)):
+    if lens is not None and (lens.turns or _as_stored(lens, *stored)):
         turn = (False, lens.turns)
     image = _turned(image, *turn)
     height, width = image.shape[:2]
@@ -132,6 +133,15 @@ def frame_of(
     else:
         encoded = np.frombuffer(photo.data, np.uint8)
     return Frame(name, w, h, encoded, encode_valid(keep), width, height, photo.focal)
+
+
+def _as_stored(lens: Lens, width: int, height: int) -> bool:
+    """Whether a lens is of a photo of this size as it is stored, not as EXIF turns it; without a stated size, whether
+    its principal point lies no nearer to the middle of the turned one."""
+    if lens.width:
+        return (width, height) == (lens.width, lens.height)
+    x, y = 2 * lens.cx, 2 * lens.cy
+    return abs(x - width) + abs(y - height) <= abs(x - height) + abs(y - width)
 
 
 def black_border(image: UInt8) -> Bool:

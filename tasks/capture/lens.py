@@ -92,11 +92,11 @@ def _turning(lens: Lens) -> float:
 def photo_lens(frame: Frame, stated: Lens | None, cameras: Cameras) -> Lens | None:
     """The lens whose distortion was taken out of a frame, for the size of its input photo; None for a pinhole.
 
-    stated: what the capture says, if anything; otherwise structure from motion may have found the distortion
+    stated: what the capture says, if anything; where that is no distortion, structure from motion may have found one
     (`Cameras.radial`). cameras: those of all frames.
     """
     lens = stated
-    if stated is None and cameras.radial.size:
+    if (stated is None or stated.pinhole) and cameras.radial.size:
         lens = found_lens(cameras, cameras.names.index(frame.name))
     if lens is None or lens.pinhole:
         return None

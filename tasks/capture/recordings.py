@@ -195,6 +195,7 @@ def sens_frames(
     recording: FileRef,
     names: tuple[str, ...],
     entries: tuple[int, ...],
+    valid: tuple[FileRef | None, ...] = (),
     skipped: tuple[str, ...] = (),
     params: IngestParams = IngestParams(),
 ) -> tuple[Frame, ...]:
@@ -210,10 +211,10 @@ def sens_frames(
         for i, (name, entry) in enumerate(zip(names, entries, strict=True)):
             start, length, _, _ = index.offsets[entry]
             file.seek(start)
-            where = f"{recording.path}, frame {entry},"
+            where, mask = f"{recording.path}, frame {entry},", valid[i] if valid else None
             photo = inspect(file.read(length), where)
             pixels = pixels_of(photo, where)
-            result.append(frame_of(name, photo, pixels, where, None, index.color_lens, params))
+            result.append(frame_of(name, photo, pixels, where, mask, index.color_lens, params))
             progress(i + 1, len(entries), name)
     return tuple(result)
 

@@ -68,6 +68,10 @@ class SfmParams:
     min_registered: Fraction = 0.5
     """The share of photos that must find their pose; below it the step fails."""
 
+    def straight(self) -> SfmParams:
+        """For photos whose distortion was taken out: a second one would be known to nothing that knows the first."""
+        return replace(self, mapping=replace(self.mapping, camera_model="SIMPLE_PINHOLE"))
+
 
 @dataclass(frozen=True)
 class Unregistered:

@@ -23,6 +23,7 @@ from ss_flow.tasks.artifacts import (
     UInt8,
 )
 from ss_flow.tasks.gaussians.initialise import select
+from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, level_axes, looking, up_of
@@ -52,7 +53,7 @@ class DenseDescribeParams:
     azimuths: Count = 12
     """Views on each ring."""
     distance: Positive = 2.0
-    """From the object's centre to the views, in diagonals of its box."""
+    """From the object's centre to the views, in diagonals of its box; farther off where it is tiny."""
     side: Count = 560
     """Of the square pictures, pixels."""
     neighbours: Count = 5
@@ -128,7 +129,9 @@ def around(own: Gaussians, cameras: Cameras, params: DenseDescribeParams) -> tup
     diagonal = max(box_diagonal(own.means), float(np.exp(own.log_scales.max())))
     up = up_of(cameras.world_to_camera)
     east, north = level_axes(up)
-    focal = _SHARE_OF_PICTURE * params.side * params.distance
+    # What is nearer than the near plane is not drawn: views of a tiny thing stand farther off and look more closely.
+    away = params.distance * max(diagonal, NEAR_PLANE)
+    focal = _SHARE_OF_PICTURE * params.side * (away / diagonal)
     middle = params.side / 2
     lens = Camera(params.side, params.side, focal, focal, middle, middle, np.eye(4))
     found = []
@@ -136,7 +139,7 @@ def around(own: Gaussians, cameras: Cameras, params: DenseDescribeParams) -> tup
         for azimuth in 2 * np.pi * np.arange(params.azimuths) / params.azimuths:
             level = np.cos(azimuth) * east + np.sin(azimuth) * north
             outwards = np.cos(elevation) * level + np.sin(elevation) * up
-            eye = center + params.distance * diagonal * outwards
+            eye = center + away * outwards
             found.append(replace(lens, world_to_camera=looking(eye, -outwards, up)))
     return tuple(found)
 

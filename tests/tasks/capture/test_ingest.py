@@ -141,6 +141,25 @@ def test_a_photo_is_not_turned_when_its_intrinsics_are_those_of_the_stored_one(t
     assert (turned.width, turned.height) == (24, 32)
 
 
+@pytest.mark.parametrize(
+    ("orientation", "center", "size"),
+    [(6, (16, 12), (32, 24)), (6, (12, 16), (24, 32)), (3, (16, 12), (32, 24)), (8, (12.5, 15), (24, 32))],
+)
+def test_where_a_size_is_not_stated_the_principal_point_tells_which_photo_the_intrinsics_are_of(
+    orientation, center, size, tmp_path
+):
+    """As in ScanNet's layout and TUM's, whose depth lies as the photos are stored."""
+    path = tmp_path / "a.jpg"
+    stored = cv2.imencode(".jpg", made.photo())[1].tobytes()
+    path.write_bytes(with_orientation(stored, orientation))
+    lens, params = Lens(0, 0, 30, 30, *center), IngestParams(jpeg_quality=0)
+    (frame,) = frames(names=("a",), photos=(ref(path),), lenses=(lens,), params=params)
+    assert (frame.width, frame.height) == size
+    if size == (32, 24):
+        plain = cv2.imdecode(np.frombuffer(stored, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        np.testing.assert_array_equal(decode_rgb(frame), plain)
+
+
 def test_undistortion_makes_a_pinhole_of_the_same_intrinsics(tmp_path):
     """A white dot at a distorted place lands where the pinhole sees it; by hand: r' = r (1 + k r^2)."""
     k, focal = 0.5, 100.0

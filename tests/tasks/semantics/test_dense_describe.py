@@ -72,6 +72,16 @@ def test_views_lie_on_a_half_sphere_and_show_the_whole_object():
         np.testing.assert_allclose(project(middle[None], view)[0], [[280, 280]], atol=1e-3)
 
 
+def test_what_is_smaller_than_the_near_plane_gets_the_vectors_that_it_gets_when_it_is_large(monkeypatch):
+    monkeypatch.setattr(step, "patch_encoder_of", lambda model: Colours())
+    own, named = block(), Model("colours", "patch-features", (), (), ())
+    small = replace(own, means=own.means * np.float32(1e-3), log_scales=own.log_scales + np.float32(np.log(1e-3)))
+    large, tiny = (dense_describe(one, made_cameras(), network=named, params=FEW) for one in (own, small))
+    assert (tiny.origin != NO_VECTOR).all()
+    shell = large.origin == FROM_PICTURES
+    np.testing.assert_allclose(tiny.features[shell], large.features[shell], atol=0.15)
+
+
 def test_views_of_two_photos_with_opposite_ups_are_still_cameras():
     upright = made_cameras(((0, -3, 0),) * 2)
     poses = upright.world_to_camera.copy()
