@@ -408,9 +408,11 @@ def _own(value: Any) -> Any:
     """The same with lists and tables of its own, which can be changed as nothing else of a frozen dataclass can."""
     own = value
     for item in dataclasses.fields(value):
-        if isinstance(content := getattr(value, item.name), dict | list):
+        if isinstance(content := getattr(value, item.name), dict | list | tuple):
+            if (inner := copy.deepcopy(content)) is content:  # a tuple in which nothing can be changed
+                continue
             own = copy.copy(value) if own is value else own
-            object.__setattr__(own, item.name, copy.deepcopy(content))
+            object.__setattr__(own, item.name, inner)
     return own
 
 

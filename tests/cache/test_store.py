@@ -206,9 +206,10 @@ def test_a_type_that_only_type_checkers_know_is_no_hindrance_and_a_tuple_of_a_un
 
 
 def test_lists_and_tables_belong_to_who_asked_for_them(store):
-    digest = store.put(toy.Table({"a": [1]}, ["a"]))
+    digest = store.put(toy.Table({"a": [1]}, ["a"], ({"a": 1},)))
     for _ in range(2):
         found = store.get(digest)
-        assert found == toy.Table({"a": [1]}, ["a"])
+        assert found == toy.Table({"a": [1]}, ["a"], ({"a": 1},))
         found.rows["a"].append(2)
         found.names.clear()
+        found.entries[0]["a"] = 2
