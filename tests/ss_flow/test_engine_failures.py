@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import time
 from pathlib import Path
@@ -17,7 +18,7 @@ from ss_flow.cache.errors import StoreFailure
 from ss_flow.events import Reporter
 from ss_flow.graph import each, expand, otherwise, pick
 from ss_flow.resolution import Failure
-from ss_flow.running import Surroundings, running, save_checkpoint
+from ss_flow.running import Surroundings, load_checkpoint, running, save_checkpoint
 from ss_flow.task import task
 
 
@@ -164,6 +165,18 @@ def test_a_damaged_checkpoint_is_as_good_as_none(store, tmp_path):
     kept.write_bytes(bytes(content))
     falls_at.unlink()
     assert value(store, run(store, flow).values["start"]) == 0
+
+
+def test_of_a_damaged_checkpoint_nothing_is_taken_and_nothing_is_raised(tmp_path):
+    place, kept = tmp_path / "kept.npz", {"height": np.array(3), "values": np.arange(5.0)}
+    with running(Surroundings(checkpoint=place)):
+        save_checkpoint(kept)
+        content = place.read_bytes()
+        for position, wrong in itertools.product(range(len(content)), (0, 1, 0xFF)):
+            place.write_bytes(content[:position] + bytes([content[position] ^ wrong]) + content[position + 1 :])
+            found = load_checkpoint()
+            assert found is None or all(np.array_equal(found[name], kept[name]) for name in kept)
+            assert found is not None or wrong
 
 
 def test_a_store_that_was_moved_away_is_not_there_again_for_a_checkpoint(tmp_path):
