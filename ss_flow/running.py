@@ -156,9 +156,10 @@ def unfinished(path: Path) -> Path:
 
 
 def remove_checkpoint(path: Path) -> None:
-    """Take away what a task kept, when it is done."""
-    path.unlink(missing_ok=True)
-    unfinished(path).unlink(missing_ok=True)
+    """Take away what a task kept, when it is done; where that is not allowed, it stays until it is collected."""
+    for file in (path, unfinished(path)):
+        with contextlib.suppress(OSError):
+            file.unlink()
 
 
 def load_checkpoint() -> dict[str, NDArray[Any]] | None:

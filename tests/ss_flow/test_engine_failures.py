@@ -179,6 +179,11 @@ def test_of_a_damaged_checkpoint_nothing_is_taken_and_nothing_is_raised(tmp_path
             assert found is not None or wrong
 
 
+def test_a_checkpoint_that_cannot_be_taken_away_fails_no_task(store):
+    (store.root / "checkpoints").touch()
+    assert value(store, run(store, lambda: {"start": toy.source(values=(1.0,))[0]}).values["start"]) == 1.0
+
+
 def test_a_store_that_was_moved_away_is_not_there_again_for_a_checkpoint(tmp_path):
     with running(Surroundings(checkpoint=tmp_path / "moved" / "checkpoints" / "kept.npz")):
         save_checkpoint({"x": np.ones(2)})
