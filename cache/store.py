@@ -65,6 +65,7 @@ GRACE_SECONDS = 3600.0
 
 _TEMPORARY = re.compile(r"[0-9a-f]{32}")
 """What `temporary` calls things."""
+_RECORD = re.compile(rf"{DIGEST.pattern}\.json")
 
 NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 """What keeps a process from opening any file."""
@@ -417,8 +418,8 @@ def _own(value: Any) -> Any:
 
 
 def _records(folder: str) -> Iterator[Entry]:
-    """The JSON files of a folder."""
-    for entry in entries(folder):
+    """The JSON files of a folder that are named by digests."""
+    for entry in filter(lambda entry: _RECORD.fullmatch(entry.name), entries(folder)):
         with contextlib.suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)  # which may lead round in a circle
             yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)

@@ -117,10 +117,11 @@ def test_what_others_put_among_the_objects_is_none_and_stays(store):
 
 def test_files_that_lie_about_in_a_store_are_no_hindrance(store):
     output = store.put(LabelMap("x", np.ones((2, 2), np.uint16)))
-    for folder in ("objects", "actions"):
+    for folder in ("objects", "actions", "actions/ab", "parts"):
+        (store.root / folder).mkdir(exist_ok=True)
         (store.root / folder / ".DS_Store").write_text("x")
     assert [entry.name for entry in store.objects()] == [output]
-    assert list(store.actions()) == [] and not verify(store).damaged
+    assert list(store.actions()) == list(store.parts()) == [] and not verify(store).damaged
 
 
 def test_an_object_of_a_foreign_type_is_refused():
