@@ -6,6 +6,7 @@ import errno
 import itertools
 import os
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,13 @@ from toy_runs import ran, run, value
 
 from ss_flow import engine
 from ss_flow.cache.errors import StoreFailure
+from ss_flow.engine import Request, run_flows
+from ss_flow.errors import InputError
 from ss_flow.events import Reporter
-from ss_flow.graph import each, expand, otherwise, pick
+from ss_flow.graph import each, expand, labelled, otherwise, pick, stored
 from ss_flow.resolution import Failure
 from ss_flow.running import Surroundings, load_checkpoint, running, save_checkpoint
+from ss_flow.runs import latest_runs
 from ss_flow.task import task
 
 
@@ -203,6 +207,28 @@ def test_an_interrupted_run_keeps_what_was_finished_and_ends_its_claims(store):
     assert time.monotonic() - started < 5
     assert list((store.root / "claims").iterdir()) == []
     assert ran(run(store, lambda: {"square": toy.square(toy.source(values=(2.0,))[0])})) == []
+
+
+def test_an_interrupt_is_told_though_a_flow_that_ends_meanwhile_cannot_be_written(store):
+    class Interrupt(Reporter):
+        def event(self, kind, **details):
+            if kind == "started" and details["item"] == "last":
+                raise KeyboardInterrupt
+
+    def flow(item):
+        with labelled(item):
+            return {"end": toy.nap(stored("number", store.put(toy.number(len(item)))))}
+
+    def refuse(report):
+        raise InputError("the output cannot be written.")
+
+    requests = [Request(partial(flow, n), n, reporter=Interrupt(), done=refuse) for n in ("a", "bb", "last")]
+    with pytest.raises(KeyboardInterrupt):
+        run_flows(requests, store, jobs=3)
+    for scene, kind in (("a", "finished"), ("bb", "finished"), ("last", "taken")):
+        (kept,) = latest_runs(store.runs, scene)
+        events = [event["event"] for event in kept.events()]
+        assert events[-1] == "run ended" and kind in events
 
 
 def test_a_store_that_can_only_be_read_ends_the_run_with_one_sentence(store, monkeypatch):
