@@ -288,6 +288,9 @@ EDITS = {
     "filled by a decorator with arguments": (
         "TABLE = {}\ndef add(n):\n    def inner(f):\n        TABLE[n] = f\n        return f\n    return inner\n"
         "@add(1)\ndef g(): return 3\n", "3", "4", "TABLE"),
+    "filled by a call of a call": (
+        "TABLE = {}\ndef add(n, v):\n    TABLE[n] = v\ndef fill():\n    add('f', 3)\nfill()\n", "3", "4", "TABLE"
+    ),
     "filled by a call": ("TABLE = {}\ndef add(n, v):\n    TABLE[n] = v\nadd('f', 3)\n", "3", "4", "TABLE"),
     "set by a call": ("TABLE = None\ndef _start():\n    global TABLE\n    TABLE = 3\n_start()\n", "3", "4", "TABLE"),
     "module as a value": ("from probe import maths\n", "", "", "{1: maths}[1].twice(x)"),
