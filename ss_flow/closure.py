@@ -141,6 +141,8 @@ def _closure(module_name: str, function_name: str) -> Closure:
             if attribute is not None and _is_followed(origin, own):
                 pending.append((origin, attribute))
         if name not in module.definitions:
+            if name not in module.imports and "__getattr__" in module.definitions:  # which makes it
+                pending.append((module_name, "__getattr__"))
             continue
         found |= _digests(module_name, name)
         needs = _needed(module_name, name, own)

@@ -312,6 +312,13 @@ def test_a_class_that_only_an_annotation_in_quotes_names_is_followed(package, hi
     assert set(package(step=f"from typing import Literal\n{step}")) == {"probe.step.run", "probe.step.Out"}
 
 
+def test_a_name_that_a_module_makes_when_it_is_asked_for_leads_to_what_makes_it(package):
+    lazy = "def late(x):\n    return x\n\n\ndef __getattr__(name):\n    return late\n"
+    for step in ("from probe.lazy import made\n\n\ndef run(x):\n    return made(x)\n",
+                 "import probe.lazy\n\n\ndef run(x):\n    return probe.lazy.made(x)\n"):  # fmt: skip
+        assert set(package(step=step, lazy=lazy)) == {"probe.step.run", "probe.lazy.__getattr__", "probe.lazy.late"}
+
+
 def test_how_text_is_written_does_not_count(package):
     assert package(step="def run(x):\n    return u'abc'\n") == package(step="def run(x):\n    return 'abc'\n")
 
