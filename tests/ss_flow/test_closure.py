@@ -239,6 +239,26 @@ def test_of_two_things_imported_under_one_name_both_are_followed(package):
     assert {"probe.maths.twice", "probe.maths.unrelated"} <= set(package(step=step, maths=MATHS))
 
 
+def test_what_one_method_imports_hides_from_another_nothing_that_its_module_imports(package):
+    step = """
+    from probe.maths import twice
+
+    class Both:
+        def ours(self, x):
+            return twice(x)
+
+        def theirs(self, x):
+            from probe.others import twice
+
+            return twice(x)
+
+    def run(x):
+        return Both().ours(x)
+    """
+    found = package(step=step, maths=MATHS, others="def twice(x):\n    return 2 * x\n")
+    assert {"probe.maths.twice", "probe.others.twice"} <= set(found)
+
+
 def test_the_branches_of_single_dispatch_belong_to_the_function(package):
     step = """
     import functools
