@@ -329,7 +329,7 @@ class Store:
         """Keep what a digest in the components of actions stands for, once for all of them; plain data."""
         path, text = self._part_path(name), json.dumps(part, separators=(",", ":"))
         with contextlib.suppress(OSError):
-            if path.stat().st_size == len(text):  # a power cut may have left it empty
+            if path.read_bytes() == text.encode():  # a power cut may have left it empty, or a disk may fail
                 return
         self._write(path, text)
 

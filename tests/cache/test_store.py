@@ -168,9 +168,10 @@ def test_what_a_killed_writer_left_is_swept_by_age(store):
     assert mine.exists() and not left.exists()
 
 
-def test_a_part_that_a_power_cut_left_empty_is_written_again(store):
+@pytest.mark.parametrize("left", [b"", b'["one","tvo"]'])
+def test_a_part_that_is_empty_or_damaged_is_written_again(store, left):
     store.put_part("0a", ["one", "two"])
-    (store.root / "parts" / "0a.json").write_bytes(b"")
+    (store.root / "parts" / "0a.json").write_bytes(left)
     store.put_part("0a", ["one", "two"])
     assert store.part("0a") == ["one", "two"]
 
