@@ -54,7 +54,7 @@ from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, reading, writing
 from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder, share
-from ss_flow.cache.plain_json import reader
+from ss_flow.cache.plain_json import read_json, reader
 from ss_flow.cache.recent import Recent
 
 MEMORY_BYTES = min(1 << 30, psutil.virtual_memory().total // 16)
@@ -336,7 +336,7 @@ class Store:
     def part(self, name: str) -> Any:
         """What a digest in the components of an action stands for; None when not known."""
         try:
-            return json.loads(self._part_path(name).read_text())
+            return read_json(self._part_path(name).read_text())
         except (OSError, ValueError):
             return None
 
