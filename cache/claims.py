@@ -28,6 +28,7 @@ from typing import Any, Protocol
 import psutil
 
 from ss_flow.cache.errors import writing
+from ss_flow.cache.plain_json import read_json
 
 HEARTBEAT_SECONDS = 5.0
 EXPIRY_SECONDS = 60.0
@@ -165,7 +166,7 @@ class Claims:
         if seen.content == self._token and key not in self._held:
             return True  # the answer to making or removing it was lost
         try:
-            holder = json.loads(seen.content)
+            holder = read_json(seen.content)
             if holder["host"] == _this_process()["host"] and not _lives(holder["pid"], holder["started"]):
                 return True
         except (ValueError, KeyError, TypeError):

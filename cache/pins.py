@@ -11,6 +11,7 @@ from pathlib import Path
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import StoreFailure, writing
 from ss_flow.cache.files import write_atomically
+from ss_flow.cache.plain_json import read_json
 from ss_flow.cache.store import Store
 
 
@@ -38,7 +39,7 @@ def read_pins(store: Store) -> list[Pin]:
     found = []
     for path in (store.root / "roots" / "pins").glob("[!.]*.json"):
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = read_json(path.read_text(encoding="utf-8"))
             content["keys"], content["objects"] = tuple(content["keys"]), tuple(content["objects"])
             found.append(Pin(**content))
         except FileNotFoundError:  # unpinned just now

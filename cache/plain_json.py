@@ -1,4 +1,4 @@
-"""JSON documents of the store and of runs, by msgspec: a third of the standard library's time, at every hit."""
+"""JSON documents of the store and of runs; by msgspec, which takes a third of the time, those of every hit."""
 
 from __future__ import annotations
 
@@ -13,6 +13,14 @@ T = TypeVar("T")
 _write = msgspec.json.Encoder().encode
 
 
+def read_json(content: str | bytes) -> Any:
+    """What a document holds. Raises ValueError for what is none, or is nested so deeply that it is nobody's."""
+    try:
+        return json.loads(content)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
 def reader(kind: type[T]) -> Callable[[bytes], T]:
     """What reads documents that hold a `kind`, say a dataclass of plain data. It raises ValueError for others."""
     decode = msgspec.json.Decoder(kind).decode
@@ -20,8 +28,8 @@ def reader(kind: type[T]) -> Callable[[bytes], T]:
     def read(content: bytes) -> T:
         try:
             return decode(content)
-        except msgspec.DecodeError:  # the standard library also reads what it writes itself: NaN and Infinity
-            return msgspec.convert(json.loads(content), kind)
+        except (msgspec.DecodeError, RecursionError):  # the standard library also reads its own NaN and Infinity
+            return msgspec.convert(read_json(content), kind)
 
     return read
 

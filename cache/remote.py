@@ -96,11 +96,12 @@ class RemoteStore(Store):
         if (copy := self._copy(object_digest)) is not None:
             return copy
         with self.temporary() as place:
-            value = self._download(object_digest, place)
+            value, written = self._download(object_digest, place)
             target = self.object_path(object_digest)
             with writing(self.root):
                 target.parent.mkdir(exist_ok=True)
                 rename_folder(place, target)
+        _stamp(target, written)
         return value
 
     def _copy(self, object_digest: str) -> Any:
@@ -116,10 +117,10 @@ class RemoteStore(Store):
         if self._bucket.head(f"{self._folder(object_digest)}/{MANIFEST}") is None:
             return super().read(object_digest)
         with self.temporary() as place:
-            return self._download(object_digest, place)
+            return self._download(object_digest, place)[0]
 
-    def _download(self, object_digest: str, place: Path) -> Any:
-        """Copy an object to a place here, and check it."""
+    def _download(self, object_digest: str, place: Path) -> tuple[Any, float]:
+        """Copy an object to a place here, and check it; also returns when it was written there."""
         folder = self._folder(object_digest)
         files = {meta.name.removeprefix(f"{folder}/"): meta for meta in self._bucket.files(folder)}
         if MANIFEST not in files:
@@ -147,8 +148,7 @@ class RemoteStore(Store):
             except ValueError as error:
                 self.discard(object_digest)
                 raise Gone(object_digest, f"was damaged ({error})") from None
-        _stamp(place, max(meta.written for meta in files.values()))
-        return value
+        return value, max(meta.written for meta in files.values())
 
     def restore(self, object_digest: str) -> None:
         self._known.discard(object_digest)
@@ -229,9 +229,9 @@ class RemoteStore(Store):
         content, meta = found
         with writing(self.root), self.temporary() as place:
             place.write_bytes(content)
-            _stamp(place, meta.written)
             path.parent.mkdir(exist_ok=True)
             place.replace(path)
+        _stamp(path, meta.written)
         return True
 
     def _write(self, path: Path, text: str) -> None:
@@ -297,6 +297,6 @@ def default_folder(location: str) -> Path:
 
 
 def _stamp(path: Path, used: float) -> None:
-    """Making a copy does not count as using it."""
+    """Making a copy does not count as using it. To be called when it has its name: an old one in tmp/ is swept."""
     with contextlib.suppress(OSError):
         os.utime(path, (used, used))

@@ -54,7 +54,7 @@ from ss_flow.cache.canonical import DIGEST, digest
 from ss_flow.cache.claims import Claims
 from ss_flow.cache.errors import Gone, OtherVersion, reading, writing
 from ss_flow.cache.files import entries, folder_bytes, read_stamped, remove, rename_folder, share
-from ss_flow.cache.plain_json import reader
+from ss_flow.cache.plain_json import read_json, reader
 from ss_flow.cache.recent import Recent
 
 MEMORY_BYTES = min(1 << 30, psutil.virtual_memory().total // 16)
@@ -63,8 +63,11 @@ which each instance looks again, but no more than a small machine can spare."""
 GRACE_SECONDS = 3600.0
 """What was made or used within this time is not collected, whoever asks: a run may be about to use it."""
 
+_UNCHANGING = frozenset({str, bytes, int, float, bool, type(None)})
+"""What nobody can change in a tuple."""
 _TEMPORARY = re.compile(r"[0-9a-f]{32}")
 """What `temporary` calls things."""
+_RECORD = re.compile(rf"{DIGEST.pattern}\.json")
 
 NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 """What keeps a process from opening any file."""
@@ -328,14 +331,14 @@ class Store:
         """Keep what a digest in the components of actions stands for, once for all of them; plain data."""
         path, text = self._part_path(name), json.dumps(part, separators=(",", ":"))
         with contextlib.suppress(OSError):
-            if path.stat().st_size == len(text):  # a power cut may have left it empty
+            if path.read_bytes() == text.encode():  # a power cut may have left it empty, or a disk may fail
                 return
         self._write(path, text)
 
     def part(self, name: str) -> Any:
         """What a digest in the components of an action stands for; None when not known."""
         try:
-            return json.loads(self._part_path(name).read_text())
+            return read_json(self._part_path(name).read_text())
         except (OSError, ValueError):
             return None
 
@@ -408,15 +411,21 @@ def _own(value: Any) -> Any:
     """The same with lists and tables of its own, which can be changed as nothing else of a frozen dataclass can."""
     own = value
     for item in dataclasses.fields(value):
-        if isinstance(content := getattr(value, item.name), dict | list):
+        if _can_change(content := getattr(value, item.name)):
             own = copy.copy(value) if own is value else own
             object.__setattr__(own, item.name, copy.deepcopy(content))
     return own
 
 
+def _can_change(content: Any) -> bool:
+    if isinstance(content, tuple):
+        return not _UNCHANGING.issuperset(map(type, content))
+    return isinstance(content, dict | list)
+
+
 def _records(folder: str) -> Iterator[Entry]:
-    """The JSON files of a folder."""
-    for entry in entries(folder):
+    """The JSON files of a folder that are named by digests."""
+    for entry in filter(lambda entry: _RECORD.fullmatch(entry.name), entries(folder)):
         with contextlib.suppress(FileNotFoundError):
             status = entry.stat(follow_symlinks=False)  # which may lead round in a circle
             yield Entry(entry.name.removesuffix(".json"), status.st_mtime, status.st_size)

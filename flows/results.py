@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from ss_flow.cache.canonical import DIGEST, digests_of
 from ss_flow.cache.location import is_url, open_store
+from ss_flow.cache.plain_json import read_json
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.graph import stored
@@ -286,7 +286,7 @@ def id_image(file: Path) -> NDArray[np.uint16]:
 
 def _read(file: Path, needed: set[str]) -> dict[str, Any]:
     try:
-        document = dict(json.loads(file.read_text(encoding="utf-8")))
+        document = dict(read_json(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{file} is damaged ({error}); run the scene again.") from None
     if not needed <= document.keys():

@@ -141,6 +141,8 @@ def _closure(module_name: str, function_name: str) -> Closure:
             if attribute is not None and _is_followed(origin, own):
                 pending.append((origin, attribute))
         if name not in module.definitions:
+            if name not in module.imports and "__getattr__" in module.definitions:  # which makes it
+                pending.append((module_name, "__getattr__"))
             continue
         found |= _digests(module_name, name)
         needs = _needed(module_name, name, own)
@@ -194,7 +196,9 @@ def _needed(module_name: str, name: str, own: str) -> _Needs:
     origins = [*inner.values(), *(module.imports[name] for name in named)]
     imported = {origin.partition(".")[0] for several in origins for origin, _ in several}
     looked_for: set[str] = set()
-    needed = dict.fromkeys(_dependencies(module, nodes, module.imports | inner, own, looked_for))
+    # Of a name that one method of a class imports for itself, and that another takes from its module, both count.
+    local = {name: [*module.imports.get(name, ()), *inner.get(name, ())] for name in module.imports | inner}
+    needed = dict.fromkeys(_dependencies(module, nodes, local, own, looked_for))
     return _Needs(tuple(needed), frozenset(imported.union(_loaded_by_name(nodes))), frozenset(looked_for))
 
 

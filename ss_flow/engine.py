@@ -215,6 +215,7 @@ class _Run:
         self._store, self._claims = store, claims
         self._parts = [_Part(request, store) for request in requests]
         self._healed: set[str] = set()
+        self._is_stopping = False
         self.scheduler: Scheduler | None = None
 
     @property
@@ -268,6 +269,9 @@ class _Run:
                 except Gone as gone:  # the other flows go on
                     damaged.append(gone)
                     return
+                except Exception:
+                    if not self._is_stopping:  # else what ended the run is told, and the other flows are heard out
+                        raise
             part.report = report
 
         try:
@@ -302,6 +306,7 @@ class _Run:
 
     def stop(self) -> None:
         """Wait for what runs to finish or to keep what it has; flows that have not ended end here."""
+        self._is_stopping = True
         if self.scheduler is not None:
             self.tell("stopping", running=self.scheduler.running())
             self.scheduler.drain()

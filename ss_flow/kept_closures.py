@@ -1,8 +1,9 @@
 """Code closures kept in a folder, so that not every process walks through the same sources.
 
 A closure is worked out anew as soon as anything that it was read from has another content: a source of ours, a native
-one, a module that was looked for and is there now, the analysis itself, Python's version. All of these are read each
-time, which takes milliseconds; it is their syntax trees that take a second. No time of change is trusted.
+one, a module that was looked for and is there now, the analysis itself, Python's version; and when a module whose
+version counted is held by no distribution any more, or by an editable one, so that its code is to count. The sources
+are read each time, which takes milliseconds; it is their syntax trees that take a second. No time of change is trusted.
 
 Notes
 -----
@@ -25,8 +26,8 @@ from blake3 import blake3
 
 from ss_flow import closure, code_text, sources
 from ss_flow.cache.files import read_checked, write_checked
-from ss_flow.closure import Closure, closure_of, reading
-from ss_flow.sources import source_digest
+from ss_flow.closure import ENGINE, Closure, closure_of, reading
+from ss_flow.sources import is_loose, source_digest
 
 _ANALYSIS = b"".join(Path(file).read_bytes() for file in (closure.__file__, code_text.__file__, sources.__file__))
 _SIGNS = {"python": platform.python_version(), "analysis": blake3(_ANALYSIS).hexdigest()}
@@ -37,7 +38,8 @@ def kept_closure(function: Callable[..., Any], folder: Path) -> Closure:
     """What `closure_of` says, from the folder where it holds that; it is kept there otherwise."""
     file = folder / f"{function.__module__}-{function.__qualname__}.txt"
     with reading:
-        if (known := _read(file)) is not None:
+        known = _read(file)
+        if known is not None and (function.__module__.startswith(f"{ENGINE}.") or not _is_loose_by_now(known)):
             return known
         found = closure_of(function)
     content = {**_SIGNS, **vars(found), "modules": sorted(found.modules)}
@@ -58,3 +60,8 @@ def _read(file: Path) -> Closure | None:
     if any(source_digest(name) != known for name, known in content["sources"].items()):
         return None
     return Closure(content["definitions"], frozenset(content["modules"]), content["sources"])
+
+
+def _is_loose_by_now(known: Closure) -> bool:
+    """Whether a module is to be followed of which only the version counted."""
+    return any(is_loose(name) and name not in known.sources for name in known.modules)

@@ -23,7 +23,7 @@ def own_copy(name: str, value: Any, hint: Any = None) -> Any:
     """A parameter as its key sees it: NumPy's scalars as numbers, mappings in the order of their names.
 
     hint: its declared type; where that is a tuple or a list, so is the copy: a key does not tell them apart. A
-    dataclass stays what it is, but for lists and dicts in it.
+    dataclass stays what it is, but for lists, mappings and NumPy's scalars in it.
     Raises TypeError when it is neither plain data nor a frozen dataclass of such.
     """
     if isinstance(value, np.generic):
@@ -54,13 +54,9 @@ def _own_dataclass(name: str, value: Any) -> Any:
     own = value
     for field in dataclasses.fields(value):
         content = getattr(value, field.name)
-        if isinstance(content, _PLAIN) or not field.metadata.get("key", True):
-            continue
-        if isinstance(content, list | tuple | dict) or dataclasses.is_dataclass(content):
-            inner = own_copy(f"{name}.{field.name}", content)
-            if inner is not content:
-                own = copy.copy(value) if own is value else own
-                object.__setattr__(own, field.name, inner)
+        if field.metadata.get("key", True) and (inner := own_copy(f"{name}.{field.name}", content)) is not content:
+            own = copy.copy(value) if own is value else own
+            object.__setattr__(own, field.name, inner)
     if own is value:
         with contextlib.suppress(TypeError):  # of a class with slots
             _unchanging[id(value)] = value

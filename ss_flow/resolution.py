@@ -104,6 +104,7 @@ class Resolution:
         pending = [node]
         while pending:
             current = pending[-1]
+            self._ranks.setdefault(current, 0)  # meanwhile: a node that waits for itself would be ranked for ever
             consumers = self._consumers.get(current, [])
             unranked = [c for c in consumers if c not in self._ranks]
             if unranked:

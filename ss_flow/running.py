@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import warnings
-import zipfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,9 +21,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.cache.canonical import digest
+
 T = TypeVar("T")
 R = TypeVar("R")
 Listener = Callable[[int, int, str], None]
+_DIGEST = "digest of the others"
+"""In a checkpoint: the archive itself would not notice an array that is missing, or is none any more."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,8 @@ def save_checkpoint(arrays: Mapping[str, NDArray[Any]]) -> None:
     with contextlib.suppress(OSError):
         path.parent.mkdir(exist_ok=True)  # not those above: a store that was moved away would be there again
         with unfinished(path).open("wb") as stream:
-            np.savez(stream, **arrays)  # type: ignore[arg-type]
+            kept = {name: np.asarray(array) for name, array in arrays.items()}
+            np.savez(stream, **kept, **{_DIGEST: np.array(digest(kept))})  # type: ignore[arg-type]
             stream.flush()
             os.fsync(stream.fileno())
         unfinished(path).replace(path)
@@ -152,9 +156,10 @@ def unfinished(path: Path) -> Path:
 
 
 def remove_checkpoint(path: Path) -> None:
-    """Take away what a task kept, when it is done."""
-    path.unlink(missing_ok=True)
-    unfinished(path).unlink(missing_ok=True)
+    """Take away what a task kept, when it is done; where that is not allowed, it stays until it is collected."""
+    for file in (path, unfinished(path)):
+        with contextlib.suppress(OSError):
+            file.unlink()
 
 
 def load_checkpoint() -> dict[str, NDArray[Any]] | None:
@@ -164,6 +169,7 @@ def load_checkpoint() -> dict[str, NDArray[Any]] | None:
         return None
     try:
         with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile):
+            kept = {name: stored[name] for name in stored.files}
+        return kept if str(kept.pop(_DIGEST)) == digest(kept) else None
+    except Exception:  # whatever is raised of bytes that were damaged
         return None

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ss_flow.cache.files import write_atomically
+from ss_flow.cache.plain_json import read_json
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -60,7 +61,7 @@ class Run:
             with (self.folder / "events.jsonl").open("rb") as stream:
                 for line in stream:
                     with contextlib.suppress(ValueError):
-                        if _is_whole(event := json.loads(line)):
+                        if _is_whole(event := read_json(line)):
                             yield event
         except ABSENT:
             return
@@ -139,7 +140,7 @@ def latest_runs(runs: Path, scene: str | None = None) -> Iterator[Run]:
     found = []
     for file in runs.glob("*/run.json"):
         try:
-            run = Run(file.parent, json.loads(file.read_text()))
+            run = Run(file.parent, read_json(file.read_text()))
             if scene in (None, run.header["scene"]):
                 found.append((run.place, run))
         except (*ABSENT, ValueError, KeyError, TypeError, OverflowError):  # collected just now, or damaged

@@ -197,7 +197,7 @@ def module_without_stars(name: str) -> Module | None:
     if "global" in source.text:  # a look at every function takes as long as all else here
         bound |= {name for function in functions.values() for name in _declared_global(function)}
     for statement, tests in statements:
-        called = (_changed_by_call(functions[name]) for name in _called_at_once(statement) if name in functions)
+        called = map(_changed_by_call, _run_by(statement, functions))
         at_once = () if isinstance(statement, DEFINITIONS) else _changed_in(statement)
         changed = [*at_once, *itertools.chain(*called)]
         for name in dict.fromkeys([*_bound_at_top(statement), *(name for name in changed if name in bound)]):
@@ -269,12 +269,24 @@ def _changed_by_call(function: ast.FunctionDef) -> list[str]:
     return [*_declared_global(function), *(name for name in _changed_in(function) if name not in own)]
 
 
-def _called_at_once(statement: ast.stmt) -> Iterator[str]:
-    """The functions that are called when a statement of a module runs, decorators among them, by their names."""
-    if isinstance(statement, DEFINITIONS):
-        yield from (decorator.id for decorator in statement.decorator_list if isinstance(decorator, ast.Name))
+def _run_by(statement: ast.stmt, functions: dict[str, ast.FunctionDef]) -> Iterator[ast.FunctionDef]:
+    """The functions of a module that are called when a statement of it runs, decorators among them, and those that
+    they call in their turn."""
+    pending: list[str] = []
     for part in statement.decorator_list if isinstance(statement, DEFINITIONS) else (statement,):
-        yield from (n.func.id for n in ast.walk(part) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name))
+        pending += [part.id] if isinstance(part, ast.Name) else _called_in(part)
+    seen: set[str] = set()
+    while pending:
+        if (name := pending.pop()) in functions and name not in seen:
+            seen.add(name)
+            yield functions[name]
+            pending += _called_in(functions[name])
+
+
+def _called_in(part: ast.AST) -> list[str]:
+    """The functions that are called somewhere in a piece of code, by their names."""
+    calls = (node.func for node in ast.walk(part) if isinstance(node, ast.Call))
+    return [function.id for function in calls if isinstance(function, ast.Name)]
 
 
 def _changed_in(statement: ast.stmt) -> Iterator[str]:

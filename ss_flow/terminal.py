@@ -117,11 +117,14 @@ class _Steps(Messages):
         self._worth = worth
         self._steps: dict[str, _Step] = {}
         self._step_of: dict[str, _Step] = {}
+        self._has_news = False
+        """Whether anything was heard since the last pause: each of thousands of flows calls for one."""
         self._lock = threading.RLock()
 
     def event(self, kind: str, **details: Any) -> None:
         with self._lock:
             self._count(kind, details)
+            self._has_news = True
         super().event(kind, **details)
 
     def _count(self, kind: str, details: dict[str, Any]) -> None:
@@ -150,7 +153,9 @@ class _Steps(Messages):
                 node.done, node.total, node.note = done, total, note
 
     def pause(self) -> None:
-        self._say_done(lambda step: step.ended >= step.known)
+        if self._has_news:
+            self._has_news = False
+            self._say_done(lambda step: step.ended >= step.known)
 
     def close(self) -> None:
         """Also tells of steps that were interrupted."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import IO, Annotated, Any
 
 import tyro
 from rich.console import Console
+from rich.text import Text
 
 from ss_flow.cache.errors import StoreFailure
 from ss_flow.cache.file_digests import FileDigests
@@ -167,8 +169,19 @@ def _store_here(folder: Path, document: Mapping[str, Any], needed: Sequence[str]
     )
 
 
+_COMMANDS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+"""Control characters, but for tabs and ends of lines."""
+
+
 class _Words(Console):
-    """Where the reader has gone, as in `ss-flow cache ls | head -1`, it goes on in silence; Rich ends the program."""
+    """Where the reader has gone, as in `ss-flow cache ls | head -1`, it goes on in silence; Rich ends the program.
+
+    What a terminal would take for a command shows as a number: names of files, and what a store from someone else
+    holds, may say anything.
+    """
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(_COMMANDS.sub(lambda found: f"\\x{ord(found[0]):02x}", text), **options)
 
     def on_broken_pipe(self) -> None:
         self.quiet = True

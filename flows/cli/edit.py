@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from ss_flow.cache.plain_json import read_json
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import InStore, StoreOptions, console, open_run
 from ss_flow.flows.cli.prepare import display
@@ -52,7 +53,7 @@ class EditRun:
 
 def _read_script(file: Path) -> Any:
     try:
-        return json.loads(file.read_text(encoding="utf-8-sig"))
+        return read_json(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"the edit script {file} cannot be read: {error.strerror}.") from None
     except ValueError as error:

@@ -78,18 +78,23 @@ def _steps(events: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     steps: dict[str, dict[str, Any]] = defaultdict(
         lambda: {"hit": 0, "finished": 0, "failed": 0, "skipped": 0, "running": 0, "expected": 0, "seconds": 0.0}
     )
+    running: dict[Any, str] = {}  # keys, each of several nodes perhaps, and their steps
     for event in events:
         row = steps[event["step"]] if "step" in event else {}
         row["expected"] = event.get("of", 0)
         if event["event"] == "restarted":  # the same results are found again
+            running.clear()
             for row in steps.values():
-                row |= {"hit": 0, "skipped": 0, "running": 0}
+                row |= {"hit": 0, "skipped": 0}
         elif event["event"] == "started":
-            row["running"] += 1
-        elif event["event"] in row:
+            running[event.get("key")] = event["step"]
+        elif event["event"] in ("finished", "failed", "retried"):
+            running.pop(event.get("key"), None)
+        if event["event"] in row:
             row[event["event"]] += 1
-            row["running"] -= event["event"] in ("finished", "failed") and row["running"] > 0
             row["seconds"] += event["seconds"] if event["event"] == "finished" else 0.0
+    for step in running.values():
+        steps[step]["running"] += 1
     return steps
 
 

@@ -275,8 +275,7 @@ class Prefixed(Reporter):
         self._whole.progressed(f"{self._prefix} {label}", done, total, note)
 
     def pause(self) -> None:
-        if self._leading:
-            self._whole.pause()
+        self._whole.pause()
 
 
 @contextlib.contextmanager

@@ -215,7 +215,7 @@ def _is_local(host: str) -> bool:
 
 def _free_port(host: str, first: int) -> int:
     """The first port that is free; viser itself would try without an end where the host is wrong."""
-    last: OSError | None = None
+    reason = "there is no such port"
     for port in range(first, min(first + _PORTS, 65536)) if first else (0,):
         try:
             family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -224,6 +224,7 @@ def _free_port(host: str, first: int) -> int:
                 probe.bind(place)
             return port
         except OSError as error:
-            last = error
-    reason = last.strerror if last is not None else "there is no such port"
+            reason = error.strerror or str(error)
+        except UnicodeError:  # of what cannot be the name of a host, such as a..b
+            reason = "there is no such host"
     raise InputError(f"the viewer cannot listen on {host}, port {first}: {reason}; choose others with --host, --port.")

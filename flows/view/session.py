@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.cache.files import write_atomically
+from ss_flow.cache.plain_json import read_json
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
 from ss_flow.flows.edit_objects import Objects
@@ -204,7 +205,7 @@ def _named(operation: Operation, objects: Objects) -> list[int]:
 def read_operations(file: Path) -> list[Operation]:
     """The operations of an edit script. Raises InputError when there is none that can be read."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8-sig"))
+        document = read_json(file.read_text(encoding="utf-8-sig"))
         operations = document["operations"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file} is no edit script that can be read: {error}.") from None

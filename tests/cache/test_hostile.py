@@ -10,8 +10,11 @@ import shutil
 import numpy as np
 import pytest
 
-from ss_flow.cache.errors import Gone
+from ss_flow.cache.errors import Gone, StoreFailure
+from ss_flow.cache.pins import read_pins
 from ss_flow.cache.store import Action, Store
+from ss_flow.cache.verify import verify
+from ss_flow.runs import Run, latest_runs
 from ss_flow.tasks.artifacts import LabelMap
 
 SMALL = LabelMap("x", np.eye(8, dtype=np.uint16))
@@ -142,6 +145,20 @@ def test_an_action_whose_outputs_lead_out_of_the_store_is_none(store):
         store.record(action)
         assert store.action(action.key) is None
         assert store.action(action.key, whole=False) is None
+
+
+def test_a_document_that_is_nested_without_end_is_none(store):
+    key, deep = "ab" * 32, "[" * 100_000
+    for name in (f"actions/ab/{key}.json", f"parts/{key}.json", f"claims/{key}", "roots/runs/r/run.json"):
+        (store.root / name).parent.mkdir(parents=True, exist_ok=True)
+        (store.root / name).write_text(deep)
+    (store.runs / "r" / "events.jsonl").write_text(deep)
+    assert store.action(key) is None and store.part(key) is None and store.open_claims().living() == {key}
+    assert list(latest_runs(store.runs)) == list(Run(store.runs / "r", {}).events()) == []
+    assert [damage.kind for damage in verify(store).damaged] == ["part", "action"]
+    (store.root / "roots" / "pins" / "p.json").write_text(deep)
+    with pytest.raises(StoreFailure, match="cannot be read"):
+        read_pins(store)
 
 
 def test_a_checkpoint_from_someone_else_is_left_aside(store, tmp_path):

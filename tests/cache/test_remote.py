@@ -11,6 +11,7 @@ import pytest
 import ss_flow_toy as toy
 from remote_stores import action_of, emptied, label_map, names
 
+from ss_flow.cache import remote
 from ss_flow.cache.bucket import Bucket
 from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import Gone, StoreFailure
@@ -38,6 +39,16 @@ def test_what_was_read_once_is_read_here_the_next_time(here, there, bucket):
     bucket.delete(names(bucket, "objects"))
     again = RemoteStore(there.location, there.root)
     assert digest(again.get(object_digest)) == digest(again.read(object_digest)) == object_digest
+
+
+def test_no_other_process_sweeps_what_is_downloaded_though_it_is_old(here, there, monkeypatch):
+    object_digest = here.put(label_map())
+    here.record(action := action_of(object_digest))
+    stamp = remote._stamp
+    monkeypatch.setattr(remote, "_stamp", lambda path, _: (stamp(path, 0.0), there.sweep_temporaries()))
+    assert there.action(action.key) == action
+    assert digest(there.get(object_digest)) == object_digest
+    assert there.object_path(object_digest).stat().st_mtime == 0.0
 
 
 def test_the_bucket_is_asked_once_whether_it_holds_an_object_and_never_for_what_is_here(here, there, asked):

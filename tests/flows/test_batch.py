@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import shutil
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from tiny_runs import SHORT, Called, bytes_of, run_tiny, ss_flow, write_room
 
 from ss_flow.cache.store import Store
@@ -15,8 +17,10 @@ from ss_flow.events import Reporter
 from ss_flow.flows import deliver as deliver_module
 from ss_flow.flows.cli import batch as batch_module
 from ss_flow.flows.cli.batch import folder_names
+from ss_flow.flows.cli.prepare import Prefixed
 from ss_flow.flows.generated import RoomParams
 from ss_flow.tasks.splat import reconstruct as reconstruct_module
+from ss_flow.terminal import Lines
 
 DEN = RoomParams(objects=1, views=4, width=64, height=48, held_out=0)
 
@@ -261,3 +265,12 @@ def test_scenes_of_one_name_get_folders_of_their_own(scenes, names):
     found = folder_names(map(Path, scenes))
     assert len(set(found.values())) == len(scenes)
     assert [found[Path(scene)] for scene in scenes] == names
+
+
+def test_a_step_of_a_later_scene_has_its_line_when_it_has_ended_and_not_when_all_has():
+    stream = io.StringIO()
+    with contextlib.closing(Lines(Console(file=stream, width=200))) as screen:
+        later = Prefixed(screen, "den", leading=False)
+        later.event("finished", label="half", step="half", of=1, seconds=1.0)
+        later.pause()
+        assert "done   den half" in stream.getvalue()

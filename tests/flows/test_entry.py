@@ -155,6 +155,15 @@ def test_a_terminal_that_lacks_a_sign_gets_its_number(tmp_path):
         assert called.returncode == (0 if arguments == ["--help"] else 2)
 
 
+def test_what_a_terminal_would_take_for_a_command_shows_as_a_number(tmp_path):
+    (tmp_path / "a\x1b]0;b\x07\x9bc").mkdir()
+    called = subprocess.run(
+        [sys.executable, "-c", ENTRY, "run", str(tmp_path / "a\x1b]0;b\x07\x9bc")], capture_output=True, text=True
+    )
+    assert called.returncode == 2
+    assert r"a\x1b]0;b\x07\x9bc holds no photo" in called.stderr and "\x1b" not in called.stderr
+
+
 def test_an_interrupt_before_the_command_is_known_ends_as_any_other():
     before = (
         "import sys\n"

@@ -34,6 +34,15 @@ def test_status_counts_what_each_step_did(tiny):
     assert all(row["expected"] == row["finished"] + row["hit"] for row in document["steps"].values())
 
 
+def test_what_was_tried_again_runs_no_more_when_it_has_ended(store, tmp_path):
+    def flow():
+        return {"end": toy.killed_once(toy.source(values=(1.0,))[0], marker=str(tmp_path / "marker"))}
+
+    run_flow(flow, store, scene="toy")
+    row = json.loads(ss_flow("status", "--json", "--cache", store.root).out)["steps"]["ss_flow_toy.killed_once"]
+    assert (row["finished"], row["running"]) == (1, 0)
+
+
 def test_status_of_a_run_that_ended_lacks_nothing_though_more_was_expected_at_times(warm):
     run = next(latest_runs(warm.store / "roots/runs"))
     lines = [json.loads(line) for line in (run.folder / "events.jsonl").read_text().splitlines()]

@@ -57,6 +57,7 @@ class TestWithTheExtra:
         [
             (("--port", "70000"), "--port 70000 is out of range; it must be from 0 to 65535."),
             (("--host", "no.such.host.invalid"), "the viewer cannot listen on no.such.host.invalid"),
+            (("--host", "no..host"), "the viewer cannot listen on no..host, port 8080: there is no such host; choose"),
         ],
     )
     def test_where_it_cannot_listen_is_said(self, tiny, options, sentence):

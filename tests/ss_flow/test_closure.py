@@ -239,6 +239,26 @@ def test_of_two_things_imported_under_one_name_both_are_followed(package):
     assert {"probe.maths.twice", "probe.maths.unrelated"} <= set(package(step=step, maths=MATHS))
 
 
+def test_what_one_method_imports_hides_from_another_nothing_that_its_module_imports(package):
+    step = """
+    from probe.maths import twice
+
+    class Both:
+        def ours(self, x):
+            return twice(x)
+
+        def theirs(self, x):
+            from probe.others import twice
+
+            return twice(x)
+
+    def run(x):
+        return Both().ours(x)
+    """
+    found = package(step=step, maths=MATHS, others="def twice(x):\n    return 2 * x\n")
+    assert {"probe.maths.twice", "probe.others.twice"} <= set(found)
+
+
 def test_the_branches_of_single_dispatch_belong_to_the_function(package):
     step = """
     import functools
@@ -288,6 +308,9 @@ EDITS = {
     "filled by a decorator with arguments": (
         "TABLE = {}\ndef add(n):\n    def inner(f):\n        TABLE[n] = f\n        return f\n    return inner\n"
         "@add(1)\ndef g(): return 3\n", "3", "4", "TABLE"),
+    "filled by a call of a call": (
+        "TABLE = {}\ndef add(n, v):\n    TABLE[n] = v\ndef fill():\n    add('f', 3)\nfill()\n", "3", "4", "TABLE"
+    ),
     "filled by a call": ("TABLE = {}\ndef add(n, v):\n    TABLE[n] = v\nadd('f', 3)\n", "3", "4", "TABLE"),
     "set by a call": ("TABLE = None\ndef _start():\n    global TABLE\n    TABLE = 3\n_start()\n", "3", "4", "TABLE"),
     "module as a value": ("from probe import maths\n", "", "", "{1: maths}[1].twice(x)"),
@@ -307,6 +330,13 @@ def test_an_edit_that_changes_what_a_name_stands_for_is_seen(package, case):
 def test_a_class_that_only_an_annotation_in_quotes_names_is_followed(package, hints):
     step = f"class Out:\n    pass\n\ndef twice():\n    pass\n\ndef run({hints}) -> Literal['twice']:\n    return x\n"
     assert set(package(step=f"from typing import Literal\n{step}")) == {"probe.step.run", "probe.step.Out"}
+
+
+def test_a_name_that_a_module_makes_when_it_is_asked_for_leads_to_what_makes_it(package):
+    lazy = "def late(x):\n    return x\n\n\ndef __getattr__(name):\n    return late\n"
+    for step in ("from probe.lazy import made\n\n\ndef run(x):\n    return made(x)\n",
+                 "import probe.lazy\n\n\ndef run(x):\n    return probe.lazy.made(x)\n"):  # fmt: skip
+        assert set(package(step=step, lazy=lazy)) == {"probe.step.run", "probe.lazy.__getattr__", "probe.lazy.late"}
 
 
 def test_how_text_is_written_does_not_count(package):

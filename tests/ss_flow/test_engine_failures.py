@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +16,13 @@ from toy_runs import ran, run, value
 
 from ss_flow import engine
 from ss_flow.cache.errors import StoreFailure
+from ss_flow.engine import Request, run_flows
+from ss_flow.errors import InputError
 from ss_flow.events import Reporter
-from ss_flow.graph import each, expand, otherwise, pick
+from ss_flow.graph import each, expand, labelled, otherwise, pick, stored
 from ss_flow.resolution import Failure
-from ss_flow.running import Surroundings, running, save_checkpoint
+from ss_flow.running import Surroundings, load_checkpoint, running, save_checkpoint
+from ss_flow.runs import latest_runs
 from ss_flow.task import task
 
 
@@ -166,6 +171,23 @@ def test_a_damaged_checkpoint_is_as_good_as_none(store, tmp_path):
     assert value(store, run(store, flow).values["start"]) == 0
 
 
+def test_of_a_damaged_checkpoint_nothing_is_taken_and_nothing_is_raised(tmp_path):
+    place, kept = tmp_path / "kept.npz", {"height": np.array(3), "values": np.arange(5.0)}
+    with running(Surroundings(checkpoint=place)):
+        save_checkpoint(kept)
+        content = place.read_bytes()
+        for position, wrong in itertools.product(range(len(content)), (0, 1, 0xFF)):
+            place.write_bytes(content[:position] + bytes([content[position] ^ wrong]) + content[position + 1 :])
+            found = load_checkpoint()
+            assert found is None or all(np.array_equal(found[name], kept[name]) for name in kept)
+            assert found is not None or wrong
+
+
+def test_a_checkpoint_that_cannot_be_taken_away_fails_no_task(store):
+    (store.root / "checkpoints").touch()
+    assert value(store, run(store, lambda: {"start": toy.source(values=(1.0,))[0]}).values["start"]) == 1.0
+
+
 def test_a_store_that_was_moved_away_is_not_there_again_for_a_checkpoint(tmp_path):
     with running(Surroundings(checkpoint=tmp_path / "moved" / "checkpoints" / "kept.npz")):
         save_checkpoint({"x": np.ones(2)})
@@ -185,6 +207,28 @@ def test_an_interrupted_run_keeps_what_was_finished_and_ends_its_claims(store):
     assert time.monotonic() - started < 5
     assert list((store.root / "claims").iterdir()) == []
     assert ran(run(store, lambda: {"square": toy.square(toy.source(values=(2.0,))[0])})) == []
+
+
+def test_an_interrupt_is_told_though_a_flow_that_ends_meanwhile_cannot_be_written(store):
+    class Interrupt(Reporter):
+        def event(self, kind, **details):
+            if kind == "started" and details["item"] == "last":
+                raise KeyboardInterrupt
+
+    def flow(item):
+        with labelled(item):
+            return {"end": toy.nap(stored("number", store.put(toy.number(len(item)))))}
+
+    def refuse(report):
+        raise InputError("the output cannot be written.")
+
+    requests = [Request(partial(flow, n), n, reporter=Interrupt(), done=refuse) for n in ("a", "bb", "last")]
+    with pytest.raises(KeyboardInterrupt):
+        run_flows(requests, store, jobs=3)
+    for scene, kind in (("a", "finished"), ("bb", "finished"), ("last", "taken")):
+        (kept,) = latest_runs(store.runs, scene)
+        events = [event["event"] for event in kept.events()]
+        assert events[-1] == "run ended" and kind in events
 
 
 def test_a_store_that_can_only_be_read_ends_the_run_with_one_sentence(store, monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 import ss_flow_toy as toy
 from toy_runs import run, value
 
-from ss_flow.graph import INDEX, Flow, each, gather, pick, stored
+from ss_flow.graph import INDEX, Flow, each, expand, gather, pick, stored
 
 
 def test_an_unknown_executor_is_refused_in_one_sentence(store):
@@ -49,6 +49,23 @@ def test_a_mistake_in_a_flow_is_told_in_one_sentence(store, build, said):
 
 with Flow().building():
     OF_ANOTHER_FLOW = toy.source(values=(1.0,))
+
+
+def test_a_node_that_depends_on_what_it_expands_to_ends_the_run_in_one_sentence(store):
+    run(store, lambda: {"start": toy.source(values=(1.0,))[0]})
+
+    def flow():
+        again = []
+
+        def build(_):
+            # A call that has yet to be made leads into the circle.
+            return toy.total((again[0], toy.square(toy.source(values=(2.0,))[0])))
+
+        again.append(expand(toy.source(values=(1.0,))[0], build))
+        return {"end": again[0]}
+
+    with pytest.raises(RuntimeError, match="the flow waits for itself"):
+        run(store, flow)
 
 
 def test_positions_alone_have_no_length_and_are_refused_at_the_call(store):

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from ss_flow import closure, kept_closures
+from ss_flow import closure, kept_closures, sources
 from ss_flow.closure import closure_of
 from ss_flow.kept_closures import kept_closure
 
@@ -99,6 +99,15 @@ def test_a_helper_of_no_distribution_that_is_there_at_last_is_noticed(probe, wal
     (probe.package / "step.py").write_text("def run(x):\n    import late_probe\n\n    return late_probe.f(x)\n")
     assert "late_probe" in kept_closure(probe(), probe.folder).modules
     (probe.package.parent / "late_probe.py").write_text("def f(x):\n    return x\n")
+    assert "late_probe.f" in kept_closure(probe(), probe.folder).definitions
+
+
+def test_a_helper_whose_distribution_tells_its_code_no_more_is_noticed(probe, walks, monkeypatch):
+    (probe.package / "step.py").write_text("def run(x):\n    import late_probe\n\n    return late_probe.f(x)\n")
+    (probe.package.parent / "late_probe.py").write_text("def f(x):\n    return x\n")
+    monkeypatch.setattr(sources, "is_distributed", lambda name: True)
+    assert "late_probe" in kept_closure(probe(), probe.folder).modules
+    monkeypatch.setattr(sources, "is_distributed", lambda name: name != "late_probe")  # an editable one, say
     assert "late_probe.f" in kept_closure(probe(), probe.folder).definitions
 
 

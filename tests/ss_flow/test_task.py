@@ -83,6 +83,14 @@ def test_a_dataclass_of_parameters_has_lists_of_its_own_too():
     assert kept[0] is shared and kept[1] == Holder(Holder(Nothing(), ([1], 2)))
 
 
+def test_what_a_dataclass_of_parameters_holds_is_what_its_key_sees():
+    with Flow().building():
+        kept = modelled(union=Linear(np.float64(0.5))).parameters["union"]
+    assert type(kept.slope) is float and kept == Linear(0.5)
+    with Flow().building(), pytest.raises(TypeError, match=r"union\.slope holds a set, no plain data"):
+        modelled(union=Linear({2.0}))
+
+
 def test_a_dataclass_that_can_be_changed_is_no_parameter():
     @dataclass
     class Loose:

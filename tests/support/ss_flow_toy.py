@@ -51,6 +51,7 @@ class Table:
 
     rows: dict[str, list[int]]
     names: list[str]
+    entries: tuple[dict[str, int], ...] = ()
 
 
 @dataclass(frozen=True)
