@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.running import in_threads
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Int32
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import pixels_under
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
@@ -120,7 +120,7 @@ def consistent_points(
     other views look through, fail.
     """
 
-    def told(view: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def told(view: int) -> tuple[Int32, Int32]:
         camera = camera_of(cameras, view)
         rows, column, row, z = pixels_in_view(points, camera)
         measured = depth_at(depths[view], column, row, camera.width, camera.height)

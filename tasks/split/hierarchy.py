@@ -72,7 +72,7 @@ class HierarchyParams:
     bulge: Fraction = 0.09
     """How far it must rise from there, as a share of its extent, where its colours are half like those around it; the
     farther, the more they are alike. A bag on a sofa is no part of the sofa, but its arm is."""
-    flush: Fraction = 0.6
+    flush: Fraction = 0.4
     """Share of its border along which a flat piece goes on without an edge into something larger: a mug on a page that
     lies on a table is no part of the page. 1 = none does."""
     stuff: StuffParams = field(default_factory=StuffParams)
@@ -194,7 +194,7 @@ class _Pieces:
 
     def best_unions(self) -> list[tuple[tuple[int, ...], float]]:
         """The sets of pieces to unite now, each with its agreement: of sets that share a piece, the best alone."""
-        sets, below = self._sets()
+        sets, groups = self._sets()
         presumed = self._presumed()
         unshown = sorted(presumed.keys() - set(sets))
         sets += unshown
@@ -209,13 +209,13 @@ class _Pieces:
         )
         agreement += (1 - agreement) * params.alone * self.contact.alone(member, self.stuff)
         agreement = np.minimum(agreement * (1 + params.contact * (2 * self.contact.own(member) - 1)), 1)
-        group = np.array([members in below for members in sets])
+        group = np.array([members in groups for members in sets])
         row_of = {members: row for row, members in enumerate(sets)}
-        # A mask that holds a page and the mug on it holds the page as one.
-        for members in below.keys() & row_of.keys():
-            row = row_of.get(below[members])
-            if row is not None and not group[row]:
-                agreement[row] = max(agreement[row], agreement[row_of[members]])
+        # A mask that holds a page and the mug on it holds each of the two as one.
+        for members, parts in groups.items():
+            for row in (row_of[part] for part in parts if part in row_of and members in row_of):
+                if not group[row]:
+                    agreement[row] = max(agreement[row], agreement[row_of[members]])
         agreement *= np.where(group, _ON_TOP, np.where(self.contact.hang_together(member), 1, 1 - params.apart))
         least = [presumed.get(members, 0.0) for members in sets]
         agreement = np.maximum(agreement, least).astype(np.float64).round(6)
@@ -229,9 +229,9 @@ class _Pieces:
             taken |= set(sets[row])
         return chosen
 
-    def _sets(self) -> tuple[list[tuple[int, ...]], dict[tuple[int, ...], tuple[int, ...]]]:
+    def _sets(self) -> tuple[list[tuple[int, ...]], dict[tuple[int, ...], tuple[tuple[int, ...], ...]]]:
         """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
-        on the others. For each set in which something does, those below it."""
+        on the others. For each set in which something does, what is below, and what stands on that."""
         shown: Counter[tuple[int, ...]] = Counter()
         for view in self.counted:
             for shows in view.shows:
@@ -244,7 +244,11 @@ class _Pieces:
                 shown[left[members]] += times
                 left.setdefault(left[members], self._below(left[members]))
         sets = [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
-        return sets, {members: below for members, below in left.items() if below != members}
+        return sets, {
+            members: (below, tuple(piece for piece in members if piece not in below))
+            for members, below in left.items()
+            if below != members
+        }
 
     def _presumed(self) -> dict[tuple[int, ...], float]:
         """The pairs of things that are faces of one, or of which one lies in the other, unless the views deny it; with
