@@ -22,6 +22,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     Bool,
     Cameras,
+    Float64,
     Hierarchy,
     PointCloud,
     PointLabels,
@@ -40,6 +41,9 @@ from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
+
+Members = tuple[int, ...]
+"""Some pieces, or labels, by their rows, ascending."""
 
 _ON_TOP = 0.5
 """What is left of an agreement when one piece stands on the others: the views show a group."""
@@ -125,7 +129,7 @@ def hierarchy(
     if params.convex:
         edges = convex_edges(points, cameras, visibility, labels.label, ends)
     inlays = find_inlays(looks, labels.label, ~is_stuff & (params.inlaid > 0))
-    own: list[tuple[int, ...]] = [(row,) for row in range(len(leaves))]
+    own: list[Members] = [(row,) for row in range(len(leaves))]
     pieces = _Pieces(views_of(leaves, tallies), is_stuff, contact, edges, own, mounds, sheets, inlays, params)
     node, parent, agreement, stuff = leaves.tolist(), [0] * len(leaves), [1.0] * len(leaves), is_stuff.tolist()
     top = list(range(len(leaves)))  # the tree's row of each piece
@@ -161,7 +165,7 @@ class _Pieces:
     contact: Contact
     edges: Bool
     """[G, G] which meet in a convex edge."""
-    labels: list[tuple[int, ...]]
+    labels: list[Members]
     """G x the labels (rows) that each is made of."""
     mounds: Mounds
     sheets: Sheets
@@ -175,11 +179,11 @@ class _Pieces:
         least, share = self.params.min_points, self.params.min_visible
         return [view.only((view.seen >= least) & (view.seen >= share * most)) for view in self.views]
 
-    def united(self, unions: list[tuple[int, ...]]) -> _Pieces:
+    def united(self, unions: list[Members]) -> _Pieces:
         """What is left when each of these sets has become one piece: the others first, then the unions."""
         count = len(self.stuff)
         gone = {piece for members in unions for piece in members}
-        groups: list[tuple[int, ...]] = [*((piece,) for piece in range(count) if piece not in gone), *unions]
+        groups: list[Members] = [*((piece,) for piece in range(count) if piece not in gone), *unions]
         joined = np.zeros((count, len(groups)), np.float32)
         for column, members in enumerate(groups):
             joined[list(members), column] = 1
@@ -192,14 +196,27 @@ class _Pieces:
             labels=[tuple(row for piece in members for row in self.labels[piece]) for members in groups],
         )
 
-    def best_unions(self) -> list[tuple[tuple[int, ...], float]]:
+    def best_unions(self) -> list[tuple[Members, float]]:
         """The sets of pieces to unite now, each with its agreement: of sets that share a piece, the best alone."""
         sets, groups = self._sets()
         presumed = self._presumed()
-        unshown = sorted(presumed.keys() - set(sets))
-        sets += unshown
+        sets += sorted(presumed.keys() - set(sets))
         if not sets:
             return []
+        least = [presumed.get(members, 0.0) for members in sets]
+        agreement = np.maximum(self._agreements(sets, groups), least).astype(np.float64).round(6)
+        taken: set[int] = set()
+        chosen = []
+        for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
+            if agreement[row] < max(self.params.min_agreement, 1e-6):
+                break
+            if not taken & set(sets[row]):
+                chosen.append((sets[row], float(agreement[row])))
+            taken |= set(sets[row])
+        return chosen
+
+    def _agreements(self, sets: list[Members], groups: dict[Members, tuple[Members, Members]]) -> Float64:
+        """How far the views agree on each set, less or more by what its places tell: [S]. groups: as of `_sets`."""
         member = np.zeros((len(sets), len(self.stuff)), np.float32)
         for row, members in enumerate(sets):
             member[row, list(members)] = 1
@@ -209,30 +226,20 @@ class _Pieces:
         )
         agreement += (1 - agreement) * params.alone * self.contact.alone(member, self.stuff)
         agreement = np.minimum(agreement * (1 + params.contact * (2 * self.contact.own(member) - 1)), 1)
-        group = np.array([members in groups for members in sets])
+        is_group = np.array([members in groups for members in sets])
         row_of = {members: row for row, members in enumerate(sets)}
         # A mask that holds a page and the mug on it holds each of the two as one.
-        for members, parts in groups.items():
-            for row in (row_of[part] for part in parts if part in row_of and members in row_of):
-                if not group[row]:
+        for members in groups.keys() & row_of.keys():
+            for row in (row_of[part] for part in groups[members] if part in row_of):
+                if not is_group[row]:
                     agreement[row] = max(agreement[row], agreement[row_of[members]])
-        agreement *= np.where(group, _ON_TOP, np.where(self.contact.hang_together(member), 1, 1 - params.apart))
-        least = [presumed.get(members, 0.0) for members in sets]
-        agreement = np.maximum(agreement, least).astype(np.float64).round(6)
-        taken: set[int] = set()
-        chosen = []
-        for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
-            if agreement[row] < max(params.min_agreement, 1e-6):
-                break
-            if not taken & set(sets[row]):
-                chosen.append((sets[row], float(agreement[row])))
-            taken |= set(sets[row])
-        return chosen
+        agreement *= np.where(is_group, _ON_TOP, np.where(self.contact.hang_together(member), 1, 1 - params.apart))
+        return agreement
 
-    def _sets(self) -> tuple[list[tuple[int, ...]], dict[tuple[int, ...], tuple[tuple[int, ...], ...]]]:
+    def _sets(self) -> tuple[list[Members], dict[Members, tuple[Members, Members]]]:
         """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
         on the others. For each set in which something does, what is below, and what stands on that."""
-        shown: Counter[tuple[int, ...]] = Counter()
+        shown: Counter[Members] = Counter()
         for view in self.counted:
             for shows in view.shows:
                 members = tuple(np.flatnonzero(shows).tolist())
@@ -250,7 +257,7 @@ class _Pieces:
             if below != members
         }
 
-    def _presumed(self) -> dict[tuple[int, ...], float]:
+    def _presumed(self) -> dict[Members, float]:
         """The pairs of things that are faces of one, or of which one lies in the other, unless the views deny it; with
         the agreement that each has at least."""
         lying = [
@@ -263,7 +270,7 @@ class _Pieces:
         least = dict.fromkeys(inlaid, self.params.inlaid)
         return least | {pair: max(self.params.convex, least.get(pair, 0)) for pair in faces}
 
-    def _together(self, views: list[View], pairs: NDArray[np.intp]) -> list[tuple[int, ...]]:
+    def _together(self, views: list[View], pairs: NDArray[np.intp]) -> list[Members]:
         """Those of some pairs [P, 2] that are things, and that half of the views which see both hold under one mask."""
         a, b = pairs[~self.stuff[pairs].any(axis=1)].T
         both, together = np.zeros((2, len(a)))
@@ -273,7 +280,7 @@ class _Pieces:
         one = (together > 0) & (together >= _TOGETHER * both)
         return list(zip(a[one].tolist(), b[one].tolist(), strict=True))
 
-    def _below(self, members: tuple[int, ...]) -> tuple[int, ...]:
+    def _below(self, members: Members) -> Members:
         """Those of these pieces that do not stand on the others."""
         labels = [row for piece in members for row in self.labels[piece]]
         on_top = dict(zip(labels, self.mounds.standing(labels).tolist(), strict=True))
