@@ -33,7 +33,7 @@ from ss_flow.tasks.artifacts import (
     Registration,
     SceneUnit,
 )
-from ss_flow.tasks.capture import ingest, recordings, views
+from ss_flow.tasks.capture import ingest, recordings, video, views
 from ss_flow.tasks.capture.checks import checks
 from ss_flow.tasks.capture.coco_masks import coco_masks
 from ss_flow.tasks.capture.colmap import has_pycolmap
@@ -216,7 +216,7 @@ def _given_cameras(scene: SceneFiles, reference: Reference, frames: tuple[Frame,
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> tuple[Frame, ...]:
     if scene.kind == "video":
         assert scene.recording is not None
-        return recordings.video_frames(video=reference(scene.recording), params=params.video.every(params.stride))
+        return video.video_frames(video=reference(scene.recording), params=params.video.every(params.stride))
     if scene.kind == "stray":
         assert scene.recording is not None and scene.lenses is not None
         return recordings.recorded_frames(

@@ -15,11 +15,11 @@ from ss_flow.tasks.capture.mono import MonoParams
 from ss_flow.tasks.capture.neighbors import NeighborParams
 from ss_flow.tasks.capture.planes import PlaneParams
 from ss_flow.tasks.capture.pose_fit import PoseFitParams
-from ss_flow.tasks.capture.recordings import VideoParams
 from ss_flow.tasks.capture.refine_poses import RefinePosesParams
 from ss_flow.tasks.capture.registration import RegistrationParams
 from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.capture.stereo import StereoParams
+from ss_flow.tasks.capture.video import VideoParams
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative, QuarterTurns
 from ss_flow.tasks.semantics.dense_describe import DenseDescribeParams

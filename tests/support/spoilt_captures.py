@@ -10,9 +10,10 @@ from capture_folders import ref, refs
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.ingest import cameras, frames
-from ss_flow.tasks.capture.recordings import sens_depth, sens_frames, video_frames
+from ss_flow.tasks.capture.recordings import sens_depth, sens_frames
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.sensor_depth import depth
+from ss_flow.tasks.capture.video import video_frames
 
 
 def read_all(path: Path) -> None:

@@ -10,7 +10,7 @@ from capture_folders import ref
 from spoilt_captures import Cases, cut, read_all
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.capture.recordings import video_frames
+from ss_flow.tasks.capture.video import video_frames
 
 case = Cases()
 
