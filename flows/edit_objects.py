@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
-from ss_flow.flows.results import open_finished
+from ss_flow.flows.results import open_finished, read_instances
 from ss_flow.tasks.artifacts import Cameras, Gaussians
 from ss_flow.tasks.deliver.instances_json import gaussians_placed, instance_file
 from ss_flow.tasks.deliver.palette import instance_color
@@ -266,13 +265,9 @@ def object_of_run(folder: Path, called: int | str) -> tuple[Entry, list[int], Pa
     """
     from ss_flow.tasks.gaussians.read_ply import read_columns
 
-    try:
-        document = json.loads((folder / "instances.json").read_text(encoding="utf-8"))
-        entries = document["instances"]
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(
-            f"{folder} is not the output folder of a run: it has no instances.json that can be read."
-        ) from None
+    if not (folder / "instances.json").is_file():
+        raise InputError(f"{folder} is not the output folder of a run: it has no instances.json.")
+    entries = read_instances(folder)["instances"]
     entry = next((e for e in entries if called in (e["id"], e["name"])), None)
     if entry is None:
         raise ValueError(f"{folder / 'instances.json'} has no object of this id or name")

@@ -93,6 +93,26 @@ def test_coco_says_what_the_masks_show_in_the_pixels_of_the_photos(tiny, tmp_pat
     assert seen > 4
 
 
+def test_coco_holds_instances_that_are_in_masks_only_and_crumbs_when_they_are_named(warm, tmp_path):
+    file = warm.out / "instances.json"
+    document = json.loads(file.read_text())
+    bare, crumb, *rest = document["instances"]
+    for entry, is_crumb in ((bare, False), (crumb, True)):
+        entry.update(file=None, num_gaussians=0, weak=is_crumb, crumb=is_crumb)
+    file.write_text(json.dumps(document))
+    whole, named = tmp_path / "whole.json", tmp_path / "named.json"
+    assert export(warm, "--format", "coco", "--out", whole).code == 0
+    annotated = {a["instance_id"] for a in json.loads(whole.read_text())["annotations"]}
+    assert annotated == {bare["id"], *(entry["id"] for entry in rest if not entry["crumb"])}
+    answer = export(
+        warm, "--format", "coco", "--instance", crumb["name"], "--instance", str(bare["id"]), "--out", named
+    )
+    assert answer.code == 0, answer.err
+    assert {a["instance_id"] for a in json.loads(named.read_text())["annotations"]} == {bare["id"], crumb["id"]}
+    answer = export(warm, "--format", "ply", "--instance", str(bare["id"]), "--out", tmp_path / "a.ply")
+    assert answer.code == 2 and "has no Gaussians" in answer.err
+
+
 def test_coco_can_be_given_to_a_run_as_its_masks(tiny, tmp_path):
     export(tiny, "--format", "coco", "--out", tmp_path / "a.json")
     asked = ["--masks", tmp_path / "a.json", "--until", "segment", "--preset", "fast", "--json"]
@@ -194,7 +214,7 @@ def test_a_scene_without_gaussians_is_not_written(warm, tmp_path, more):
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize("more", [["spz", "--each"], ["mesh-obj"], ["mesh-glb"], ["coco"]])
+@pytest.mark.parametrize("more", [["spz", "--each"], ["mesh-obj"], ["mesh-glb"]])
 def test_where_no_instance_has_a_file_nothing_is_written(warm, tmp_path, more):
     file = warm.out / "instances.json"
     document = json.loads(file.read_text())
@@ -203,6 +223,16 @@ def test_where_no_instance_has_a_file_nothing_is_written(warm, tmp_path, more):
     answer = export(warm, "--format", *more, "--out", tmp_path / "a")
     assert answer.code == 2 and f"no instance of {warm.out} has a file of its own" in answer.err
     assert not (tmp_path / "a").exists()
+
+
+def test_where_all_instances_are_crumbs_no_coco_is_written(warm, tmp_path):
+    file = warm.out / "instances.json"
+    document = json.loads(file.read_text())
+    document["instances"] = [entry | {"file": None, "crumb": True} for entry in document["instances"]]
+    file.write_text(json.dumps(document))
+    answer = export(warm, "--format", "coco", "--out", tmp_path / "a.json")
+    assert answer.code == 2 and f"no instance of {warm.out} is more than a crumb" in answer.err
+    assert not (tmp_path / "a.json").exists()
 
 
 @pytest.mark.parametrize(
