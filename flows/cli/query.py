@@ -26,12 +26,12 @@ from ss_flow.flows.cli.context import (
     open_run,
 )
 from ss_flow.flows.cli.telling import print_table
-from ss_flow.flows.query import NEEDED, described_parts
+from ss_flow.flows.query import NEEDED, described_parts, words_left_out
 from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, not_of_an_edit, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
 from ss_flow.tasks.deliver.places import Written, check_replaceable, replacing_own, sizes
 from ss_flow.tasks.models.catalogue import Model
-from ss_flow.tasks.models.colour_words import ColourWords, words_ignored
+from ss_flow.tasks.models.colour_words import ColourWords
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
 
@@ -151,9 +151,8 @@ class Query:
         print_table(table, out)
         if len(shown) < len(rows):
             out.print(f"{len(rows) - len(shown)} more are farther off; --json names all.")
-        if found.encoder == ColourWords.name and (ignored := words_ignored(found.text)):
-            without = ", ".join(f'"{word}"' for word in ignored)
-            out.print(f"Only colour words were understood, not {without}; `ss-flow models list` shows what reads more.")
+        if lacking := words_left_out(found):
+            out.print(lacking)
 
 
 def query_params(document: dict[str, Any]) -> QueryParams:

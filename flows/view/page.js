@@ -385,7 +385,7 @@ async function start() {
     redraw(false);
   });
   document.getElementById("search").addEventListener("input", (event) => {
-    const words = event.target.value.toLowerCase();
+    const words = event.target.value.trim().toLowerCase(); // phones put a space behind a word
     for (const object of scene.objects) rows.get(object.id).hidden = !object.name.toLowerCase().includes(words);
     document.getElementById("none").hidden = [...rows.values()].some((row) => !row.hidden);
   });

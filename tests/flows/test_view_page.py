@@ -179,7 +179,7 @@ def test_labels_colour_the_scene_and_a_click_selects_the_object_under_it(page):
 @needs_browser
 def test_the_list_is_searched_by_name(page):
     name = page.evaluate("document.querySelector('li .name').textContent")
-    page.evaluate(TYPED.format(json.dumps(name.upper())))
+    page.evaluate(TYPED.format(json.dumps(f"{name.upper()} ")))
     left = page.evaluate("[...document.querySelectorAll('li:not([hidden]) .name')].map(one => one.textContent)")
     assert left and all(name in one for one in left)
     assert page.evaluate("document.querySelectorAll('li[hidden]').length") > 0

@@ -39,6 +39,8 @@ def test_what_is_typed_is_answered_as_by_the_command(viewer: Viewer, tiny) -> No
         assert _listed(objects) == ranked
         matches = sum(bool(entry["matched"]) for entry in found["instances"])
         assert objects.answer.content == (f"{matches} match" if matches else "Nothing in the scene matches.")
+    objects.text.value = "white teapot"
+    assert 'Only colour words were understood, not "teapot"' in objects.answer.content
     objects.text.value = ", not"
     assert "nothing follows" in objects.answer.content or "empty" in objects.answer.content
 
