@@ -99,10 +99,11 @@ class Objects:
         for instance in ids:
             self._leaves(instance)
             self.entries[instance] = _unseen(self.entries[instance])
+            self.parts[instance] = dict.fromkeys(self.parts[instance], 0)
 
     def copy(self, instance: int, name: str) -> int:
         """One more like this; returns its id."""
-        return self._new(_unseen(self.entries[instance]), self.parts[instance], name)
+        return self._new(_unseen(self.entries[instance]), dict.fromkeys(self.parts[instance], 0), name)
 
     def put_in(self, entry: Entry, parts: Iterable[int], name: str) -> int:
         """An object of another run; returns its id."""
@@ -159,10 +160,10 @@ class Objects:
             raise ValueError("it has no parts to split it by; instances.json says how many an instance has (num_parts)")
         entry, rows = self.entries[instance], []
         for part in named:
-            piece = entry | {"num_points": own[part]}
+            piece = entry | {"num_points": own[part]} if own[part] else _unseen(entry)
             new_id = self._new(piece, {0: own[part]}, self.unique(f"{entry['name']} part {part}"))
-            self.entries[new_id]["parent"] = entry["parent"]
-            self.dense[new_id] = set(self.dense[instance])
+            self.entries[new_id]["parent"] = piece["parent"]
+            self.dense[new_id] = set(self.dense[instance]) if own[part] else set()
             rows.append((instance, part, new_id, 0))
         pieces = [new_id for _, _, new_id, _ in rows]
         self.groups = [

@@ -138,7 +138,8 @@ class Query:
             return
         out = console(json=False)
         if not found.accepted:
-            out.print(f"nothing in the scene matches {found.text!r} ({found.encoder}); the nearest are:")
+            nearest = "; the nearest are:" if document["instances"] else ": no instance was found in it."
+            out.print(f"nothing in the scene matches {found.text!r} ({found.encoder}){nearest}")
         part = ["part"] if self.parts else []
         table = Table("", "id", *part, "name", "score", "delta", "", box=None)
         rows = document["instances"]
