@@ -203,7 +203,7 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
     names = run.results.one("cameras").names
     try:
         scene = open_scene(Path(run.document["scene"]))
-        photos = {name: f"{name}{photo.suffix}" for name, photo in zip(scene.names, scene.photos, strict=False)}
+        photos = {name: file_name(name, photo) for name, photo in zip(scene.names, scene.photos, strict=False)}
     except InputError:
         photos = {}
     files = [run.folder / "masks" / f"{name}.png" for name in names]
@@ -216,6 +216,14 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
         if name not in photos:
             photos[name] = f"{name}.{suffix_of(run.store.get(value))}"
     return masks, tuple(photos[name] for name in names)
+
+
+def file_name(view: str, photo: Path) -> str:
+    """What a COCO file calls a photo: its name, after the folders that its view is called after too (`view_names`)."""
+    above = photo.parent.parts
+    places = range(len(above), -1, -1)
+    first = next((i for i in places if "_".join([*above[i:], photo.stem]) == view), len(above))
+    return "/".join([*above[first:], photo.name])
 
 
 def _check_there(scene: Gaussians, ids: tuple[int, ...] | None, folder: Path) -> None:

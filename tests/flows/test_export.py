@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +13,8 @@ import pytest
 from tiny_runs import bytes_of, ss_flow
 
 from ss_flow.cache.store import Store
+from ss_flow.flows.cli.export import file_name
+from ss_flow.tasks.capture.names import view_names
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
@@ -111,6 +114,15 @@ def test_coco_holds_instances_that_are_in_masks_only_and_crumbs_when_they_are_na
     assert {a["instance_id"] for a in json.loads(named.read_text())["annotations"]} == {bare["id"], crumb["id"]}
     answer = export(warm, "--format", "ply", "--instance", str(bare["id"]), "--out", tmp_path / "a.ply")
     assert answer.code == 2 and "has no Gaussians" in answer.err
+
+
+def test_coco_names_photos_of_a_rig_by_the_folders_that_tell_them_from_each_other():
+    called = ("cam_1/left/0001.jpg", "cam_1/right/0001.jpg", "cam_2/0001.jpg")
+    photos = [Path("/a/images") / name for name in called]
+    views = view_names(photos)
+    assert tuple(file_name(views[photo], photo) for photo in photos) == called
+    alone = Path("/a/left/left_0001.jpg")
+    assert file_name(view_names([alone])[alone], alone) == "left_0001.jpg"
 
 
 def test_coco_can_be_given_to_a_run_as_its_masks(tiny, tmp_path):
