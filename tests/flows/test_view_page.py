@@ -98,6 +98,14 @@ def test_a_scene_without_gaussians_is_a_page_without_objects(run):
     assert "0 objects, 0 Gaussians" in html
 
 
+def test_one_is_told_as_one(run):
+    scene, cameras = run.results.one("scene"), run.results.one("cameras")
+    (entry, *_) = (entry for entry in run.instances["instances"] if entry["num_gaussians"])
+    one = select(scene, np.flatnonzero((scene.instance_id == entry["id"]) & (scene.opacities > 0.1))[:1])
+    html = page_html("one", one, start_view(cameras, scene.means), [(entry, None)])
+    assert "1 object, 1 Gaussian<" in html
+
+
 @needs_browser
 def test_the_page_asks_for_nothing_and_complains_of_nothing(page, file):
     page.evaluate("new Promise(done => setTimeout(done, 500))")
