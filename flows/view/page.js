@@ -248,7 +248,8 @@ class Orbit {
 
   lookAt(center, size) {
     this.target = center;
-    this.distance = Math.max(size / Math.tan(scene.start.fov / 2), 0.05 * this.first);
+    const { fov, near } = scene.start; // nothing nearer than that is drawn
+    this.distance = Math.max(size / Math.tan(fov / 2), 0.05 * this.first, size + near);
   }
 }
 
