@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 
 import cv2
 import numpy as np
@@ -91,6 +92,15 @@ def test_coco_says_what_the_masks_show_in_the_pixels_of_the_photos(tiny, tmp_pat
             assert mask[y : y + height, x : x + width].sum() == annotation["area"] == mask.sum()
             seen += 1
     assert seen > 4
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
+def test_masks_whose_path_is_no_text_are_read(warm, tmp_path):
+    out = warm.out.rename(tmp_path / "out\udcff")
+    answer = ss_flow("export", out, "--cache", warm.store, "--format", "coco", "--out", tmp_path / "a.json")
+    assert answer.code == 0, answer.err
+    assert json.loads((tmp_path / "a.json").read_text())["annotations"]
+    assert ss_flow("diff", out, out, "--json").code == 0
 
 
 def test_coco_can_be_given_to_a_run_as_its_masks(tiny, tmp_path):
