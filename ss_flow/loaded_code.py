@@ -42,19 +42,38 @@ def left_behind(definitions: Iterable[str]) -> str:
     return ""
 
 
+def bound_in(module_name: str) -> dict[str, list[Any]]:
+    """What the names of a module stand for, those of its classes included, with code in the place of functions.
+
+    Empty for a module that is not loaded.
+    """
+    bound = vars(sys.modules[module_name]) if module_name in sys.modules else {}
+    return {name: [getattr(_bare(held), "__code__", held) for held in _parts(value)] for name, value in bound.items()}
+
+
 def _functions(module_name: str) -> Iterator[FunctionType]:
     """The functions that a loaded module holds, and the methods of its classes, bare of what wraps them.
 
     Without those that a decorator generates.
     """
     for value in list(vars(sys.modules[module_name]).values()):
-        for held in list(vars(value).values()) if issubclass(type(value), type) else (value,):
-            if isinstance(held, staticmethod | classmethod | property):
-                held = held.fget if isinstance(held, property) else held.__func__
-            while (inner := inspect.getattr_static(held, "__wrapped__", None)) is not None:
-                held = inner
+        for held in map(_bare, _parts(value)):
             if type(held) is FunctionType and held.__code__.co_filename == _file(held.__module__):
                 yield held
+
+
+def _parts(value: Any) -> list[Any]:
+    """What a class holds; of anything else, that alone."""
+    return list(vars(value).values()) if issubclass(type(value), type) else [value]
+
+
+def _bare(held: Any) -> Any:
+    """A function without what wraps it."""
+    if isinstance(held, staticmethod | classmethod | property):
+        held = held.fget if isinstance(held, property) else held.__func__
+    while (inner := inspect.getattr_static(held, "__wrapped__", None)) is not None:
+        held = inner
+    return held
 
 
 def _file(module_name: Any) -> str | None:

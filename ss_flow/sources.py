@@ -6,16 +6,18 @@ import ast
 import functools
 import importlib.util
 import itertools
+import operator
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from blake3 import blake3
 
 from ss_flow.distributions import is_distributed
 from ss_flow.errors import ExecutorLost
-from ss_flow.loaded_code import is_as_written
+from ss_flow.loaded_code import bound_in, is_as_written
 
 STAR = "*"
 NATIVE_SOURCES = "NATIVE_SOURCES"
@@ -70,8 +72,9 @@ def source_digest(name: str) -> str:
         return ""
 
 
-_known: dict[str, tuple[object, Source | None]] = {}
-"""Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then."""
+_known: dict[str, tuple[object, Source | None, dict[str, list[Any]]]] = {}
+"""Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then. With
+what its names stood for."""
 _outdated: set[str] = set()
 """Modules that are not loaded as they were read. Ours are read as soon as they are loaded."""
 
@@ -84,7 +87,7 @@ def source_of(name: str) -> Source | None:
     if name in _outdated:
         raise ExecutorLost(f"{name} was edited after it was loaded: load it again (importlib.reload), or start anew.")
     if name not in _known:
-        _known[name] = _specification(name), _read(name)
+        _known[name] = _specification(name), _read(name), bound_in(name)
     return _known[name][1]
 
 
@@ -98,6 +101,9 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
     for name in _loaded(packages, loose, len(sys.modules)):
         specification = _specification(name)
         if name in _known and _known[name][0] is specification:
+            if name not in _outdated and _is_exchanged(name):
+                _outdated.add(name)
+                changed = True
             continue
         try:
             source = _read(name)
@@ -106,12 +112,48 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
         except (OSError, ValueError, SyntaxError, ImportError):
             continue
         changed = changed or (name in _known and _known[name][1] != source)
-        _known[name] = specification, source
+        _known[name] = specification, source, bound_in(name)
         if as_written:
             _outdated.discard(name)
         else:
             _outdated.add(name)
     return changed
+
+
+def _is_exchanged(name: str) -> bool:
+    """Whether what was edited in a module's file was put into the module, which stayed loaded, as IPython's autoreload
+    does: which state of the file that was, nobody knows."""
+    if name.startswith("ss_flow.") and "IPython" not in sys.modules:
+        return False  # it takes time, of so many modules
+    specification, source, before = _known[name]
+    now = bound_in(name)
+    exchanged = {one for one in before.keys() & now if not _are_same(before[one], now[one])}
+    if source is None or source.path.suffix != ".py" or (not exchanged and before.keys() == now.keys()):
+        return False
+    try:
+        edited = _read(name)
+        if edited is None:
+            return False
+        if edited.text == source.text:  # it was read while it was loaded, or has changed its own state since
+            _known[name] = specification, source, now
+        return not exchanged.isdisjoint(_bound_otherwise(source.text, edited.text))
+    except (OSError, ValueError, SyntaxError, ImportError):
+        return False
+
+
+def _are_same(before: list[Any], now: list[Any]) -> bool:
+    return len(before) == len(now) and all(map(operator.is_, before, now))
+
+
+@functools.lru_cache(maxsize=16)
+def _bound_otherwise(before: str, after: str) -> frozenset[str]:
+    """The names that two texts of a module bind by different statements."""
+    bound: list[set[tuple[str, str]]] = []
+    for text in (before, after):
+        statements = [statement for statement, _ in _top_level(ast.parse(text).body, ())]
+        named = ((s, [*_bound_at_top(s), *imports_of(Module("", False), [s])]) for s in statements)
+        bound.append({(name, ast.dump(statement)) for statement, names in named for name in names})
+    return frozenset(name for name, _ in bound[0] ^ bound[1])
 
 
 @functools.lru_cache(maxsize=1)
