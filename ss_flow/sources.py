@@ -127,8 +127,8 @@ def _is_exchanged(name: str) -> bool:
         return False  # it takes time, of so many modules
     specification, source, before = _known[name]
     now = bound_in(name)
-    exchanged = {one for one in before.keys() & now if not _are_same(before[one], now[one])}
-    if source is None or source.path.suffix != ".py" or (not exchanged and before.keys() == now.keys()):
+    exchanged = {one for one in before.keys() | now.keys() if not _are_same(before.get(one), now.get(one))}
+    if not exchanged or source is None or source.path.suffix != ".py":
         return False
     try:
         edited = _read(name)
@@ -141,8 +141,10 @@ def _is_exchanged(name: str) -> bool:
         return False
 
 
-def _are_same(before: list[Any], now: list[Any]) -> bool:
-    return len(before) == len(now) and all(map(operator.is_, before, now))
+def _are_same(before: list[Any] | None, now: list[Any] | None) -> bool:
+    if before is None or now is None or len(before) != len(now):
+        return False
+    return all(map(operator.is_, before, now))
 
 
 @functools.lru_cache(maxsize=16)

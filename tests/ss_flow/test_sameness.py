@@ -151,6 +151,18 @@ def test_what_was_put_into_a_module_that_stays_loaded_is_refused(store, probed, 
     assert value > 6 and happened == "finished"
 
 
+def test_what_is_put_below_the_tasks_of_a_module_before_the_first_run_is_refused(store, probed):
+    file = probed.folder / "ss_flow_probed.py"
+    text = file.read_text().replace("from probed_helper import double\n", "") + f"\n\n{HELPER}"
+    file.write_text(text)
+    steps = probed()
+    file.write_text(text.replace(HELPER, EDITED))
+    exec(EDITED, vars(steps))
+    with pytest.raises(ExecutorLost, match="ss_flow_probed was edited after it was loaded"):
+        run(store, steps, "second")
+    assert run(store, importlib.reload(steps), "second") == (7.0, "finished")
+
+
 def test_what_a_module_changes_of_itself_does_not_count_as_edited(store, probed):
     helper = probed.folder / "probed_helper.py"
     helper.write_text(f"calls = 0\n\n\n{HELPER}")
