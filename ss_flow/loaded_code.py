@@ -43,12 +43,22 @@ def left_behind(definitions: Iterable[str]) -> str:
 
 
 def bound_in(module_name: str) -> dict[str, list[Any]]:
-    """What the names of a module stand for, those of its classes included, with code in the place of functions.
+    """What the names of a module stand for, those of its own classes included, with code in the place of functions.
 
     Empty for a module that is not loaded.
     """
-    bound = vars(sys.modules[module_name]) if module_name in sys.modules else {}
-    return {name: [getattr(_bare(held), "__code__", held) for held in _parts(value)] for name, value in bound.items()}
+    bound = dict(vars(sys.modules[module_name])) if module_name in sys.modules else {}
+    found: dict[str, list[Any]] = {}
+    for name, value in bound.items():
+        is_own = issubclass(type(value), type) and value.__module__ == module_name
+        found[name] = [_code(held) for held in list(vars(value).values())] if is_own else [_code(value)]
+    return found
+
+
+def _code(held: Any) -> Any:
+    if isinstance(held, staticmethod | classmethod | property):
+        held = held.fget if isinstance(held, property) else held.__func__
+    return held.__code__ if type(held) is FunctionType else held
 
 
 def _functions(module_name: str) -> Iterator[FunctionType]:
@@ -57,23 +67,13 @@ def _functions(module_name: str) -> Iterator[FunctionType]:
     Without those that a decorator generates.
     """
     for value in list(vars(sys.modules[module_name]).values()):
-        for held in map(_bare, _parts(value)):
+        for held in list(vars(value).values()) if issubclass(type(value), type) else (value,):
+            if isinstance(held, staticmethod | classmethod | property):
+                held = held.fget if isinstance(held, property) else held.__func__
+            while (inner := inspect.getattr_static(held, "__wrapped__", None)) is not None:
+                held = inner
             if type(held) is FunctionType and held.__code__.co_filename == _file(held.__module__):
                 yield held
-
-
-def _parts(value: Any) -> list[Any]:
-    """What a class holds; of anything else, that alone."""
-    return list(vars(value).values()) if issubclass(type(value), type) else [value]
-
-
-def _bare(held: Any) -> Any:
-    """A function without what wraps it."""
-    if isinstance(held, staticmethod | classmethod | property):
-        held = held.fget if isinstance(held, property) else held.__func__
-    while (inner := inspect.getattr_static(held, "__wrapped__", None)) is not None:
-        held = inner
-    return held
 
 
 def _file(module_name: Any) -> str | None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from blake3 import blake3
 
+from ss_flow.cache.files import stamp
 from ss_flow.distributions import is_distributed
 from ss_flow.errors import ExecutorLost
 from ss_flow.loaded_code import bound_in, is_as_written
@@ -72,9 +73,10 @@ def source_digest(name: str) -> str:
         return ""
 
 
-_known: dict[str, tuple[object, Source | None, dict[str, list[Any]]]] = {}
-"""Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then. With
-what its names stood for."""
+_known: dict[str, tuple[object, Source | None]] = {}
+"""Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then."""
+_bound: dict[str, tuple[tuple[int, ...], dict[str, list[Any]]]] = {}
+"""What their names stood for then, after the stamp of the file; () where the module was still being loaded."""
 _outdated: set[str] = set()
 """Modules that are not loaded as they were read. Ours are read as soon as they are loaded."""
 
@@ -87,7 +89,8 @@ def source_of(name: str) -> Source | None:
     if name in _outdated:
         raise ExecutorLost(f"{name} was edited after it was loaded: load it again (importlib.reload), or start anew.")
     if name not in _known:
-        _known[name] = _specification(name), _read(name), bound_in(name)
+        _bound[name] = _stamp(name), bound_in(name)
+        _known[name] = _specification(name), _read(name)
     return _known[name][1]
 
 
@@ -105,6 +108,7 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
                 _outdated.add(name)
                 changed = True
             continue
+        _bound[name] = _stamp(name), bound_in(name)
         try:
             source = _read(name)
             as_written = source is None or name.startswith("ss_flow.") or is_as_written(name)
@@ -112,7 +116,7 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
         except (OSError, ValueError, SyntaxError, ImportError):
             continue
         changed = changed or (name in _known and _known[name][1] != source)
-        _known[name] = specification, source, bound_in(name)
+        _known[name] = specification, source
         if as_written:
             _outdated.discard(name)
         else:
@@ -125,17 +129,17 @@ def _is_exchanged(name: str) -> bool:
     does: which state of the file that was, nobody knows."""
     if name.startswith("ss_flow.") and "IPython" not in sys.modules:
         return False  # it takes time, of so many modules
-    specification, source, before = _known[name]
+    source, (read, before), stamp_now = _known[name][1], _bound[name], _stamp(name)
+    if source is None or source.path.suffix != ".py" or (read and read == stamp_now):
+        return False
     now = bound_in(name)
     exchanged = {one for one in before.keys() | now.keys() if not _are_same(before.get(one), now.get(one))}
-    if not exchanged or source is None or source.path.suffix != ".py":
-        return False
     try:
         edited = _read(name)
         if edited is None:
             return False
-        if edited.text == source.text:  # it was read while it was loaded, or has changed its own state since
-            _known[name] = specification, source, now
+        if edited.text == source.text:
+            _bound[name] = stamp_now, now
         return not exchanged.isdisjoint(_bound_otherwise(source.text, edited.text))
     except (OSError, ValueError, SyntaxError, ImportError):
         return False
@@ -177,11 +181,23 @@ def is_loose(name: str) -> bool:
 def forget_sources() -> None:
     """Read every module anew the next time."""
     _known.clear()
+    _bound.clear()
     _outdated.clear()
 
 
 def _specification(name: str) -> object:
     return getattr(sys.modules.get(name), "__spec__", None)
+
+
+def _stamp(name: str) -> tuple[int, ...]:
+    """The stamp of a loaded module's file; () where it has none, or is being loaded still."""
+    specification: Any = _specification(name)
+    if not getattr(specification, "has_location", False) or getattr(specification, "_initializing", False):
+        return ()
+    try:
+        return tuple(stamp(specification.origin))
+    except OSError:
+        return ()
 
 
 def _read(name: str) -> Source | None:
