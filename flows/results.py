@@ -6,10 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from ss_flow.cache.canonical import DIGEST, digests_of
 from ss_flow.cache.location import is_url, open_store
@@ -293,16 +290,6 @@ def finished_run(folder: Path, document: dict[str, Any], store: Store, needed: S
     run = FinishedRun(folder, document, read_instances(folder), Results(store, document["results"]))
     run.require(needed)
     return run
-
-
-def id_image(file: Path) -> NDArray[np.uint16]:
-    """The ids of a view, [H, W], from `masks/`. Raises InputError when the file cannot be read or is no such image."""
-    import cv2
-
-    ids = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if ids is None or ids.ndim != 2:
-        raise InputError(f"{file} cannot be read or is damaged: it is no image of ids; run the scene again.")
-    return cast("NDArray[np.uint16]", ids)
 
 
 def _read(file: Path, needed: set[str]) -> dict[str, Any]:

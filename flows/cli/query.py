@@ -27,8 +27,9 @@ from ss_flow.flows.cli.context import (
 )
 from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.query import NEEDED, described_parts, words_left_out
-from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, not_of_an_edit, read_run
+from ss_flow.flows.results import BACKGROUND, FinishedRun, not_of_an_edit, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
+from ss_flow.tasks.capture.id_images import written_ids
 from ss_flow.tasks.deliver.places import Written, check_replaceable, replacing_own, sizes
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.colour_words import ColourWords
@@ -207,7 +208,7 @@ def write_answer(
     masks: Iterator[Bool]
     if parts is None:
         ids = [row["id"] for row in matched]
-        masks = (np.isin(id_image(photo), ids) for photo in photos)
+        masks = (np.isin(written_ids(photo), ids) for photo in photos)
     else:
         shown = [part for part in parts if (part.instance_id, part.part_id) in wanted]
         masks = _on_photos(run, shown, [photo.stem for photo in photos])

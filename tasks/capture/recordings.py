@@ -18,6 +18,7 @@ from ss_flow.tasks.capture.ingest import IngestParams, frame_of, warn_of_skipped
 from ss_flow.tasks.capture.layout_scannet import read_sens_index
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_files import Photo, Pixels, inspect, pixels_of
+from ss_flow.tasks.capture.scene_files import open_video
 from ss_flow.tasks.capture.sensor_depth import in_world_units, registered_depth
 from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
@@ -58,9 +59,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
     Warns where fewer frames can be decoded than the video announces.
     Raises InputError when the video cannot be opened or shows nothing.
     """
-    import cv2
 
-    where = str(video.path)
     total = _count_frames(video.path)
     stride = max(params.stride, -(-total // params.max_frames))
     if 0 < params.stride < stride:
@@ -69,7 +68,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
             f"{params.max_frames} are to be taken (capture.video.max_frames)."
         )
     step = max(1, stride // max(1, params.candidates))
-    reader = cv2.VideoCapture(where)
+    reader = open_video(video.path)
     aspect = _pixel_aspect(reader)
     best: list[tuple[float, int, Frame]] = []
     window: tuple[float, int, np.ndarray] | None = None
@@ -99,7 +98,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
 def _count_frames(video: Path) -> int:
     import cv2
 
-    reader = cv2.VideoCapture(str(video))
+    reader = open_video(video)
     if not reader.isOpened():
         raise InputError(
             f"{video} cannot be opened as a video: it is cut short or damaged, or holds no pictures; copy it again."
@@ -168,7 +167,7 @@ def recorded_frames(
     import cv2
 
     warn_of_skipped(skipped, "without depth, or beyond the video's end")
-    reader = cv2.VideoCapture(str(recording.path))
+    reader = open_video(recording.path)
     reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     result: list[Frame] = []
     for place in range(entries[-1] + 1):

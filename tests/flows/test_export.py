@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 from pathlib import Path
 
 import cv2
@@ -123,6 +124,15 @@ def test_coco_names_photos_of_a_rig_by_the_folders_that_tell_them_from_each_othe
     assert tuple(file_name(views[photo], photo) for photo in photos) == called
     alone = Path("/a/left/left_0001.jpg")
     assert file_name(view_names([alone])[alone], alone) == "left_0001.jpg"
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
+def test_masks_whose_path_is_no_text_are_read(warm, tmp_path):
+    out = warm.out.rename(tmp_path / "out\udcff")
+    answer = ss_flow("export", out, "--cache", warm.store, "--format", "coco", "--out", tmp_path / "a.json")
+    assert answer.code == 0, answer.err
+    assert json.loads((tmp_path / "a.json").read_text())["annotations"]
+    assert ss_flow("diff", out, out, "--json").code == 0
 
 
 def test_coco_can_be_given_to_a_run_as_its_masks(tiny, tmp_path):
