@@ -13,12 +13,25 @@ T = TypeVar("T")
 _write = msgspec.json.Encoder().encode
 
 
-def read_json(content: str | bytes) -> Any:
-    """What a document holds. Raises ValueError for what is none, or is nested so deeply that it is nobody's."""
+def read_json(content: str | bytes, *, once: bool = False) -> Any:
+    """What a document holds.
+
+    once: of an object that names something twice, of which only the last would count, nothing is read.
+    Raises ValueError for what is none, or is nested so deeply that it is nobody's.
+    """
     try:
-        return json.loads(content)
+        return json.loads(content, object_pairs_hook=_named_once if once else None)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in found:
+            raise ValueError(f"{name!r} stands twice in one object")
+        found[name] = value
+    return found
 
 
 def reader(kind: type[T]) -> Callable[[bytes], T]:

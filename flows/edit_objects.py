@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
-from ss_flow.flows.results import open_finished
+from ss_flow.flows.results import open_finished, read_instances
 from ss_flow.tasks.artifacts import Cameras, Gaussians
 from ss_flow.tasks.deliver.instances_json import gaussians_placed, instance_file
 from ss_flow.tasks.deliver.palette import instance_color
@@ -100,10 +99,11 @@ class Objects:
         for instance in ids:
             self._leaves(instance)
             self.entries[instance] = _unseen(self.entries[instance])
+            self.parts[instance] = dict.fromkeys(self.parts[instance], 0)
 
     def copy(self, instance: int, name: str) -> int:
         """One more like this; returns its id."""
-        return self._new(_unseen(self.entries[instance]), self.parts[instance], name)
+        return self._new(_unseen(self.entries[instance]), dict.fromkeys(self.parts[instance], 0), name)
 
     def put_in(self, entry: Entry, parts: Iterable[int], name: str) -> int:
         """An object of another run; returns its id."""
@@ -160,10 +160,10 @@ class Objects:
             raise ValueError("it has no parts to split it by; instances.json says how many an instance has (num_parts)")
         entry, rows = self.entries[instance], []
         for part in named:
-            piece = entry | {"num_points": own[part]}
+            piece = entry | {"num_points": own[part]} if own[part] else _unseen(entry)
             new_id = self._new(piece, {0: own[part]}, self.unique(f"{entry['name']} part {part}"))
-            self.entries[new_id]["parent"] = entry["parent"]
-            self.dense[new_id] = set(self.dense[instance])
+            self.entries[new_id]["parent"] = piece["parent"]
+            self.dense[new_id] = set(self.dense[instance]) if own[part] else set()
             rows.append((instance, part, new_id, 0))
         pieces = [new_id for _, _, new_id, _ in rows]
         self.groups = [
@@ -266,13 +266,9 @@ def object_of_run(folder: Path, called: int | str) -> tuple[Entry, list[int], Pa
     """
     from ss_flow.tasks.gaussians.read_ply import read_columns
 
-    try:
-        document = json.loads((folder / "instances.json").read_text(encoding="utf-8"))
-        entries = document["instances"]
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(
-            f"{folder} is not the output folder of a run: it has no instances.json that can be read."
-        ) from None
+    if not (folder / "instances.json").is_file():
+        raise InputError(f"{folder} is not the output folder of a run: it has no instances.json.")
+    entries = read_instances(folder)["instances"]
     entry = next((e for e in entries if called in (e["id"], e["name"])), None)
     if entry is None:
         raise ValueError(f"{folder / 'instances.json'} has no object of this id or name")

@@ -24,7 +24,7 @@ T = TypeVar("T")
 _REQUIRED = cast(Any, object())
 _VERSION = 1
 _NO_TURN: tuple[Vector, float] = ((0.0, 0.0, 1.0), 0.0)
-_MOVING = ("duplicate", "transform", "recolour", "replace", "split")
+_OF_GAUSSIANS = ("duplicate", "transform", "recolour", "replace", "split")
 """Operations that need Gaussians to work on."""
 
 
@@ -193,7 +193,7 @@ class _Call:
             names = self.objects.names()
             close = _hint(value, names) if isinstance(value, str) else ""
             raise Unfit(f"no instance goes by {value!r} at this point; instances.json lists ids and names{close}")
-        if self.op in _MOVING and not self.objects.solid(found):
+        if self.op in _OF_GAUSSIANS and not self.objects.solid(found):
             raise Unfit(f"{found} has no Gaussians (too few views show it); name one that has")
         return found
 

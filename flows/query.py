@@ -8,8 +8,10 @@ from typing import Any
 from ss_flow.graph import each
 from ss_flow.tasks.artifacts import PartDescriptors, PartMasks
 from ss_flow.tasks.models.catalogue import Model
+from ss_flow.tasks.models.colour_words import ColourWords, words_ignored
 from ss_flow.tasks.semantics.describe import DescribeParams, describe_part
 from ss_flow.tasks.semantics.part_masks import part_masks
+from ss_flow.tasks.semantics.query import QueryResult
 
 NEEDED = ("ingest", "cameras", "scene", "masks")
 """The results of a run that its parts are found in."""
@@ -28,3 +30,11 @@ def described_parts(
         parts,
         build=lambda part: describe_part(nodes["ingest"], part, encoder=encoder, params=params, turns=turns),
     )
+
+
+def words_left_out(found: QueryResult) -> str:
+    """What is to be said of words that were not understood; "" where all were."""
+    if found.encoder != ColourWords.name or not (ignored := words_ignored(found.text)):
+        return ""
+    without = ", ".join(f'"{word}"' for word in ignored)
+    return f"Only colour words were understood, not {without}; `ss-flow models list` shows what reads more."

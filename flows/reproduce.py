@@ -49,11 +49,11 @@ class Variant:
     settings: tuple[str, ...] = ()
     """Parameters that differ from the preset's."""
     measure: ScanMeasure | None = None
-    """What is measured, on annotated points; none where labelled frames are measured by."""
+    """What is measured on annotated points; None where the section's protocol is one on labelled frames."""
     hints: bool = False
     """Whether masks grow from points that a user clicked."""
     subsampled: bool = True
-    """Whether every n-th frame is taken only."""
+    """Whether only every n-th frame is taken."""
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from ss_flow.cache.canonical import DIGEST, digests_of
 from ss_flow.cache.location import is_url, open_store
@@ -25,6 +22,11 @@ from ss_flow.tasks.words import first_of
 BACKGROUND = 0
 GIVEN = ("masks", "hints", "correct")
 """Options of `ss-flow run` that name files beside the capture, as run.json keeps them."""
+_OF_INSTANCE = {
+    "id", "name", "named_by", "kind", "color", "parent", "parts", "bbox", "centroid", "views", "confidence",
+    "num_parts", "num_points", "num_gaussians", "weak", "crumb", "file",
+}  # fmt: skip
+"""What instances.json says of each."""
 _KNOWN = 8
 """Instances that a message names; those whose names hold the word come first."""
 
@@ -112,10 +114,10 @@ class FinishedRun:
         """Of the instances, by their ids as text."""
         return {str(entry["id"]): entry["name"] for entry in self.instances["instances"]}
 
-    def ids(self, asked: Sequence[str]) -> tuple[int, ...]:
+    def ids(self, asked: Sequence[str], *, solid: bool = True) -> tuple[int, ...]:
         """The ids of instances given by id or by name, ascending; 0 is the background.
 
-        Raises InputError for one that the run does not have, or that has no Gaussians.
+        solid: whether they must have Gaussians. Raises InputError for one that the run does not have, or that has none.
         """
         entries = self.instances["instances"]
         by_name = {entry["name"]: entry for entry in entries}
@@ -133,7 +135,7 @@ class FinishedRun:
                 raise InputError(
                     f"--instance {word!r} is no instance of {self.folder}; there are 0 (background), {known}{where}."
                 )
-            if not entry["num_gaussians"]:
+            if solid and not entry["num_gaussians"]:
                 raise InputError(f"instance {entry['id']} ({entry['name']}) of {self.folder} has no Gaussians.")
             found.add(int(entry["id"]))
         return tuple(sorted(found))
@@ -164,9 +166,10 @@ class FinishedRun:
 
         return run_html(self)
 
-    def all_ids(self) -> tuple[int, ...]:
-        """The instances that have a file of their own, ascending."""
-        return tuple(sorted(int(entry["id"]) for entry in self.instances["instances"] if entry["file"]))
+    def all_ids(self, *, solid: bool = True) -> tuple[int, ...]:
+        """The instances that have a file of their own, ascending; unless `solid`, all but crumbs."""
+        entries = self.instances["instances"]
+        return tuple(sorted(e["id"] for e in entries if (e["file"] if solid else not e["crumb"])))
 
 
 def of_type(store: Store, run: Run, kind: type) -> list[Any]:
@@ -189,6 +192,22 @@ def read_run(folder: Path) -> dict[str, Any]:
     if not isinstance(results, dict) or not all(map(_are_digests, results.values())):
         raise InputError(f"{folder / RUN_FILE} is damaged: its results are no digests; run the scene again.")
     return document
+
+
+def read_instances(folder: Path) -> dict[str, Any]:
+    """The document instances.json of an output folder. Raises InputError when there is none, or it is damaged."""
+    file = folder / "instances.json"
+    document = _read(file, {"instances", "groups"})
+    if not isinstance(document["instances"], list) or not all(map(_is_instance, document["instances"])):
+        raise InputError(f"{file} is damaged: an instance lacks what a run writes of it; run the scene again.")
+    return document
+
+
+def _is_instance(entry: Any) -> bool:
+    """Whether this says what a run writes of an instance."""
+    if not isinstance(entry, dict) or not entry.keys() >= _OF_INSTANCE:
+        return False
+    return isinstance(entry["id"], int) and isinstance(entry["name"], str) and isinstance(entry["file"], str | None)
 
 
 def _are_digests(value: Any) -> bool:
@@ -268,20 +287,9 @@ def finished_run(folder: Path, document: dict[str, Any], store: Store, needed: S
     document: its run.json. needed: the results that the store must still hold.
     Raises InputError when instances.json is damaged, or one of these is gone.
     """
-    instances = _read(folder / "instances.json", {"instances"})
-    run = FinishedRun(folder, document, instances, Results(store, document["results"]))
+    run = FinishedRun(folder, document, read_instances(folder), Results(store, document["results"]))
     run.require(needed)
     return run
-
-
-def id_image(file: Path) -> NDArray[np.uint16]:
-    """The ids of a view, [H, W], from `masks/`. Raises InputError when the file cannot be read or is no such image."""
-    import cv2
-
-    ids = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if ids is None or ids.ndim != 2:
-        raise InputError(f"{file} cannot be read or is damaged: it is no image of ids; run the scene again.")
-    return cast("NDArray[np.uint16]", ids)
 
 
 def _read(file: Path, needed: set[str]) -> dict[str, Any]:

@@ -33,12 +33,16 @@ R = TypeVar("R")
 
 
 def splat(capture: Capture, found: Split, networks: Networks, params: Params) -> dict[str, Any]:
-    """Instances -> Gaussians, each on its own; refined masks; one scene (Split&Splat, Sec. 3.2)."""
+    """Instances -> Gaussians, each on its own; refined masks; one scene (Split&Splat, Sec. 3.2).
+
+    What is built for an instance takes its row in `found.instances`: a step for one row depends on no other's.
+    """
     views = capture.views
     settings, visibility = params.splat, params.split.visibility.of_splat()
 
     @functools.cache
     def reconstructed(row: int) -> Gaussians:
+        """G_l, from the instance's own pixels (Sec. 3.2.1)."""
         return of_instance(
             found,
             row,
@@ -49,6 +53,7 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
 
     @functools.cache
     def refined(row: int) -> InstanceMasks:
+        """M^_l, its masks as M^gs and the segmenter mend them (Sec. 3.2.2)."""
         return of_instance(
             found,
             row,
@@ -64,6 +69,7 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
         )
 
     def retrained(row: int) -> Gaussians:
+        """G_l once more, where its masks have changed."""
         return of_instance(
             found,
             row,
@@ -84,6 +90,8 @@ def splat(capture: Capture, found: Split, networks: Networks, params: Params) ->
     with labelled("splat"):
         masks_refined = resolve_refined(views, masks_of_each, params=settings.resolve, visibility=visibility)
         shown = shown_in(masks_refined)
+
+    # One scene (Sec. 3.2.3): pairs that collide, where parameters ask for them; then all at once, with the background.
     merged = merge_rounds(views, of_each(retrained), masks_refined, shown, params, 0)
     assembled = assemble(merged)
     last = settings.merge.of_last_pass()
@@ -124,8 +132,8 @@ def described(
     masks: Callable[[int], InstanceMasks],
     gaussians: Callable[[int], Gaussians],
 ) -> tuple[Descriptors, ...]:
-    """The descriptors of all instances; masks, gaussians: the nodes of an instance's own, by its row."""
-
+    """The descriptors of all instances (f_obj; Sec. 5.2); masks, gaussians: the nodes of an instance's own, by its
+    row."""
     describing = params.semantics.describe.in_use(networks.encoder)
 
     def build(row: int, seen: list[int]) -> Descriptors:
@@ -169,9 +177,9 @@ def merge_rounds(
     params: Params,
     number: int,
 ) -> tuple[Gaussians, ...]:
-    """Merge the pairs that collide, disjoint pairs side by side, until none is left (spec P4).
+    """Merge the pairs that collide, disjoint pairs side by side, until none is left (Split&Splat, Sec. 3.2.3; spec P4).
 
-    shown: which views show which instance.
+    shown: which views show which instance. number: of the round, from 0.
     """
 
     def build(planned: MergePlan) -> tuple[Gaussians, ...]:

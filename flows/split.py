@@ -59,19 +59,23 @@ class Networks:
 
 @dataclass(frozen=True)
 class Split:
-    """Nodes of the first half, by the artifacts that they stand for."""
+    """Nodes of the first half, by the artifacts that they stand for; the paper's signs in brackets."""
 
     points: PointCloud
+    """The dense points (P_dense)."""
     visibility: tuple[Visibility, ...]
+    """Those that each view sees (P_k)."""
     masks: tuple[MaskSet, ...]
+    """What the segmenter found in each view (M_k)."""
     pieces: PointLabels
-    """The leaves of the tree."""
+    """The labels that the views voted for (l_p): the leaves of the tree."""
     tree: Hierarchy
     labels: PointLabels
-    """The instances, which the cut through the tree leaves, boards apart, and as the user corrected them."""
+    """The instances, which the cut through the tree leaves, boards apart, and as the user corrected them (P_labeled;
+    in the paper the pieces themselves)."""
     parts: PointParts
     instances: tuple[InstanceMasks, ...]
-    """The background first."""
+    """With their masks in all views (M~); the background first."""
     appearances: Appearances
     """The views that see each of them."""
     embeddings: tuple[Embedding, ...]
@@ -92,13 +96,9 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
             build=lambda frame: embed(frame, model=segmenter, turns=capture.turns),
         )
     seen = _seen(capture, points, params)
-    hinted: PointLabels | None = None
-    if capture.masks is not None:
-        masks = capture.masks
-    elif capture.clicks is not None:
-        masks, hinted = _masks_of_hints(capture, capture.clicks, embeddings, points, seen, segmenter, params)
-    else:
-        masks = _masks_of_views(capture, embeddings, segmenter, params)
+    masks, hinted = _masks(capture, embeddings, points, seen, segmenter, params)
+
+    # Which masks of all views show one object (Sec. 3.1.3).
     observed = each(
         seen,
         masks,
@@ -109,28 +109,25 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     if capture.clicks is not None:  # what was clicked as two objects stays two, and what was clicked as one, one
         propagating, granularity = replace(propagating, touching_merge=False, apart=False), 1.0
     pieces = propagate(points, seen, observed, params=propagating.in_use())
-    counted = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
-    tree = hierarchy(points, capture.cameras, seen, pieces, counted, params=params.hierarchy)
-    labels = cut(pieces, tree, granularity=granularity)
-    shown, joined = masks, labels
+
+    # Which of these objects are pieces of one thing (beyond the paper).
+    tallies = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
+    tree = hierarchy(points, capture.cameras, seen, pieces, tallies, params=params.hierarchy)
+    things = cut(pieces, tree, granularity=granularity)
     nested = find_parts(observed, masks, pieces, params=params.parts)
-    if params.boards.rises and capture.masks is None and capture.clicks is None:  # what the user showed stays
-        labels = part_boards(points, capture.cameras, labels, tree, params=params.boards)
-    if capture.corrections is not None:
-        by_clicks: list[PointLabels] = []
-        if segmenter is not None:
-            clicked = _clicked(capture, capture.corrections, embeddings, segmenter, params, apart=True)
-            by_clicks = [_labelled(points, seen, clicked, params)]
-        labels = correct(points, seen, capture.corrections, pieces, labels, by_clicks, names=capture.things)
-    if labels is not joined:
+    labels = _divided(capture, embeddings, points, seen, pieces, tree, things, segmenter, params)
+    shown = masks
+    if labels is not things:
         contained = params.segment.contained
         shown = each(
             seen,
             masks,
             names=capture.names,
-            build=lambda visible, pool: part_masks(visible, pool, joined, labels, contained=contained),
+            build=lambda visible, pool: part_masks(visible, pool, things, labels, contained=contained),
         )
     parts = cut_parts(pieces, nested, labels)
+
+    # The labelled points as masks again (Sec. 3.1.3, last part).
     prompted: tuple[PromptedMasks, ...] = ()
     if segmenter is not None and capture.masks is None:
         prompted = _prompted(capture, embeddings, seen, shown, labels, segmenter, params)
@@ -141,7 +138,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
 
 
 def _dense_points(capture: Capture, params: SplitParams) -> PointCloud:
-    """The points that labels are given to."""
+    """The points that labels are given to (P_dense; Sec. 3.1.2)."""
     views = (capture.frames, capture.cameras)
     if params.dense_source == "splatting":
         return dense_splatting(
@@ -151,7 +148,7 @@ def _dense_points(capture: Capture, params: SplitParams) -> PointCloud:
 
 
 def _seen(capture: Capture, points: PointCloud, params: SplitParams) -> tuple[Visibility, ...]:
-    """Which points each view sees: by depth, and by their colour where it has none."""
+    """Which points each view sees: by depth (P_k; Eq. 1, 2), and by their colour where it has none."""
     seen = each(
         capture.by_view,
         capture.presumed,
@@ -170,6 +167,23 @@ def _seen(capture: Capture, points: PointCloud, params: SplitParams) -> tuple[Vi
             points, camera, depth, frame, visible, color=params.visible_color
         ),
     )
+
+
+def _masks(
+    capture: Capture,
+    embeddings: tuple[Embedding, ...],
+    points: PointCloud,
+    seen: tuple[Visibility, ...],
+    segmenter: Model | None,
+    params: SplitParams,
+) -> tuple[tuple[MaskSet, ...], PointLabels | None]:
+    """The masks of all views (M_k; Sec. 3.1.1): the capture's own, those of clicked objects, or the segmenter's; and
+    the points labelled by the objects that were clicked, where some were."""
+    if capture.masks is not None:
+        return capture.masks, None
+    if capture.clicks is not None:
+        return _masks_of_hints(capture, capture.clicks, embeddings, points, seen, segmenter, params)
+    return _masks_of_views(capture, embeddings, segmenter, params), None
 
 
 def _masks_of_views(
@@ -246,6 +260,31 @@ def _clicked(
             EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter, apart=apart
         ),
     )
+
+
+def _divided(
+    capture: Capture,
+    embeddings: tuple[Embedding, ...],
+    points: PointCloud,
+    seen: tuple[Visibility, ...],
+    pieces: PointLabels,
+    tree: Hierarchy,
+    things: PointLabels,
+    segmenter: Model | None,
+    params: SplitParams,
+) -> PointLabels:
+    """The instances after what masks cannot tell: boards apart from what rises from them, then the user's corrections
+    (beyond the paper). Things come back as they are where there is neither."""
+    labels = things
+    if params.boards.rises and capture.masks is None and capture.clicks is None:  # what the user showed stays
+        labels = part_boards(points, capture.cameras, labels, tree, params=params.boards)
+    if capture.corrections is not None:
+        by_clicks: list[PointLabels] = []
+        if segmenter is not None:
+            clicked = _clicked(capture, capture.corrections, embeddings, segmenter, params, apart=True)
+            by_clicks = [_labelled(points, seen, clicked, params)]
+        labels = correct(points, seen, capture.corrections, pieces, labels, by_clicks, names=capture.things)
+    return labels
 
 
 def _prompted(

@@ -66,23 +66,25 @@ def split_splat(capture: Capture, held_out: Capture | None, networks: Networks, 
         "truth": capture.truth,
     }
     results = {name: nodes for name, nodes in known.items() if nodes is not None}
-    void = params.evaluate.zero_is_void is not False
-    if capture.truth is not None:
-        with labelled("split"):
-            results["metrics_split"] = evaluate_masks(
-                masks_split, capture.truth, found.tree, capture.frames, zero_is_void=void
-            )
+
+    def measure(stage: str, masks: str) -> None:
+        if capture.truth is not None and masks in results:
+            with labelled(stage):
+                results[f"metrics_{stage}"] = evaluate_masks(
+                    results[masks],
+                    capture.truth,
+                    found.tree,
+                    capture.frames,
+                    zero_is_void=params.evaluate.zero_is_void is not False,
+                )
+
+    measure("split", "masks_split")
     if capture.given is None:
         results |= splat(capture, found, networks, params)
     else:
         results |= {"given_scene": capture.given} | label_given(capture, found, masks_split, networks, params)
-    if capture.truth is not None:
-        for stage, masks in (("refined", "masks_refined"), ("splat", "masks")):
-            if masks in results:
-                with labelled(stage):
-                    results[f"metrics_{stage}"] = evaluate_masks(
-                        results[masks], capture.truth, found.tree, capture.frames, zero_is_void=void
-                    )
+    measure("refined", "masks_refined")
+    measure("splat", "masks")
     if held_out is not None:
         results |= {"ingest_held_out": held_out.frames, "cameras_held_out": held_out.cameras}
         if held_out.truth is not None:

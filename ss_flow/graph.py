@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args, overload
 
 if TYPE_CHECKING:
     from ss_flow.task import Task
@@ -225,12 +225,7 @@ def gather(nodes: Sequence[A]) -> tuple[A, ...]:
 
     Raises TypeError when one of them is not a node.
     """
-    for node in nodes:
-        if not isinstance(node, Node):
-            raise TypeError(f"an input of a task in a flow must be a node, not {type(node).__name__}")
-        if node.flow is not _building():
-            raise TypeError(f"{node.label} is a node of another flow")
-    return cast(tuple[A, ...], _gathered(list(nodes), "fail"))
+    return cast(tuple[A, ...], _gathered(_nodes(nodes, "an input of a task in a flow"), "fail"))
 
 
 def pick(nodes: Sequence[A], positions: Iterable[int]) -> tuple[A, ...]:
@@ -242,6 +237,17 @@ def pick(nodes: Sequence[A], positions: Iterable[int]) -> tuple[A, ...]:
         raise TypeError(f"pick takes a node that stands for a list, not a {type(nodes).__name__}")
     picked = Pick(_building(), nodes.step, nodes.item, nodes, tuple(positions))
     return cast(tuple[A, ...], picked)
+
+
+def _nodes(values: Iterable[Any], what: str) -> list[Any]:
+    """The same, where they are nodes of the flow that is being built; what: what they are, for a message."""
+    nodes = list(values)
+    for node in nodes:
+        if not isinstance(node, Node):
+            raise TypeError(f"{what} must be a node, not {type(node).__name__}")
+        if node.flow is not _building():
+            raise TypeError(f"{node.label} is a node of another flow")
+    return nodes
 
 
 def _gathered(items: list[Any], on_error: OnError) -> Gather:
@@ -279,21 +285,26 @@ def each(
     lists: nodes that stand for lists, one at least, or INDEX. build: takes one node of every list, and the position of
     the item for INDEX; returns a node. names: what to call the items (say, the frames' names). on_error: with "skip",
     an item that fails is left out, and the run is degraded. Returns a node that stands for the list of the results.
+    Raises TypeError when a list is no node, ValueError for another `on_error`.
     """
     flow = _building()
-    sources = [source for source in lists if source is not INDEX]
+    if on_error not in get_args(OnError):
+        raise ValueError(f"on_error is {on_error!r}; it must be one of {', '.join(get_args(OnError))}")
+    sources = _nodes([one for one in lists if one is not INDEX], "what `each` goes through")
     if not sources:
         raise TypeError("each needs a list to go through; INDEX alone says no length")
 
     def build_list(*lengths: int) -> Node:
         if len(set(lengths)) != 1:
             raise ValueError(f"lists of different lengths side by side: {lengths}")
+        if names and len(names) < lengths[0]:
+            raise ValueError(f"{len(names)} names for the {lengths[0]} items of a list")
         items = []
         with flow.building():
             for index in range(lengths[0]):
                 _item.set(names[index] if names else str(index))
                 items.append(build(*(index if source is INDEX else source[index] for source in lists)))
-        return _gathered(items, on_error)
+        return _gathered(_nodes(items, "what `build` returns for an item"), on_error)
 
     return Expand(flow, "each", _item.get(), sources, build_list, loads=False)
 
@@ -304,7 +315,8 @@ def expand(plan: A, build: Callable[[A], R]) -> R:
     Of a list, `build` gets the number of its items: none is loaded.
     """
     flow = _building()
-    node = Expand(flow, "expand", _item.get(), [cast(Any, plan)], cast(Any, build), loads=True)
+    sources = _nodes([plan], "what `expand` waits for")
+    node = Expand(flow, "expand", _item.get(), sources, cast(Any, build), loads=True)
     return cast(R, node)
 
 
@@ -314,7 +326,8 @@ def otherwise(node: R, build: Callable[[], R]) -> R:
     The run is then degraded.
     """
     flow = _building()
-    return cast(R, Otherwise(flow, "otherwise", _item.get(), cast(Any, node), cast(Any, build)))
+    (source,) = _nodes([node], "what `otherwise` replaces")
+    return cast(R, Otherwise(flow, "otherwise", _item.get(), source, cast(Any, build)))
 
 
 def stored(name: str, value: str | Sequence[str]) -> Any:

@@ -42,6 +42,25 @@ def left_behind(definitions: Iterable[str]) -> str:
     return ""
 
 
+def bound_in(module_name: str) -> dict[str, list[Any]]:
+    """What the names of a module stand for, those of its own classes included, with code in the place of functions.
+
+    Empty for a module that is not loaded.
+    """
+    bound = dict(vars(sys.modules[module_name])) if module_name in sys.modules else {}
+    found: dict[str, list[Any]] = {}
+    for name, value in bound.items():
+        is_own = issubclass(type(value), type) and value.__module__ == module_name
+        found[name] = [_code(held) for held in list(vars(value).values())] if is_own else [_code(value)]
+    return found
+
+
+def _code(held: Any) -> Any:
+    if isinstance(held, staticmethod | classmethod | property):
+        held = held.fget if isinstance(held, property) else held.__func__
+    return held.__code__ if type(held) is FunctionType else held
+
+
 def _functions(module_name: str) -> Iterator[FunctionType]:
     """The functions that a loaded module holds, and the methods of its classes, bare of what wraps them.
 

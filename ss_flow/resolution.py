@@ -194,10 +194,11 @@ class Resolution:
             return value
         if isinstance(value, str):
             return self._fail(node, TypeError(f"{node.label} is of a list, but its source is a single artifact"))
-        try:
-            return tuple(value[position] for position in positions)
-        except IndexError:
-            return self._fail(node, IndexError(f"{node.label} is not among the {len(value)} items of its list"))
+        for position in positions:
+            if not -len(value) <= position < len(value):
+                said = f"item {position} is not among the {len(value)} items of {source.label}"
+                return self._fail(node, IndexError(said))
+        return tuple(value[position] for position in positions)
 
     def _fail(self, node: Node, error: Exception) -> Failure:
         failure = Failure(node.label, error)

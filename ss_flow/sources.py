@@ -6,16 +6,19 @@ import ast
 import functools
 import importlib.util
 import itertools
+import operator
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from blake3 import blake3
 
+from ss_flow.cache.files import stamp
 from ss_flow.distributions import is_distributed
 from ss_flow.errors import ExecutorLost
-from ss_flow.loaded_code import is_as_written
+from ss_flow.loaded_code import bound_in, is_as_written
 
 STAR = "*"
 NATIVE_SOURCES = "NATIVE_SOURCES"
@@ -72,6 +75,8 @@ def source_digest(name: str) -> str:
 
 _known: dict[str, tuple[object, Source | None]] = {}
 """Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then."""
+_bound: dict[str, tuple[tuple[int, ...], dict[str, list[Any]]]] = {}
+"""What their names stood for then, after the stamp of the file; () where the module was still being loaded."""
 _outdated: set[str] = set()
 """Modules that are not loaded as they were read. Ours are read as soon as they are loaded."""
 
@@ -84,6 +89,7 @@ def source_of(name: str) -> Source | None:
     if name in _outdated:
         raise ExecutorLost(f"{name} was edited after it was loaded: load it again (importlib.reload), or start anew.")
     if name not in _known:
+        _bound[name] = _stamp(name), bound_in(name)
         _known[name] = _specification(name), _read(name)
     return _known[name][1]
 
@@ -98,7 +104,11 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
     for name in _loaded(packages, loose, len(sys.modules)):
         specification = _specification(name)
         if name in _known and _known[name][0] is specification:
+            if name not in _outdated and _is_exchanged(name):
+                _outdated.add(name)
+                changed = True
             continue
+        _bound[name] = _stamp(name), bound_in(name)
         try:
             source = _read(name)
             as_written = source is None or name.startswith("ss_flow.") or is_as_written(name)
@@ -112,6 +122,44 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
         else:
             _outdated.add(name)
     return changed
+
+
+def _is_exchanged(name: str) -> bool:
+    """Whether what was edited in a module's file was put into the module, which stayed loaded, as IPython's autoreload
+    does: which state of the file that was, nobody knows."""
+    if name.startswith("ss_flow.") and "IPython" not in sys.modules:
+        return False  # it takes time, of so many modules
+    source, (read, before), stamp_now = _known[name][1], _bound[name], _stamp(name)
+    if source is None or source.path.suffix != ".py" or (read and read == stamp_now):
+        return False
+    now = bound_in(name)
+    exchanged = {one for one in before.keys() | now.keys() if not _are_same(before.get(one), now.get(one))}
+    try:
+        edited = _read(name)
+        if edited is None:
+            return False
+        if edited.text == source.text:
+            _bound[name] = stamp_now, now
+        return not exchanged.isdisjoint(_bound_otherwise(source.text, edited.text))
+    except (OSError, ValueError, SyntaxError, ImportError):
+        return False
+
+
+def _are_same(before: list[Any] | None, now: list[Any] | None) -> bool:
+    if before is None or now is None or len(before) != len(now):
+        return False
+    return all(map(operator.is_, before, now))
+
+
+@functools.lru_cache(maxsize=16)
+def _bound_otherwise(before: str, after: str) -> frozenset[str]:
+    """The names that two texts of a module bind by different statements."""
+    bound: list[set[tuple[str, str]]] = []
+    for text in (before, after):
+        statements = [statement for statement, _ in _top_level(ast.parse(text).body, ())]
+        named = ((s, [*_bound_at_top(s), *imports_of(Module("", False), [s])]) for s in statements)
+        bound.append({(name, ast.dump(statement)) for statement, names in named for name in names})
+    return frozenset(name for name, _ in bound[0] ^ bound[1])
 
 
 @functools.lru_cache(maxsize=1)
@@ -133,11 +181,23 @@ def is_loose(name: str) -> bool:
 def forget_sources() -> None:
     """Read every module anew the next time."""
     _known.clear()
+    _bound.clear()
     _outdated.clear()
 
 
 def _specification(name: str) -> object:
     return getattr(sys.modules.get(name), "__spec__", None)
+
+
+def _stamp(name: str) -> tuple[int, ...]:
+    """The stamp of a loaded module's file; () where it has none, or is being loaded still."""
+    specification: Any = _specification(name)
+    if not getattr(specification, "has_location", False) or getattr(specification, "_initializing", False):
+        return ()
+    try:
+        return tuple(stamp(specification.origin))
+    except OSError:
+        return ()
 
 
 def _read(name: str) -> Source | None:

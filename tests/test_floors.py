@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
 from pathlib import Path
 
@@ -46,6 +47,22 @@ def test_every_package_is_installed():
         for place in (ROOT / floor).rglob("__init__.py")
     ]
     assert sorted(listed) == sorted(found)
+
+
+@pytest.mark.parametrize(
+    "package",
+    [place.parent for floor in ("tasks", "flows") for place in sorted((ROOT / floor).rglob("__init__.py"))],
+    ids=lambda package: str(package.relative_to(ROOT)),
+)
+def test_a_package_that_says_what_its_modules_are_names_them_all(package):
+    said = ast.get_docstring(ast.parse((package / "__init__.py").read_text()))
+    if said is None or "`" not in said:
+        assert package.name in ("cli", "generated", "view")
+        return
+    modules = {place.stem for place in package.glob("*.py")} - {"__init__"}
+    inner = {place.parent.name for place in package.glob("*/__init__.py")}
+    named = set(re.findall(r"`(\w+)`", said))
+    assert modules | inner <= named
 
 
 def imported(tree: ast.AST):

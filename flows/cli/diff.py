@@ -18,7 +18,8 @@ from rich.table import Table
 from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import console
 from ss_flow.flows.cli.telling import print_table
-from ss_flow.flows.results import id_image, read_run
+from ss_flow.flows.results import read_run
+from ss_flow.tasks.capture.id_images import written_ids
 from ss_flow.tasks.evaluate.comparison import Correspondence, correspondence
 
 _SHOWN = 10
@@ -135,7 +136,7 @@ def _views_of_both(first: Path, second: Path) -> list[tuple[Path, Path]]:
 
 def _id_images(views: list[tuple[Path, Path]]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     for files in views:
-        a, b = map(id_image, files)
+        a, b = map(written_ids, files)
         if a.shape != b.shape:
             raise InputError(f"{files[0]} and {files[1]} differ in size; diff compares runs of the same photos.")
         yield a, b

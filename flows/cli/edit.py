@@ -53,7 +53,7 @@ class EditRun:
 
 def _read_script(file: Path) -> Any:
     try:
-        return read_json(file.read_text(encoding="utf-8-sig"))
+        return read_json(file.read_text(encoding="utf-8-sig"), once=True)
     except OSError as error:
         raise InputError(f"the edit script {file} cannot be read: {error.strerror}.") from None
     except ValueError as error:

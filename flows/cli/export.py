@@ -68,7 +68,10 @@ class Export:
         run = open_run(self.result, self.store, ("scene", "cameras", *_ALSO_NEEDED.get(self.format, ())))
         several = self.each or self.format in formats.MESHES
         by_instance = several or self.format == "coco" or self.format in formats.SURFACES
-        ids = run.ids(self.instance) if self.instance else run.all_ids() if by_instance else None
+        solid = self.format != "coco"  # masks show instances without Gaussians, too
+        ids = (
+            run.ids(self.instance, solid=solid) if self.instance else run.all_ids(solid=solid) if by_instance else None
+        )
         folder = several or workspace
         out = self.out or Path("ss-flow-export") / f"{run.name}{self._ending(ids or (), folder=folder)}"
         self._check_place(out, run.store.location, folder=folder)
@@ -77,11 +80,12 @@ class Export:
                 raise not_of_an_edit(run.folder, run.document, "photos")
             return self._write_workspace(out, run)
         if ids == ():
+            lack = "has a file of its own" if solid else "is more than a crumb"
             raise InputError(
-                f"no instance of {run.folder} has a file of its own (instances.json), so there is nothing to export; "
-                "--instance names others, 0 the background."
+                f"no instance of {run.folder} {lack} (instances.json), so there is nothing to export; --instance names "
+                "others, 0 the background."
             )
-        if self.format != "coco":
+        if solid:
             _check_there(run.results.one("scene"), ids, run.folder)
         pixels = _masks_and_photos(run) if self.format == "coco" else ((), ())
 
@@ -199,7 +203,7 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
     names = run.results.one("cameras").names
     try:
         scene = open_scene(Path(run.document["scene"]))
-        photos = {name: f"{name}{photo.suffix}" for name, photo in zip(scene.names, scene.photos, strict=False)}
+        photos = {name: file_name(name, photo) for name, photo in zip(scene.names, scene.photos, strict=False)}
     except InputError:
         photos = {}
     files = [run.folder / "masks" / f"{name}.png" for name in names]
@@ -212,6 +216,14 @@ def _masks_and_photos(run: FinishedRun) -> tuple[tuple[FileRef, ...], tuple[str,
         if name not in photos:
             photos[name] = f"{name}.{suffix_of(run.store.get(value))}"
     return masks, tuple(photos[name] for name in names)
+
+
+def file_name(view: str, photo: Path) -> str:
+    """What a COCO file calls a photo: its name, after the folders that its view is called after too (`view_names`)."""
+    above = photo.parent.parts
+    places = range(len(above), -1, -1)
+    first = next((i for i in places if "_".join([*above[i:], photo.stem]) == view), len(above))
+    return "/".join([*above[first:], photo.name])
 
 
 def _check_there(scene: Gaussians, ids: tuple[int, ...] | None, folder: Path) -> None:

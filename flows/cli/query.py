@@ -26,12 +26,13 @@ from ss_flow.flows.cli.context import (
     open_run,
 )
 from ss_flow.flows.cli.telling import print_table
-from ss_flow.flows.query import NEEDED, described_parts
-from ss_flow.flows.results import BACKGROUND, FinishedRun, id_image, not_of_an_edit, read_run
+from ss_flow.flows.query import NEEDED, described_parts, words_left_out
+from ss_flow.flows.results import BACKGROUND, FinishedRun, not_of_an_edit, read_run
 from ss_flow.tasks.artifacts import Bool, PartMasks
+from ss_flow.tasks.capture.id_images import written_ids
 from ss_flow.tasks.deliver.places import Written, check_replaceable, replacing_own, sizes
 from ss_flow.tasks.models.catalogue import Model
-from ss_flow.tasks.models.colour_words import ColourWords, words_ignored
+from ss_flow.tasks.models.colour_words import ColourWords
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams, QueryResult, query
 
@@ -138,7 +139,8 @@ class Query:
             return
         out = console(json=False)
         if not found.accepted:
-            out.print(f"nothing in the scene matches {found.text!r} ({found.encoder}); the nearest are:")
+            nearest = "; the nearest are:" if document["instances"] else ": no instance was found in it."
+            out.print(f"nothing in the scene matches {found.text!r} ({found.encoder}){nearest}")
         part = ["part"] if self.parts else []
         table = Table("", "id", *part, "name", "score", "delta", "", box=None)
         rows = document["instances"]
@@ -151,9 +153,8 @@ class Query:
         print_table(table, out)
         if len(shown) < len(rows):
             out.print(f"{len(rows) - len(shown)} more are farther off; --json names all.")
-        if found.encoder == ColourWords.name and (ignored := words_ignored(found.text)):
-            without = ", ".join(f'"{word}"' for word in ignored)
-            out.print(f"Only colour words were understood, not {without}; `ss-flow models list` shows what reads more.")
+        if lacking := words_left_out(found):
+            out.print(lacking)
 
 
 def query_params(document: dict[str, Any]) -> QueryParams:
@@ -207,7 +208,7 @@ def write_answer(
     masks: Iterator[Bool]
     if parts is None:
         ids = [row["id"] for row in matched]
-        masks = (np.isin(id_image(photo), ids) for photo in photos)
+        masks = (np.isin(written_ids(photo), ids) for photo in photos)
     else:
         shown = [part for part in parts if (part.instance_id, part.part_id) in wanted]
         masks = _on_photos(run, shown, [photo.stem for photo in photos])

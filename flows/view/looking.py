@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64
+from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 from ss_flow.tasks.geometry.cameras import camera_extent, camera_of, cameras_by_view, pixels_in_view, up_of
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def start_view(cameras: Cameras, points: Float32) -> Viewpoint:
 
 def view_of_object(cameras: Cameras, points: Float32, fov: float) -> tuple[Float64, Float64]:
     """[3] from where, [3] to where: from the side of the view of the capture that has most of an object, as near as
-    shows it whole, and no farther. World units.
+    shows it whole, and no farther; a tiny one from where it is still drawn. World units.
 
     points: [N, 3] its centres, N > 0. fov: vertical, of who looks, in radians.
     """
@@ -57,7 +58,7 @@ def view_of_object(cameras: Cameras, points: Float32, fov: float) -> tuple[Float
     angle = [float((1 / pixels_in_view(some, camera)[3] ** 2).sum()) for camera in cameras_by_view(cameras)]
     away = camera_of(cameras, int(np.argmax(angle))).center - center
     radius = float(np.quantile(np.linalg.norm(some - center, axis=1), 0.95))
-    near = radius / np.sin(_OF_PICTURE * fov / 2)
+    near = max(radius / np.sin(_OF_PICTURE * fov / 2), radius + NEAR_PLANE)
     return center + away * min(1.0, near / np.linalg.norm(away)), center
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ss_flow.errors import InputError
+from ss_flow.flows.query import words_left_out
 from ss_flow.flows.results import BACKGROUND
 from ss_flow.flows.view.search import Search
 from ss_flow.flows.view.session import Session
@@ -154,6 +155,7 @@ class ObjectList:
                     self._found = self._search(text, tau)
                     matches = len(self._found.matches())
                     answer = f"{matches} match" if self._found.accepted else "Nothing in the scene matches."
+                    answer = "\n\n".join(filter(None, [answer, words_left_out(self._found)]))
                 except InputError as error:
                     answer = str(error)
             self.answer.content = answer

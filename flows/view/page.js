@@ -248,7 +248,8 @@ class Orbit {
 
   lookAt(center, size) {
     this.target = center;
-    this.distance = Math.max(size / Math.tan(scene.start.fov / 2), 0.05 * this.first);
+    const { fov, near } = scene.start; // nothing nearer than that is drawn
+    this.distance = Math.max(size / Math.tan(fov / 2), 0.05 * this.first, size + near);
   }
 }
 
@@ -385,7 +386,7 @@ async function start() {
     redraw(false);
   });
   document.getElementById("search").addEventListener("input", (event) => {
-    const words = event.target.value.toLowerCase();
+    const words = event.target.value.trim().toLowerCase(); // phones put a space behind a word
     for (const object of scene.objects) rows.get(object.id).hidden = !object.name.toLowerCase().includes(words);
     document.getElementById("none").hidden = [...rows.values()].some((row) => !row.hidden);
   });

@@ -70,12 +70,13 @@ def page_html(
     for entry, picture in objects:
         own = seen.means[seen.instance_id == entry["id"]]
         if len(own):
-            about = f"{len(own):,} Gaussians, {entry['confidence']:.0%} agreement"
+            about = f"{_counted(len(own), 'Gaussian')}, {entry['confidence']:.0%} agreement"
             fields.append(_object(entry["id"], entry["name"], about, picture) | _place(own, origin, unit))
     behind = seen.means[seen.instance_id == BACKGROUND]
     if len(behind):
-        words = f"{len(behind):,} Gaussians"
-        fields.append(_object(BACKGROUND, "background", words, None) | _place(behind, origin, unit))
+        fields.append(
+            _object(BACKGROUND, "background", _counted(len(behind), "Gaussian"), None) | _place(behind, origin, unit)
+        )
     colors = instance_colors(-(-(int(seen.instance_id.max(initial=0)) + 1) // 256) * 256)
     document = {
         "objects": fields,
@@ -98,12 +99,16 @@ def page_html(
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(template).render(
         title=title,
-        counts=f"{sum(f['id'] != BACKGROUND for f in fields)} objects, {len(seen):,} Gaussians",
+        counts=f"{_counted(sum(f['id'] != BACKGROUND for f in fields), 'object')}, {_counted(len(seen), 'Gaussian')}",
         document=document,
         script=Markup(resources.files(__package__ or "").joinpath("page.js").read_text(encoding="utf-8")),
         instances=_text(gzip.compress(seen.instance_id.astype("<u2").tobytes(), mtime=0)),
         gaussians=_text(spz(moved).content.tobytes()),
     )
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}{'s' * (count != 1)}"
 
 
 def _object(instance_id: int, name: str, about: str, picture: Thumbnail | None) -> dict[str, Any]:

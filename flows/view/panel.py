@@ -232,6 +232,8 @@ class Panel:
             {"op": "duplicate", "instance": instance, "move": _aside(session.state.pieces[instance], right)}
             for instance in self._solid()
         ]
+        if session.selected and not copies:
+            raise InputError("select an object that has Gaussians, and is shown, to copy it.")
         self._do(*copies)
         for number in range(len(copies)):
             session.select(first + number, more=number > 0)

@@ -205,7 +205,7 @@ def _named(operation: Operation, objects: Objects) -> list[int]:
 def read_operations(file: Path) -> list[Operation]:
     """The operations of an edit script. Raises InputError when there is none that can be read."""
     try:
-        document = read_json(file.read_text(encoding="utf-8-sig"))
+        document = read_json(file.read_text(encoding="utf-8-sig"), once=True)
         operations = document["operations"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file} is no edit script that can be read: {error}.") from None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,6 +80,17 @@ def _id_images(
         pixels = frame_pixels(frame, lenses[row[frame.name]] if lenses else None, cameras)
         result.append((frame, np.where(pixels >= 0, ids.ravel()[pixels], 0).astype(np.uint16)))
     return result
+
+
+def written_ids(file: Path) -> NDArray[np.uint16]:
+    """The ids of a view, [H, W], that a run wrote to `masks/`.
+
+    Raises InputError when the file cannot be read or is no such image.
+    """
+    try:
+        return read_gray(file).astype(np.uint16, copy=False)
+    except InputError as error:
+        raise InputError(f"{file} cannot be read or is damaged: it is no image of ids; run the scene again.") from error
 
 
 def frame_pixels(frame: Frame, stated: Lens | None, cameras: Cameras) -> NDArray[np.intp]:

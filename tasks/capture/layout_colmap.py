@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -186,7 +187,7 @@ def _views_binary(path: Path) -> list[_View]:
             values = struct.unpack_from("<7d", data, place + 4)
             (camera,) = struct.unpack_from("<I", data, place + 60)
             end = data.index(b"\0", place + 64)
-            name = data[place + 64 : end].decode("utf-8")
+            name = os.fsdecode(data[place + 64 : end])
             place = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
             views.append(_View(name, _pose(values, path, name), camera))
     except (struct.error, ValueError) as error:

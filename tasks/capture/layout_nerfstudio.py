@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ss_flow.cache.plain_json import read_json
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.names import natural_key, view_names
@@ -109,8 +109,8 @@ def _pose(frame: dict[str, Any], path: Path) -> Pose:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
+        document = read_json(read_text(path))
+    except ValueError as error:
         raise InputError(f"{path} is not valid JSON ({error}).") from error
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):

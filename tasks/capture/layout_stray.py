@@ -14,7 +14,15 @@ from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.layout_colmap import pose_matrix
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.names import by_stem
-from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, check_lens, files_in, read_text, rigid_inverse
+from ss_flow.tasks.capture.scene_files import (
+    Pose,
+    SceneFiles,
+    check_lens,
+    files_in,
+    open_video,
+    read_text,
+    rigid_inverse,
+)
 from ss_flow.tasks.capture.upright import upright
 from ss_flow.tasks.geometry.cameras import centers_of
 
@@ -151,7 +159,7 @@ def _video(path: Path) -> tuple[tuple[int, int], int]:
     """Width and height of the stored frames, and how many there are."""
     import cv2
 
-    reader = cv2.VideoCapture(str(path))
+    reader = open_video(path)
     reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the lens is that of the frames as they are stored
     found = [int(reader.get(what)) for what in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
     length = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))

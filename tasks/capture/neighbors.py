@@ -25,8 +25,8 @@ class NeighborParams:
     """Which views are compared at all."""
 
     count: Count = 8
-    """Other views that the depth of one view may come from; those that overlap it best. What a photo
-    more changes ends a few neighbours away."""
+    """Other views that the depth of one view may come from; those that overlap it best. What one more photo changes
+    ends a few neighbours away."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from ss_flow.tasks.capture.ingest import IngestParams, frame_of, warn_of_skipped
 from ss_flow.tasks.capture.layout_scannet import read_sens_index
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.photo_files import Photo, Pixels, inspect, pixels_of
+from ss_flow.tasks.capture.scene_files import open_video
 from ss_flow.tasks.capture.sensor_depth import in_world_units, registered_depth
 
 OF_VIDEO = Photo(b"", "other", 0, 0, 1)
@@ -40,7 +41,7 @@ def recorded_frames(
     import cv2
 
     warn_of_skipped(skipped, "without depth, or beyond the video's end")
-    reader = cv2.VideoCapture(str(recording.path))
+    reader = open_video(recording.path)
     reader.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     result: list[Frame] = []
     for place in range(entries[-1] + 1):

@@ -188,6 +188,20 @@ def files_in(folder: Path, suffixes: frozenset[str] = PHOTO_SUFFIXES) -> list[Pa
     return sorted(found, key=lambda p: (natural_key(p.name), p.name))
 
 
+def open_video(path: Path) -> Any:
+    """OpenCV's reader of a video; whether it could be opened, it tells.
+
+    Raises InputError when bytes of the path are no text, at which OpenCV would end the process.
+    """
+    import cv2
+
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{path} has a name, or a folder, that is not written in UTF-8; rename it.") from error
+    return cv2.VideoCapture(str(path))
+
+
 def read_text(path: Path) -> str:
     """The text of a small file.
 

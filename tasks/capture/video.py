@@ -16,6 +16,7 @@ from ss_flow.tasks.artifacts import Float64, Frame, UInt8
 from ss_flow.tasks.capture.ingest import IngestParams, frame_of, warn_of_skipped
 from ss_flow.tasks.capture.photo_files import Pixels
 from ss_flow.tasks.capture.recordings import OF_VIDEO
+from ss_flow.tasks.capture.scene_files import open_video
 from ss_flow.tasks.ranges import Count, JpegQuality, Natural, NonNegative
 
 _WHOLE = 0.9
@@ -73,12 +74,10 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
     Warns where fewer frames can be decoded than the video announces.
     Raises InputError when the video cannot be opened or shows nothing.
     """
-    import cv2
-
     moved = _moved(video.path)
     total = len(moved)
     starts = _starts(moved, params)
-    reader = cv2.VideoCapture(str(video.path))
+    reader = open_video(video.path)
     aspect = _pixel_aspect(reader)
     best: list[tuple[float, Frame]] = []
     for start, stop in zip(starts, [*starts[1:], total], strict=True):
@@ -133,7 +132,7 @@ def _moved(video: Path) -> Float64:
     """
     import cv2
 
-    reader = cv2.VideoCapture(str(video))
+    reader = open_video(video)
     if not reader.isOpened():
         raise InputError(
             f"{video} cannot be opened as a video: it is cut short or damaged, or holds no pictures; copy it again."

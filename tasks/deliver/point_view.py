@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ss_flow.tasks.artifacts import Cameras, Float32, Float64, UInt8
+from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 from ss_flow.tasks.geometry.cameras import Camera, level_axes, looking, pixels_in_view, up_of
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
 
@@ -39,8 +40,10 @@ def orbit_camera(
     around = np.cos(azimuth) * east + np.sin(azimuth) * np.cross(up, east)
     outward = np.cos(elevation) * around + np.sin(elevation) * up
     half_fov = np.radians(22.0)
-    eye = center + outward * radius / np.sin(half_fov) * 0.9
-    focal = _HEIGHT / 2 / np.tan(half_fov)
+    away = outward * radius / np.sin(half_fov) * 0.9
+    farther = max(1.0, (radius + NEAR_PLANE) / float(np.linalg.norm(away)))  # what is nearer would not be drawn
+    eye = center + away * farther
+    focal = _HEIGHT / 2 / np.tan(half_fov) * farther
     return Camera(_WIDTH, _HEIGHT, focal, focal, _WIDTH / 2, _HEIGHT / 2, looking(eye, -outward, up))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -67,7 +68,7 @@ def _write_model(folder: Path, files: Sequence[str], cameras: Cameras) -> None:
         lens = struct.pack("<iQQ4d", _PINHOLE, *cameras.sizes[k].tolist(), *cameras.intrinsics[k].tolist())
         number = lenses.setdefault(lens, len(lenses) + 1)
         placed = struct.pack("<I7dI", k + 1, *quaternions[k], *shifts[k], number)
-        images.append(placed + file.encode() + b"\0" + _NONE)
+        images.append(placed + os.fsencode(file) + b"\0" + _NONE)
     grey = struct.pack("<3Bd", 128, 128, 128, 0.0) + _NONE  # neither colours nor errors nor who sees a point are known
     points = [struct.pack("<Q3d", i + 1, *point) + grey for i, point in enumerate(cameras.sparse_points.tolist())]
     for name, entries in (

@@ -1,0 +1,1 @@
+"""Changes of a finished scene: `operations`, the `holes` that they leave, how these are closed (`fill`), `pictures`."""

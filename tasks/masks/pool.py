@@ -149,7 +149,7 @@ def mask_set(name: str, masks: Bool, predicted_iou: Float32, source: str, *, con
 
 def merge_union(masks: Bool, grid: Int32, duplicate: float, overlap: float) -> tuple[Bool, Int32]:
     """Promote larger masks: a mask of a finer grid is united with every one before it that it overlaps, of a coarser
-    grid, or larger and of its own (Split&Splat, Sec. 3.1; spec S1 with rows 8 and 9 of its table).
+    grid, or larger and of its own (Split&Splat, Sec. 3.1.1; spec S1 with rows 8 and 9 of its table).
 
     masks: [N, H, W], none empty. grid: [N] grid of origin, 0 = coarsest. duplicate: share of the smaller mask above
     which the later of two masks of one grid is dropped. overlap: share of the smaller mask above which two are united.

@@ -1,5 +1,5 @@
 """A vector for every Gaussian of an object, from pictures of it alone (Split&Splat, appendix "Dense Semantic
-Embeddings"; spec rows 42-44, A32-A34)."""
+Embeddings"; spec rows 42-44, A32, A33)."""
 
 from __future__ import annotations
 

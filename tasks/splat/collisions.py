@@ -58,7 +58,6 @@ def collision_matrix(centers: Sequence[Float32 | Float64], boxes: Float64) -> Fl
 
     centers: of each of G groups [N_g, 3]; boxes: [G, 2, 3]. Borders belong to the box. Returns [G, G].
     """
-
     return _matrix(centers, boxes, lambda points, b: ((points >= boxes[b, 0]) & (points <= boxes[b, 1])).all(axis=1))
 
 

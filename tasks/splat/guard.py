@@ -71,7 +71,7 @@ def quality(gaussians: Gaussians, views: Sequence[TrainView], ids: Int32) -> Qua
         rendering = render(gaussians, view.camera, label_ids=ids[channels].tolist(), winners=False)
         error += float(((rendering.rgb - view.image)[view.inside].astype(np.float64) ** 2).sum())
         count += 3 * int(view.inside.sum())
-        counts = view.ids != -1
+        counts = view.ids != -1  # IGNORED, which says nothing for a mask or against it
         for channel, weight in zip(channels, rendering.label_masks, strict=True):
             overlaps.append(iou((weight >= 0.5) & counts, view.ids == channel))
     mse = max(error / max(1, count), 1e-10)

@@ -171,10 +171,12 @@ def retrain(
 
 
 def _completed(scene: SceneViews, instance: InstanceMasks, params: ReconstructParams) -> InstanceMasks:
+    """With the surface that masks agree on (`tau_agree`); the background has no masks of its own to agree."""
     return completed(scene, instance, params.tau_agree) if params.tau_agree and instance.instance_id else instance
 
 
 def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussians:
+    """The Gaussians that training starts from, one a labelled point that is left when they are thinned out."""
     rows = thin(instance.points, round(params.max_points * params.scale_of(instance)))
     first = initialise(
         instance.points[rows],
@@ -205,6 +207,8 @@ def thin(points: Float32, limit: int) -> Int32:
 def _trained(
     scene: SceneViews, instance: InstanceMasks, initial: Gaussians, params: ReconstructParams, iterations: int
 ) -> Gaussians:
+    """The Gaussians after so many steps on the views of an instance; with a warning as they began, where no view shows
+    it or nothing of it is left."""
     instance = _evenly(instance, iterations)
     surface = PointSurface.of(instance.points)
     build = background_view if instance.instance_id == 0 else group_view
@@ -253,6 +257,7 @@ def _channels(scene: SceneViews, instance: InstanceMasks, params: ReconstructPar
 
 
 def _settings(params: ReconstructParams, iterations: int, scale: float) -> TrainParams:
+    """scale: the factor on the number of Gaussians."""
     return TrainParams(
         iterations=iterations,
         sh_degree=params.sh_degree,

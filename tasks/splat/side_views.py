@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ss_flow.running import in_threads
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import neighbour_spread
+from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 from ss_flow.tasks.gaussians.objective import Target
 from ss_flow.tasks.gaussians.trainer import PartView
 from ss_flow.tasks.gaussians.views import SceneViews
@@ -124,8 +125,8 @@ def _known_nearby(known: Bool, ids: NDArray[np.uint16]) -> Bool:
 
 
 def cameras_around(points: Float32, spacing: float, count: int) -> Iterator[Camera]:
-    """Cameras that show points whole from directions evenly spread over the sphere, at twice the diagonal of their box,
-    with pixels of half a spacing where that needs no more than MOST_PIXELS.
+    """Cameras that show points whole from directions evenly spread over the sphere, at twice the diagonal of their box
+    and no nearer than what is drawn, with pixels of half a spacing where that needs no more than MOST_PIXELS.
 
     Points far off from most others stay outside: with them, a bowl of which a piece of the table has the label would be
     a few pixels wide.
@@ -135,9 +136,10 @@ def cameras_around(points: Float32, spacing: float, count: int) -> Iterator[Came
     farthest = np.linalg.norm(np.abs(points - middle).max(axis=0))
     radius = min(GROWN * np.linalg.norm(high - low) / 2, farthest) + GAP * spacing
     size = int(np.clip(np.ceil(4 * radius / spacing), 16, MOST_PIXELS))
-    focal = size / 2 * np.sqrt(15.0)  # a sphere seen from four of its radii
+    away = max(4.0, 1 + NEAR_PLANE / radius)  # radii; of what is tiny, none of it before the nearest depth
+    focal = size / 2 * np.sqrt(away**2 - 1)  # a sphere seen from there
     for direction in sphere(count):
-        pose = looking(middle + 4 * radius * direction, -direction, np.array([0.0, 0.0, 1.0]))
+        pose = looking(middle + away * radius * direction, -direction, np.array([0.0, 0.0, 1.0]))
         yield Camera(size, size, focal, focal, size / 2, size / 2, pose)
 
 

@@ -98,8 +98,8 @@ def part_masks(
     """The masks of a view, of which those are divided that show as one what `correct` or `part_boards` has divided.
 
     visibility, masks: of one view. before, after: the instances before and since. contained: as `mask_tree` takes it.
-    Such a mask holds mostly points of the one instance, and most points that the view sees of
-    several of its things; each of its pixels goes to the thing of the nearest of these points.
+    Such a mask holds points of that instance mostly, and of several of its things half of the points that the view
+    sees or more; each of its pixels goes to the thing of the nearest of these points.
     """
     seen = visibility.point_index
     if (before.label[seen] == after.label[seen]).all():

@@ -50,6 +50,7 @@ def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) ->
 
 
 def _warn_of_largest(label: Int32, tree: Hierarchy) -> None:
+    """label: [N] the instance of each point, 0 = none."""
     size = np.bincount(label[label > 0], minlength=1)
     largest = int(size.argmax())
     if size[largest] > _MOST * size.sum() and largest not in tree.node[tree.stuff]:

@@ -52,9 +52,9 @@ def reprompt(
 ) -> PromptedMasks:
     """Masks for the labels that are visible in a view but that none of its masks shows, or shows well (spec S5).
 
-    visibility, masks: those of the photo. selection: how the view's own masks are matched to labels, as in
-    the re-projection. Each such label gets one mask, prompted at points spread over it. Whether the mask agrees with
-    the label is for `split.reproject` to judge. Raises InputError when the model cannot be opened.
+    visibility, masks: those of the photo. selection: how the view's own masks are matched to labels, as in the
+    re-projection. Each such label gets one mask, prompted at points spread over it. Whether the mask agrees with the
+    label is for `split.instances_in_view` to judge. Raises InputError when the model cannot be opened.
     """
     painted = paint_for_selection(visibility, labels.label, selection)
     shown = select_masks(painted, masks, selection)

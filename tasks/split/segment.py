@@ -1,5 +1,5 @@
 """2D instance masks of one view: Segment Anything prompted on grids of points, from coarse to fine (Split&Splat,
-Sec. 3.1; spec S1)."""
+Sec. 3.1.1; spec S1)."""
 
 from __future__ import annotations
 
@@ -260,5 +260,6 @@ def _low_resolution(valid: Bool) -> Bool:
 
 
 def _large_enough(masks: Bool, params: SegmentParams) -> Bool:
+    """[N] which masks [N, H, W], of the frame's size, are no crumbs (row 7)."""
     area = masks.sum(axis=(1, 2))
     return area >= max(params.min_pixels, params.min_area * masks.shape[1] * masks.shape[2])

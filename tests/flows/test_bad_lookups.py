@@ -22,6 +22,10 @@ QUERIES: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         lambda out: [spoilt(out / "instances.json", "{"), "red"],
         "instances.json is damaged",
     ),
+    "an instances.json whose instances lack their names": (
+        lambda out: [spoilt(out / "instances.json", '{"instances": [{"id": 1}], "groups": []}'), "red"],
+        "instances.json is damaged: an instance lacks what a run writes of it",
+    ),
     "a text without a colour": (lambda out: [str(out), "teapot"], '"teapot" names no colour'),
     "an empty text": (lambda out: [str(out), ""], "The query is empty"),
     "a distance out of range": (lambda out: [str(out), "red", "--tau-corr", "5"], "must be above 0 and at most 2"),

@@ -136,6 +136,20 @@ def test_an_object_of_a_run_whose_store_is_not_at_hand_is_placed_with_a_warning(
     assert warning["text"] in (place / "report.html").read_text()
 
 
+@pytest.mark.parametrize("name", ["id", "name", "file", "parts", "crumb"])
+def test_an_object_of_a_run_whose_instances_json_is_damaged_is_refused(warm, tmp_path, name):
+    shutil.copytree(warm.out, tmp_path / "other")
+    file = tmp_path / "other/instances.json"
+    document = json.loads(file.read_text())
+    for entry in document["instances"]:
+        del entry[name]
+    file.write_text(json.dumps(document))
+    own = biggest(warm.out)
+    called, place = edit(warm, {"op": "replace", "instance": own, "run": str(tmp_path / "other"), "by": own})
+    assert called.code == 2 and not place.exists()
+    assert "other/instances.json is damaged: an instance lacks what a run writes of it" in called.err
+
+
 def test_a_bad_script_runs_nothing_and_writes_nothing(warm):
     called, place = edit(warm, {"op": "remove", "instances": "no such thing"})
     assert called.code == 2 and not place.exists() and called.out == ""
@@ -147,6 +161,7 @@ def test_a_bad_script_runs_nothing_and_writes_nothing(warm):
     [
         (None, "cannot be read"),
         ("{", "is not JSON"),
+        ('{"operations": [{"op": "keep", "instances": 1, "instances": 2}]}', "'instances' stands twice in one object"),
         ("[]", "an edit script is a JSON object"),
         ("\ufeff[]", "an edit script is a JSON object"),  # the mark that editors on Windows put in front
     ],

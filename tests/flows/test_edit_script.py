@@ -140,6 +140,34 @@ def test_merging_makes_parts_of_what_had_none_and_splitting_gives_them_back():
     assert objects.names() == ["speck", *(f"still life part {p}" for p in (1, 2, 3, 4))]
 
 
+_AWAY = {"move": [1, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    ("steps", "count"),
+    [
+        ([{"op": "transform", "instances": 3, **_AWAY}], 1),
+        ([{"op": "duplicate", "instance": 3, **_AWAY}], 1),
+        ([{"op": "transform", "instances": 3, **_AWAY}, {"op": "split", "instance": 3}], 2),
+        (
+            [
+                {"op": "duplicate", "instance": 2, **_AWAY},
+                {"op": "merge", "instances": [4, 8]},
+                {"op": "split", "instance": 4},
+            ],
+            1,
+        ),
+    ],
+)
+def test_what_is_not_where_photos_show_it_has_no_views_and_no_points_nor_have_its_parts(steps, count):
+    now, objects = applied(*steps)
+    unseen = [entry for entry in objects.document(DOCUMENT, now)["instances"] if not entry["num_points"]]
+    assert len(unseen) == count
+    for entry in unseen:
+        assert entry["views"] == [] and all(part["num_points"] == 0 for part in entry["parts"])
+        assert objects.dense[entry["id"]] == set()
+
+
 def test_what_belongs_to_no_part_keeps_the_id_when_an_instance_is_split():
     whole = scene()
     parts = whole.part_id.copy()

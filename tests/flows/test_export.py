@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +14,8 @@ import pytest
 from tiny_runs import bytes_of, ss_flow
 
 from ss_flow.cache.store import Store
+from ss_flow.flows.cli.export import file_name
+from ss_flow.tasks.capture.names import view_names
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.read_ply import read_columns, read_gaussians
@@ -91,6 +95,44 @@ def test_coco_says_what_the_masks_show_in_the_pixels_of_the_photos(tiny, tmp_pat
             assert mask[y : y + height, x : x + width].sum() == annotation["area"] == mask.sum()
             seen += 1
     assert seen > 4
+
+
+def test_coco_holds_instances_that_are_in_masks_only_and_crumbs_when_they_are_named(warm, tmp_path):
+    file = warm.out / "instances.json"
+    document = json.loads(file.read_text())
+    bare, crumb, *rest = document["instances"]
+    for entry, is_crumb in ((bare, False), (crumb, True)):
+        entry.update(file=None, num_gaussians=0, weak=is_crumb, crumb=is_crumb)
+    file.write_text(json.dumps(document))
+    whole, named = tmp_path / "whole.json", tmp_path / "named.json"
+    assert export(warm, "--format", "coco", "--out", whole).code == 0
+    annotated = {a["instance_id"] for a in json.loads(whole.read_text())["annotations"]}
+    assert annotated == {bare["id"], *(entry["id"] for entry in rest if not entry["crumb"])}
+    answer = export(
+        warm, "--format", "coco", "--instance", crumb["name"], "--instance", str(bare["id"]), "--out", named
+    )
+    assert answer.code == 0, answer.err
+    assert {a["instance_id"] for a in json.loads(named.read_text())["annotations"]} == {bare["id"], crumb["id"]}
+    answer = export(warm, "--format", "ply", "--instance", str(bare["id"]), "--out", tmp_path / "a.ply")
+    assert answer.code == 2 and "has no Gaussians" in answer.err
+
+
+def test_coco_names_photos_of_a_rig_by_the_folders_that_tell_them_from_each_other():
+    called = ("cam_1/left/0001.jpg", "cam_1/right/0001.jpg", "cam_2/0001.jpg")
+    photos = [Path("/a/images") / name for name in called]
+    views = view_names(photos)
+    assert tuple(file_name(views[photo], photo) for photo in photos) == called
+    alone = Path("/a/left/left_0001.jpg")
+    assert file_name(view_names([alone])[alone], alone) == "left_0001.jpg"
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
+def test_masks_whose_path_is_no_text_are_read(warm, tmp_path):
+    out = warm.out.rename(tmp_path / "out\udcff")
+    answer = ss_flow("export", out, "--cache", warm.store, "--format", "coco", "--out", tmp_path / "a.json")
+    assert answer.code == 0, answer.err
+    assert json.loads((tmp_path / "a.json").read_text())["annotations"]
+    assert ss_flow("diff", out, out, "--json").code == 0
 
 
 def test_coco_can_be_given_to_a_run_as_its_masks(tiny, tmp_path):
@@ -194,7 +236,7 @@ def test_a_scene_without_gaussians_is_not_written(warm, tmp_path, more):
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize("more", [["spz", "--each"], ["mesh-obj"], ["mesh-glb"], ["coco"]])
+@pytest.mark.parametrize("more", [["spz", "--each"], ["mesh-obj"], ["mesh-glb"]])
 def test_where_no_instance_has_a_file_nothing_is_written(warm, tmp_path, more):
     file = warm.out / "instances.json"
     document = json.loads(file.read_text())
@@ -203,6 +245,16 @@ def test_where_no_instance_has_a_file_nothing_is_written(warm, tmp_path, more):
     answer = export(warm, "--format", *more, "--out", tmp_path / "a")
     assert answer.code == 2 and f"no instance of {warm.out} has a file of its own" in answer.err
     assert not (tmp_path / "a").exists()
+
+
+def test_where_all_instances_are_crumbs_no_coco_is_written(warm, tmp_path):
+    file = warm.out / "instances.json"
+    document = json.loads(file.read_text())
+    document["instances"] = [entry | {"file": None, "crumb": True} for entry in document["instances"]]
+    file.write_text(json.dumps(document))
+    answer = export(warm, "--format", "coco", "--out", tmp_path / "a.json")
+    assert answer.code == 2 and f"no instance of {warm.out} is more than a crumb" in answer.err
+    assert not (tmp_path / "a.json").exists()
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from ss_flow.flows.view.nodes import _colors
 from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.gaussians.densification import rotations
 from ss_flow.tasks.gaussians.initialise import initialise
+from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 
 viser = pytest.importorskip("viser", reason="needs the extra `view`")
@@ -129,6 +130,14 @@ def test_an_object_is_looked_at_whole_from_the_side_that_a_photo_saw(results, ar
         is_near = np.linalg.norm(away) < nearest * (1 - 1e-9)
         assert not is_near or np.mean(off_axis < fov / 2) > 0.9  # it fits into the picture, and fills it
         assert not is_near or np.quantile(off_axis, 0.95) > 0.2 * fov
+
+
+@pytest.mark.parametrize("count", [1, 200])
+def test_a_tiny_object_is_looked_at_from_where_it_is_drawn(around, count):
+    points = (1e-4 * np.random.default_rng(0).normal(size=(count, 3))).astype(np.float32) + around.points.points[0]
+    position, look_at = view_of_object(around.cameras, points, 0.9)
+    forward = (look_at - position) / np.linalg.norm(look_at - position)
+    assert np.quantile((points - position) @ forward, 0.05) >= NEAR_PLANE - 1e-6
 
 
 SPATIAL = {

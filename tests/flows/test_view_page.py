@@ -6,6 +6,7 @@ import base64
 import gzip
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,14 @@ def test_a_scene_without_gaussians_is_a_page_without_objects(run):
     assert "0 objects, 0 Gaussians" in html
 
 
+def test_one_is_told_as_one(run):
+    scene, cameras = run.results.one("scene"), run.results.one("cameras")
+    (entry, *_) = (entry for entry in run.instances["instances"] if entry["num_gaussians"])
+    one = select(scene, np.flatnonzero((scene.instance_id == entry["id"]) & (scene.opacities > 0.1))[:1])
+    html = page_html("one", one, start_view(cameras, scene.means), [(entry, None)])
+    assert "1 object, 1 Gaussian<" in html
+
+
 @needs_browser
 def test_the_page_asks_for_nothing_and_complains_of_nothing(page, file):
     page.evaluate("new Promise(done => setTimeout(done, 500))")
@@ -105,6 +114,26 @@ def test_the_page_asks_for_nothing_and_complains_of_nothing(page, file):
     assert page.complaints == []
     assert page.evaluate("fetch('data:,1').then(() => 'let through', () => 'refused')") == "refused"
     page.complaints.clear()  # the browser says that it refused
+
+
+@needs_browser
+def test_an_object_of_a_tiny_scene_is_gone_to_no_nearer_than_it_is_drawn(run, tmp_path):
+    size = np.float32(0.01)
+    scene, cameras = run.results.one("scene"), run.results.one("cameras")
+    scene = replace(scene, means=scene.means * size, log_scales=scene.log_scales + np.log(size))
+    poses = cameras.world_to_camera.copy()
+    poses[:, :3, 3] *= size
+    entries = [(entry, None) for entry in run.instances["instances"] if entry["num_gaussians"]]
+    start = start_view(replace(cameras, world_to_camera=poses), scene.means)
+    (tmp_path / "tiny.html").write_text(page_html("tiny", scene, start, entries))
+    with browser_page(400, 300) as page:
+        page.open((tmp_path / "tiny.html").as_uri())
+        page.wait_for("document.body?.dataset.drawn")
+        for number, (entry, _) in enumerate(entries):
+            for button in (".only", ".go"):
+                page.evaluate(f"document.querySelectorAll('li {button}')[{number}].click()")
+            own = int((scene.opacities[scene.instance_id == entry["id"]] >= 1 / 255).sum())
+            assert page.evaluate(DRAWN) >= 0.8 * own
 
 
 @needs_browser
@@ -179,7 +208,7 @@ def test_labels_colour_the_scene_and_a_click_selects_the_object_under_it(page):
 @needs_browser
 def test_the_list_is_searched_by_name(page):
     name = page.evaluate("document.querySelector('li .name').textContent")
-    page.evaluate(TYPED.format(json.dumps(name.upper())))
+    page.evaluate(TYPED.format(json.dumps(f"{name.upper()} ")))
     left = page.evaluate("[...document.querySelectorAll('li:not([hidden]) .name')].map(one => one.textContent)")
     assert left and all(name in one for one in left)
     assert page.evaluate("document.querySelectorAll('li[hidden]').length") > 0

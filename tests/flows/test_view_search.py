@@ -11,6 +11,7 @@ import pytest
 from tiny_runs import ss_flow
 
 pytest.importorskip("viser", reason="needs the extra `view`")
+from ss_flow.errors import InputError
 from ss_flow.flows.cli.context import StoreOptions, open_run
 from ss_flow.flows.cli.view import search_of
 from ss_flow.flows.view.object_list import ObjectList
@@ -39,8 +40,20 @@ def test_what_is_typed_is_answered_as_by_the_command(viewer: Viewer, tiny) -> No
         assert _listed(objects) == ranked
         matches = sum(bool(entry["matched"]) for entry in found["instances"])
         assert objects.answer.content == (f"{matches} match" if matches else "Nothing in the scene matches.")
+    objects.text.value = "white teapot"
+    assert 'Only colour words were understood, not "teapot"' in objects.answer.content
     objects.text.value = ", not"
     assert "nothing follows" in objects.answer.content or "empty" in objects.answer.content
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_what_cannot_be_copied_is_said_to_be_so(viewer: Viewer, hidden: bool) -> None:
+    panel = viewer.panel
+    panel.session.select(max(panel.session.state.objects.entries) if hidden else 0)
+    if hidden:
+        panel.session.hide(panel.session.selected)
+    with pytest.raises(InputError, match="has Gaussians, and is shown, to copy it"):
+        panel._actions()["Duplicate"](None)
 
 
 class _Scored:

@@ -181,7 +181,7 @@ def test_a_script_is_read_back_as_it_was_saved(tmp_path):
     assert session(*read_operations(file)).script() == script
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"operations": 3}', "\0"])
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"operations": 3}', '{"operations": [], "operations": []}', "\0"])
 def test_what_is_no_script_is_refused_with_its_name(tmp_path, content):
     file = tmp_path / "no.json"
     file.write_text(content)

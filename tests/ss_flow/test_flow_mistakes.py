@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import ss_flow_toy as toy
 from toy_runs import run, value
 
-from ss_flow.graph import INDEX, Flow, each, expand, gather, pick, stored
+from ss_flow.graph import INDEX, Flow, each, expand, gather, otherwise, pick, stored
 
 
 def test_an_unknown_executor_is_refused_in_one_sentence(store):
@@ -76,6 +78,35 @@ def test_positions_alone_have_no_length_and_are_refused_at_the_call(store):
 def test_only_a_node_has_items_to_pick():
     with Flow().building(), pytest.raises(TypeError, match="not a list"):
         pick([1, 2], [0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda node: each([node], build=lambda one: one), "`each` goes through must be a node, not list"),
+        (lambda node: expand([node], lambda one: node), "`expand` waits for must be a node, not list"),
+        (lambda node: otherwise([node], lambda: node), "`otherwise` replaces must be a node, not list"),
+        (lambda node: each(node, build=lambda one: one, on_error="ignore"), "must be one of fail, skip"),
+    ],
+)
+def test_what_is_no_node_is_refused_at_the_call(wrong, said):
+    with Flow().building(), pytest.raises((TypeError, ValueError), match=said):
+        wrong(toy.source(values=(1.0,)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda node: each(node, build=lambda one: None), "`build` returns for an item must be a node, not NoneType"),
+        (lambda node: each(node, build=lambda one: (one, one)), "must be a node, not tuple"),
+        (lambda node: each(node, build=lambda one: OF_ANOTHER_FLOW), "is a node of another flow"),
+        (lambda node: each(node, build=lambda one: one, names=["a"]), "1 names for the 2 items"),
+        (lambda node: pick(node, [0, 2]), "item 2 is not among the 2 items of ss_flow_toy.source"),
+    ],
+)
+def test_a_mistake_that_shows_only_when_a_list_is_known_fails_its_node_alone(store, wrong, said):
+    report = run(store, lambda: {"x": wrong(toy.source(values=(1.0, 2.0))), "y": toy.source(values=(1.0, 2.0))})
+    assert re.search(said, str(report.values["x"].error)) and len(report.all("y")) == 2
 
 
 def test_a_node_cannot_be_gone_through_as_a_list():

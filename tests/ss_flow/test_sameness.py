@@ -129,6 +129,50 @@ def test_a_module_that_is_loaded_again_unchanged_is_the_same(store, probed):
     assert run(store, steps, "second") == (6.0, "finished")
 
 
+@pytest.mark.parametrize("before", [HELPER, "FACTOR = 2\n\n\ndef double(x):\n    return FACTOR * x\n"])
+def test_what_was_put_into_a_module_that_stays_loaded_is_refused(store, probed, before):
+    file = probed.folder / "probed_helper.py"
+    file.write_text(before)
+    steps = probed()
+    assert run(store, steps, "second") == (6.0, "finished")
+    helper = sys.modules["probed_helper"]
+    if before == HELPER:  # as IPython's autoreload does it
+        file.write_text(EDITED)
+        edited = {}
+        exec(EDITED, vars(helper), edited)
+        helper.double.__code__ = edited["double"].__code__
+    else:
+        file.write_text(before.replace("2", "3"))
+        helper.FACTOR = 3
+    with pytest.raises(ExecutorLost, match="probed_helper was edited after it was loaded"):
+        run(store, steps, "second")
+    importlib.reload(helper)
+    value, happened = run(store, importlib.reload(steps), "second")
+    assert value > 6 and happened == "finished"
+
+
+def test_what_is_put_below_the_tasks_of_a_module_before_the_first_run_is_refused(store, probed):
+    file = probed.folder / "ss_flow_probed.py"
+    text = file.read_text().replace("from probed_helper import double\n", "") + f"\n\n{HELPER}"
+    file.write_text(text)
+    steps = probed()
+    file.write_text(text.replace(HELPER, EDITED))
+    exec(EDITED, vars(steps))
+    with pytest.raises(ExecutorLost, match="ss_flow_probed was edited after it was loaded"):
+        run(store, steps, "second")
+    assert run(store, importlib.reload(steps), "second") == (7.0, "finished")
+
+
+def test_what_a_module_changes_of_itself_does_not_count_as_edited(store, probed):
+    helper = probed.folder / "probed_helper.py"
+    helper.write_text(f"calls = 0\n\n\n{HELPER}")
+    steps = probed()
+    assert run(store, steps, "second") == (6.0, "finished")
+    sys.modules["probed_helper"].calls = 1
+    helper.write_text(f"calls = 0\n\n\n{EDITED}")
+    assert run(store, steps, "second") == (6.0, "hit")
+
+
 def test_a_helper_that_was_edited_between_being_loaded_and_the_first_task_is_refused(store, probed):
     probed.forget()
     importlib.import_module("probed_helper")

@@ -12,6 +12,8 @@ import numpy as np
 
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, Frame
+from ss_flow.tasks.capture import ingest
+from ss_flow.tasks.capture.scene_files import SceneFiles
 
 WIDTH, HEIGHT = 32, 24
 NAMES = ("2", "10", "11")
@@ -24,6 +26,17 @@ def ref(path: Path | None) -> FileRef | None:
 
 def refs(paths) -> tuple:
     return tuple(ref(p) for p in paths)
+
+
+def ingested(scene: SceneFiles, **changes) -> tuple[Frame, ...]:
+    """The frames of an opened capture, as a run reads them."""
+    return ingest.frames(
+        names=scene.names,
+        photos=refs(scene.photos),
+        valid=refs(scene.valid),
+        lenses=scene.lenses,
+        params=ingest.IngestParams(**changes),
+    )
 
 
 def photo(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
@@ -55,6 +68,10 @@ def cameras_of(frames: tuple[Frame, ...], radial: float = 0.0) -> Cameras:
 def pose(x: float) -> np.ndarray:
     """Camera-to-world, turned by 90 degrees about y and moved."""
     return np.array([[0, 0, 1, x], [0, 1, 0, 0.5], [-1, 0, 0, -1], [0, 0, 0, 1]], float)
+
+
+WORLD_TO_CAMERA = np.stack([np.linalg.inv(pose(i)) for i in range(3)])
+"""[3, 4, 4] of the views of most layouts."""
 
 
 def photos(root: Path) -> Path:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ss_flow.errors import InputError
 from ss_flow.running import progress
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.artifacts import Bool
+from ss_flow.tasks.capture.id_images import written_ids
 from ss_flow.tasks.deliver.export.content import FileContent
 from ss_flow.tasks.packed import bounds
 
@@ -27,15 +27,11 @@ def coco(
     their ids as text. instances: the ids that are wanted.
     Raises InputError when a mask cannot be read.
     """
-    import cv2
-
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for done, (mask, photo) in enumerate(zip(masks, photos, strict=True)):
         progress(done, len(masks), photo)
-        ids = cv2.imread(str(mask.path), cv2.IMREAD_UNCHANGED)
-        if ids is None or ids.ndim != 2:
-            raise InputError(f"{mask.path} is damaged: an image of ids is expected; run the scene again.")
+        ids = written_ids(mask.path)
         images.append({"id": done + 1, "file_name": photo, "width": ids.shape[1], "height": ids.shape[0]})
         for instance_id in np.intersect1d(ids, instances).tolist():
             annotation = {"id": len(annotations) + 1, "image_id": done + 1, "category_id": instance_id}

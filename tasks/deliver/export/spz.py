@@ -15,7 +15,9 @@ from ss_flow.tasks.gaussians.initialise import SH_ZERO
 
 _MAGIC = 0x5053474E
 _VERSION = 3
-_MOST_FRACTION_BITS = 12
+_FRACTION_BITS = 12
+"""Of coordinates up to a unit and more, as far as there is room; one more for each time that the largest halves."""
+_MOST_FRACTION_BITS = 23
 _FARTHEST = (1 << 23) - 1
 """Largest coordinate in steps of the fixed point."""
 _COLOR_SCALE = 0.15
@@ -33,7 +35,9 @@ def spz(gaussians: Gaussians) -> FileContent:
     Raises InputError where a coordinate is too large for the fixed point (beyond 8 million units).
     """
     farthest = float(np.abs(gaussians.means).max(initial=0))
-    bits = min(_MOST_FRACTION_BITS, int(np.floor(np.log2(_FARTHEST / max(farthest, 1e-9)))))
+    size = max(farthest, 1e-9)
+    fine = _FRACTION_BITS + max(0, -int(np.floor(np.log2(size))))
+    bits = min(fine, _MOST_FRACTION_BITS, int(np.floor(np.log2(_FARTHEST / size))))
     if bits < 0:
         raise InputError(f"a Gaussian lies {farthest:.3g} units from the origin; SPZ holds coordinates to {_FARTHEST}.")
     degree = gaussians.sh_degree

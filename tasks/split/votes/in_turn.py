@@ -1,4 +1,10 @@
-"""Labels from votes in the order of the views (Split&Splat, Algorithm 1, repaired; spec S4)."""
+"""Labels from votes in the order of the views (Split&Splat, Algorithm 1, repaired; spec S4).
+
+Repaired where the printed algorithm cannot be meant: the first view votes like all others, before an empty virtual
+image; that image has the labels of all views before, not of the last one alone (spec A3); and all points of a mask vote
+for the label that the mask took, a number of its own if it took none. Masks of one view do not see each other's votes
+(spec A5).
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Every path, photo or video that is no capture is refused with one sentence that names what is wrong."""
 
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -175,6 +176,13 @@ def test_the_captures_that_the_cases_spoil_are_sound(make, tmp_path):
 def test_opencv_alone_would_read_a_cut_jpeg(tmp_path):
     cut(made.photos(tmp_path) / "10.jpg")
     assert cv2.imread(str(tmp_path / "10.jpg")) is not None
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
+def test_a_video_whose_path_is_no_text_is_refused(tmp_path):
+    video = made.video(tmp_path / "a.avi", count=2).rename(tmp_path / "a\udcff.avi")
+    with pytest.raises(InputError, match="not written in UTF-8; rename it"):
+        video_frames(video=ref(video))
 
 
 def test_a_video_without_a_frame_is_said_to_be_of_a_codec_that_is_not_read(tmp_path, monkeypatch):

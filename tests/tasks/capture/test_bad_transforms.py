@@ -31,6 +31,18 @@ def transforms_that_is_no_json(root):
     return root
 
 
+@case("transforms.json", "not valid JSON (it is nested too deeply)")
+def transforms_without_an_end(root):
+    (made.nerfstudio(root) / "transforms.json").write_text('{"frames":' * 200_000)
+    return root
+
+
+@case("transforms.json", "not valid JSON (Exceeds the limit")
+def transforms_with_a_number_of_too_many_digits(root):
+    (made.nerfstudio(root) / "transforms.json").write_text(f'{{"w": {"9" * 5000}}}')
+    return root
+
+
 @case("transforms.json", "lacks a list `frames`")
 def transforms_without_frames(root):
     edit_json(made.nerfstudio(root), lambda d: d.pop("frames"))

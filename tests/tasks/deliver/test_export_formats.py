@@ -221,6 +221,16 @@ def test_spz_spends_fewer_bits_on_fractions_where_coordinates_are_large():
         spz(far)
 
 
+@pytest.mark.parametrize("size", [0.7, 0.05, 1e-3])
+def test_spz_spends_more_bits_on_fractions_where_all_coordinates_are_small(size):
+    made = made_gaussians(50, 0)
+    made.means[:] *= size / np.abs(made.means).max()
+    data = gzip.decompress(bytes_of(spz(made)))
+    raw = np.frombuffer(data, "u1", 9 * 50, 16).reshape(-1, 3).astype(np.int64) @ [1, 256, 65536]
+    means = (np.where(raw >= 1 << 23, raw - (1 << 24), raw) / (1 << data[13])).reshape(-1, 3) * (1, -1, -1)
+    assert np.abs(means - made.means).max() <= size / 4096
+
+
 def sog_parts(data: bytes) -> tuple[dict, dict[str, np.ndarray]]:
     """What is in the archive: meta.json, and the pixels of each image [n, 4] RGBA."""
     archive = zipfile.ZipFile(io.BytesIO(data))

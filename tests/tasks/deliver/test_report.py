@@ -90,7 +90,7 @@ def test_crumbs_are_folded_away_and_stuff_comes_after_things():
 
     listed = [entry("wall", kind="stuff", num_points=9), entry("speck", crumb=True), entry("mug", num_points=5)]
     text = Page(report_html(RUN, pictures=(), instances={"instances": listed})).text
-    assert text.index("mug") < text.index("wall") < text.index("1 crumbs") < text.index("speck")
+    assert text.index("mug") < text.index("wall") < text.index("1 crumb: ") < text.index("speck")
 
 
 def test_metrics_read_as_words_and_counts_as_whole_numbers():
@@ -257,7 +257,7 @@ def test_of_another_run_only_what_differs_is_told():
     assert "Compared with before What was asked for before Here a.b 1 – " in text
     assert "Measured before Here Difference mIoU (after Splat) 0.500 0.625 +0.125 PSNR (novel views) – 27.30 dB" in text
     assert "1 of 3 figures are the same in both. The objects of both agree with a mean IoU of 0.750;" in text
-    assert "1 changes; before is the first 3 of the first is in pieces: 4, 5" in text
+    assert "1 change; before is the first 3 of the first is in pieces: 4, 5" in text
     nothing = Page(report_html({}, pictures=(), comparison=Comparison("x", {}, {}, None, ()))).text
     assert "were not compared" in nothing and "Measured" not in nothing
 

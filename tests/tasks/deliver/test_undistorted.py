@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from capture_folders import cameras_of, photo, pose
 
 from ss_flow.tasks.artifacts import Frame, LabelMap
@@ -15,6 +17,14 @@ from ss_flow.tasks.deliver.undistorted import write_undistorted
 from ss_flow.tasks.geometry.images import encode_png
 
 NAMES = ("Foto mit Leer zeichen 1", "Küche 2", "3")
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
+def test_photos_whose_names_are_no_text_are_found_again(tmp_path):
+    frame = Frame("a\udcff", 32, 24, encode_png(photo(0)), np.zeros(0, np.uint8), 32, 24)
+    ids = LabelMap(frame.name, np.zeros((24, 32), np.uint16))
+    write_undistorted(tmp_path, [frame], cameras_of((frame,)), [ids])
+    assert open_scene(tmp_path).names == ("a\udcff",)
 
 
 def test_colmap_and_we_read_the_photos_whatever_their_names(tmp_path):

@@ -1,92 +1,25 @@
-"""The contract of a trainer's backend: what each gives, held against the native one and against torch's own Adam.
-
-The torch backend runs here on torch's CPU device, once with the native rasterizer behind it and once with the adapter
-to gsplat, which a dense stand-in completes; where there is CUDA, on that.
-"""
+"""The contract of a trainer's backend: what each gives for a view, held against the native one and torch's own Adam."""
 
 from __future__ import annotations
 
-import gc
-import inspect
 import sys
 from dataclasses import replace
 
-import gsplat_on_the_cpu
 import numpy as np
 import pytest
 import torch
 from torch.overrides import TorchFunctionMode
+from trainer_backends import NATIVE, example, put, tolerance
 
-from ss_flow.running import Surroundings, running
 from ss_flow.tasks.gaussians.backends import AdamStep, NativeBackend, backend_for
-from ss_flow.tasks.gaussians.densification import GradientRecord, Schedule, densify
-from ss_flow.tasks.gaussians.initialise import initialise, select
+from ss_flow.tasks.gaussians.densification import GradientRecord, densify
+from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target
 from ss_flow.tasks.gaussians.optimizer import Parameters
-from ss_flow.tasks.gaussians.rasterize import GaussianTensors, device_here, renderer_on
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.torch_backend import TorchBackend
-from ss_flow.tasks.gaussians.trainer import TrainParams, train
-from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.geometry.cameras import Camera
-
-NATIVE = NativeBackend(1)
-CUDA = pytest.param("cuda", marks=pytest.mark.skipif(device_here() != "cuda", reason="no CUDA with gsplat here"))
-
-
-@pytest.fixture
-def stand_in(monkeypatch):
-    """Have the module `gsplat` be its stand-in."""
-    monkeypatch.setitem(sys.modules, "gsplat", gsplat_on_the_cpu)
-
-
-def through_gsplat(device: str) -> TorchBackend:
-    backend = TorchBackend(device)
-    backend._renderer = renderer_on(torch.device("cuda"))
-    return backend
-
-
-@pytest.fixture(params=["torch", "adapter", CUDA])
-def backend(request, monkeypatch) -> TorchBackend:
-    """Each of the backends that are not the native one."""
-    if request.param == "adapter":
-        request.getfixturevalue("stand_in")
-        return through_gsplat("cpu")
-    return TorchBackend("cpu" if request.param == "torch" else "cuda")
-
-
-def tolerance(backend: TorchBackend) -> float:
-    """How far gradients may be from the native ones: gsplat has thresholds of its own."""
-    return 2e-4 if backend._device.type == "cpu" else 2e-3
-
-
-def put(backend, values):
-    return {name: backend.put(value) for name, value in values.items()}
-
-
-def example(seed: int, objective: Objective, *, with_labels: bool):
-    rng = np.random.default_rng(seed)
-    n, h, w = 120, 33, 46
-    parameters = (
-        rng.uniform((-0.8, -0.6, 1.5), (0.8, 0.6, 3.0), (n, 3)),
-        rng.normal(size=(n, 4)),
-        np.log(0.08) + 0.4 * rng.normal(size=(n, 3)),
-        rng.normal(size=n),
-        0.4 * rng.normal(size=(n, 4, 3)),
-    )
-    inside = rng.random((h, w)) < 0.6
-    view = TrainView(
-        Camera(w, h, 40.0, 40.0, w / 2, h / 2, np.eye(4)),
-        rng.random((h, w, 3)).astype(np.float32),
-        inside,
-        ~inside & (rng.random((h, w)) < 0.5),
-        np.where(rng.random((h, w)) < 0.8, 2.0 + rng.random((h, w)), 0).astype(np.float32),
-        rng.integers(-2, 5, (h, w)).astype(np.int32) if with_labels else None,
-    )
-    labels = rng.integers(-1, 7, n).astype(np.int32) if with_labels else None
-    values = {n: np.ascontiguousarray(p, np.float32) for n, p in zip(PARAMETERS, parameters, strict=True)}
-    return values, labels, Target.of(view, objective, 7)
 
 
 @pytest.mark.parametrize("with_labels", [False, True])
@@ -315,196 +248,6 @@ def test_a_step_carries_nothing_to_the_host_or_from_it(stand_in, with_labels):
         backend.host(found.loss)
 
 
-def trained(backend, params: TrainParams, seed: int = 1):
-    """A few dozen Gaussians on four views of a scene of many."""
-    rng = np.random.default_rng(seed)
-    made = initialise(rng.uniform((-0.8, -0.6, 1.5), (0.8, 0.6, 3.0), (150, 3)).astype(np.float32),
-                      rng.integers(0, 255, (150, 3)).astype(np.uint8), 3, 1.0, opacity=0.5)  # fmt: skip
-    views = []
-    for x in (-0.3, -0.1, 0.1, 0.3):
-        pose = np.eye(4)
-        pose[0, 3] = x
-        camera = Camera(46, 33, 40.0, 40.0, 23.0, 16.5, pose)
-        image = render(made, camera).rgb.clip(0, 1)
-        inside = image.sum(axis=2) > 0.2
-        views.append(TrainView(camera, image, inside, ~inside, np.zeros(inside.shape, np.float32)))
-    first = select(made, np.arange(60))
-    return train(first, views, params=params, extent=2.0, seed=seed, backend=backend)
-
-
-def test_a_training_is_the_same_on_every_backend(backend):
-    params = TrainParams(iterations=60, densify="none")
-    ours, theirs = trained(NATIVE, params), trained(backend, params)
-    # Rounding grows from step to step: native trainings that only round otherwise are a thousandth apart in the end.
-    np.testing.assert_allclose(theirs.loss, ours.loss, rtol=20 * tolerance(backend))
-    assert len(ours.gaussians) == len(theirs.gaussians)
-
-
-def test_a_training_that_densifies_is_the_same_until_rounding_parts_them(backend):
-    # A millionth of the gradients decides, some steps later, who is split: then all goes other ways, here too.
-    params = TrainParams(iterations=40, schedule=Schedule(10, 30, 10, 25, shorten=False), max_scale=0.05)
-    ours, theirs = (trained(one, replace(params, densify_grad=1e-5)) for one in (NATIVE, backend))
-    np.testing.assert_allclose(theirs.loss[:20], ours.loss[:20], rtol=0.5 * tolerance(backend))
-    assert len(theirs.gaussians) > 100
-    assert abs(len(ours.gaussians) - len(theirs.gaussians)) <= 0.05 * len(ours.gaussians)
-
-
-def test_a_training_by_torch_repeats_to_the_byte_and_goes_on_after_a_kill(tmp_path):
-    params = TrainParams(iterations=120, schedule=Schedule(10, 90, 10, 60, shorten=False), densify_grad=1e-5)
-    alone = trained(TorchBackend("cpu"), params)
-
-    class Killed(Exception):
-        pass
-
-    def stop(done, total, note):
-        if done == 50:
-            raise Killed
-
-    here = Surroundings(stop, checkpoint=tmp_path / "kept.npz")
-    with running(here), pytest.raises(Killed):
-        trained(TorchBackend("cpu"), params)
-    with running(replace(here, listener=lambda *_: None)):
-        resumed = trained(TorchBackend("cpu"), params)
-    for name in PARAMETERS:
-        assert getattr(resumed.gaussians, name).tobytes() == getattr(alone.gaussians, name).tobytes()
-    assert resumed.loss.tobytes() == alone.loss.tobytes()
-
-
-def test_targets_that_would_fill_the_device_are_carried_there_step_by_step(monkeypatch):
-    params = TrainParams(iterations=40, densify="none")
-    alone = trained(TorchBackend("cpu"), params)
-    full = TorchBackend("cpu")
-    monkeypatch.setattr(full, "_room", lambda: 1000)
-    carried = []
-    put = full.target
-    monkeypatch.setattr(full, "target", lambda target, labels: carried.append(target) or put(target, labels))
-    again = trained(full, params)
-    assert len(carried) >= params.iterations
-    assert again.loss.tobytes() == alone.loss.tobytes()
-    for name in PARAMETERS:
-        assert getattr(again.gaussians, name).tobytes() == getattr(alone.gaussians, name).tobytes()
-
-
-def test_a_training_by_torch_keeps_no_tensor():
-    def alive() -> int:
-        gc.collect()
-        return sum(isinstance(some, torch.Tensor) for some in gc.get_objects())
-
-    params = TrainParams(iterations=60, schedule=Schedule(10, 40, 10, 25, shorten=False), densify_grad=1e-5)
-    trained(TorchBackend("cpu"), params)
-    before = alive()
-    trained(TorchBackend("cpu"), params)
-    assert alive() <= before
-
-
-def test_the_stand_in_takes_what_gsplat_takes():
-    gsplat = pytest.importorskip("gsplat")
-    for name in ("fully_fused_projection", "isect_tiles", "isect_offset_encode", "rasterize_to_pixels",
-                 "rasterize_to_indices_in_range", "spherical_harmonics"):  # fmt: skip
-        ours, theirs = (inspect.signature(getattr(one, name)) for one in (gsplat_on_the_cpu, gsplat))
-        assert [(p.name, p.default) for p in ours.parameters.values()] == [
-            (p.name, p.default) for p in theirs.parameters.values()
-        ]
-
-
-def test_through_gsplat_a_crop_shows_what_its_photo_shows_there(stand_in):
-    values, _, target = example(12, Objective(), with_labels=False)
-    # Some lie far outside the crop, where its own limit of slopes would be another one.
-    gaussians = GaussianTensors(**{n: torch.tensor(v) for n, v in values.items()})
-    gaussians.log_scales += 1
-    renderer, device = renderer_on(torch.device("cuda")), torch.device("cpu")
-    drawn = []
-    for camera in (target.camera, target.camera.cropped(30, 5, 44, 20)):
-        where, settings = renderer.camera_on(device, camera), Settings((0.1, 0.2, 0.3), 0, 1, winners=True)
-        background = torch.tensor(settings.background)
-        drawn.append(renderer.draw(gaussians, where, background, None, settings, torch.zeros(120, 2)))
-    whole, part = drawn
-    for name in ("rgb", "alpha", "depth"):
-        torch.testing.assert_close(getattr(part, name), getattr(whole, name)[5:20, 30:44], rtol=0, atol=1e-5)
-    assert torch.equal(part.top_contributor, whole.top_contributor[5:20, 30:44])
-    assert 0 < int((part.radii > 0).sum()) < int((whole.radii > 0).sum())
-
-
-def test_through_gsplat_a_pixel_that_an_opaque_gaussian_ends_gives_no_weight_to_those_behind(stand_in):
-    """gsplat lists 256 at a time: with 255 in front, the opaque one is the last of a list and the faint ones begin the
-    next."""
-    camera, device, settings = (
-        Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4)),
-        torch.device("cpu"),
-        Settings((0, 0, 0), 0, 0, True),
-    )
-    renderer = renderer_on(torch.device("cuda"))
-    for front in (200, 255, 300):
-        opacity = torch.tensor([0.0117] * front + [0.9996, 0.9, 0.0117])
-        n = len(opacity)
-        gaussians = GaussianTensors(
-            means=torch.stack([torch.zeros(n), torch.zeros(n), torch.linspace(1, 2, n)], dim=1),
-            quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-            log_scales=torch.full((n, 3), np.log(5.0)),
-            opacity_logits=torch.logit(opacity),
-            sh=torch.zeros(n, 1, 3),
-        )
-        where = renderer.camera_on(device, camera)
-        drawn = renderer.draw(gaussians, where, torch.zeros(3), None, settings, torch.zeros(n, 2))
-        assert drawn.max_contribution.sum() == pytest.approx(float(drawn.alpha), abs=1e-5)
-        assert not drawn.max_contribution[front:].any()
-
-
 def test_a_backend_for_cuda_is_of_torch():
     assert isinstance(backend_for("cpu", 2), NativeBackend)
     assert isinstance(backend_for("meta", 2), TorchBackend)
-
-
-def no_memory(*_):
-    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3 GiB.")
-
-
-def no_room_for_a_context(*_):
-    raise RuntimeError("CUDA error: out of memory")
-
-
-def another_error(*_):
-    raise RuntimeError("CUDA error: an illegal memory access was encountered")
-
-
-@pytest.mark.parametrize(
-    ("fails", "told", "match"),
-    [
-        (no_memory, MemoryError, "not enough memory on cpu"),
-        (no_room_for_a_context, MemoryError, "not enough memory on cpu"),
-        (another_error, RuntimeError, "illegal memory access"),
-    ],
-)
-def test_a_device_without_memory_is_told_as_the_host_is(fails, told, match):
-    backend = TorchBackend("cpu")
-    backend.descent = fails
-    with pytest.raises(told, match=match):
-        trained(backend, TrainParams(iterations=3, densify="none"))
-
-
-def test_what_a_device_has_no_memory_for_is_trained_on_the_cpu_in_the_last_try(monkeypatch):
-    full = TorchBackend("cpu")
-    full.descent = no_memory
-    training = sys.modules[train.__module__]
-    monkeypatch.setattr(training, "_device", lambda views: "small")
-    monkeypatch.setattr(training, "backend_for", lambda device, threads: full if device == "small" else NATIVE)
-    params = TrainParams(iterations=3, densify="none")
-    with pytest.raises(MemoryError):
-        trained(None, params)
-    heard: list[str] = []
-    with running(Surroundings(warned=heard, last_try=True)):
-        again = trained(None, params)
-    assert again.loss.tobytes() == trained(NATIVE, params).loss.tobytes()
-    assert heard == ["small has not enough memory for a training of 4 views: it ran on the CPU."]
-
-
-def test_what_a_device_has_no_memory_for_is_drawn_on_the_cpu(monkeypatch):
-    made = initialise(np.array([[0, 0, 2.0]]), np.full((1, 3), 200, np.uint8), 1, 1.0)
-    camera = Camera(32, 24, 30, 30, 16, 12, np.eye(4))
-    expected = render(made, camera)
-    drawing = sys.modules[render.__module__]
-    monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))
-    by_torch = sys.modules["ss_flow.tasks.gaussians.torch_render"]
-    monkeypatch.setattr(by_torch, "_drawn", no_memory)
-    for name, image in expected._asdict().items():
-        assert np.array_equal(getattr(render(made, camera), name), image), name

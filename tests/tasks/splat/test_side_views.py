@@ -13,8 +13,9 @@ from scipy.ndimage import binary_erosion
 
 from ss_flow.tasks.artifacts import Bool
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, neighbour_spread
+from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
 from ss_flow.tasks.gaussians.views import SceneViews
-from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view, project
 from ss_flow.tasks.geometry.sampling import first_of_each_cube, sphere
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.splat.side_views import FEWEST, GAP, RIM, cameras_around, empty, shown_surfaces, side_views
@@ -65,6 +66,17 @@ def test_a_few_points_far_away_hardly_move_the_cameras_back():
         passes = distance_of_rays(camera, np.zeros(3))
         assert not free[passes < 0.5].any()
         assert free[passes > 0.5 + (RIM + 1.5) * spacing].mean() > 0.9  # a stray may stand before or behind
+
+
+@pytest.mark.parametrize("radius", [1e-3, 1e-4])
+def test_a_tiny_thing_is_seen_from_beyond_the_nearest_depth_and_as_large_as_any(radius):
+    ball = sphere(2000).astype(np.float32)
+    spacing = float(np.median(neighbour_spread(ball)))
+    tiny = zip(cameras_around(radius * ball, radius * spacing, 6), cameras_around(ball, spacing, 6), strict=True)
+    for camera, usual in tiny:
+        uv, z = project(radius * ball, camera)
+        assert z.min() > NEAR_PLANE
+        np.testing.assert_allclose(np.ptp(uv, axis=0), np.ptp(project(ball, usual)[0], axis=0), rtol=0.05)
 
 
 @pytest.mark.parametrize(("width", "closed"), [(1.5 * GAP, True), (3 * GAP, False)])
