@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, InstanceMasks, Int32, UInt8
 from ss_flow.tasks.gaussians.library import VotingView, address, library
-from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE, SceneViews
+from ss_flow.tasks.gaussians.views import IGNORED, SceneViews, channels_of_mask
 from ss_flow.tasks.geometry.cameras import surface_of_pixels
 from ss_flow.tasks.geometry.clustering import dbscan, nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
@@ -66,7 +66,7 @@ def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator
     near = (_surface(scene, views, k, *_border(instance.mask(k))) for k in range(len(views)))
     for some, votes, held in _votes(scene, instance, views, near):
         mask = instance.mask(some.place)
-        channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
+        channels = channels_of_mask(mask)
         same = np.where(mask[some.row, some.column], held, votes - held) + 1
         doubtful = (votes >= 2) & (same < share * (votes + 1))
         channels[some.row[doubtful], some.column[doubtful]] = IGNORED
