@@ -70,10 +70,21 @@ def _functions(module_name: str) -> Iterator[FunctionType]:
         for held in list(vars(value).values()) if issubclass(type(value), type) else (value,):
             if isinstance(held, staticmethod | classmethod | property):
                 held = held.fget if isinstance(held, property) else held.__func__
-            while (inner := inspect.getattr_static(held, "__wrapped__", None)) is not None:
+            while (inner := _wrapped(held)) is not None:
                 held = inner
             if type(held) is FunctionType and held.__code__.co_filename == _file(held.__module__):
                 yield held
+
+
+def _wrapped(held: Any) -> Any:
+    """What a wrapper says that it holds; no code of its own is asked.
+
+    A look through all its classes takes a hundred times as long as these two, which almost all are: functions, and what
+    has no place for it.
+    """
+    if type(held) is FunctionType:
+        return held.__dict__.get("__wrapped__")
+    return inspect.getattr_static(held, "__wrapped__", None) if type(held).__dictoffset__ else None
 
 
 def _file(module_name: Any) -> str | None:

@@ -70,7 +70,9 @@ class Renderer:
         shades = (np.array([t.material.shades for t in things]) / 255.0) ** _GAMMA
         self._shades = np.ascontiguousarray(shades.transpose(1, 2, 0))
         rng = np.random.default_rng(seed)
-        self._lattice = rng.random((_LATTICE, _LATTICE, _LATTICE)).astype(np.float32).ravel()
+        lattice = rng.random((_LATTICE, _LATTICE, _LATTICE)).astype(np.float32)
+        self._lattice = lattice.ravel()
+        self._rise = (np.roll(lattice, -1, axis=2) - lattice).ravel()
         self._offset = np.ascontiguousarray(rng.uniform(0, 7, (len(things), 3)).T)
 
     def render(self, camera: Camera, rng: np.random.Generator) -> tuple[UInt8, Float32, NDArray[np.uint16], UInt8]:
@@ -189,18 +191,16 @@ class Renderer:
         base = np.floor(place)
         f = (place - base).astype(np.float32)
         f = f * f * (3 - 2 * f)
-        low = base.astype(np.intp) & (_LATTICE - 1)
-        high = (low + 1) & (_LATTICE - 1)
-        strides = np.array([[_LATTICE**2], [_LATTICE], [1]])
-        steps = low * strides, high * strides
-        value = np.zeros(len(f[0]), np.float32)
+        x, y, z = base.astype(np.int32) & (_LATTICE - 1)
+        planes = x * _LATTICE**2, ((x + 1) & (_LATTICE - 1)) * _LATTICE**2
+        rows = y * _LATTICE + z, ((y + 1) & (_LATTICE - 1)) * _LATTICE + z
+        value = np.zeros(len(x), np.float32)
         for dx in (0, 1):
             wx = f[0] if dx else 1 - f[0]
             for dy in (0, 1):
                 wy = f[1] if dy else 1 - f[1]
-                row = steps[dx][0] + steps[dy][1]
-                near, far = self._lattice.take(row + low[2]), self._lattice.take(row + high[2])
-                value += wx * wy * (near + (far - near) * f[2])
+                at = (planes[dx] + rows[dy]).astype(np.intp)  # as `take` wants it
+                value += wx * wy * (self._lattice.take(at) + self._rise.take(at) * f[2])
         return value.astype(np.float64)
 
 

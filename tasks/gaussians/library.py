@@ -28,7 +28,7 @@ _INT, _INT32, _INT64, _DOUBLE, _FLOAT, _POINTER = (
 NATIVE_SOURCES = (
     "native/binning.h", "native/blending.h", "native/harmonics.h", "native/lanes.h", "native/losses.cpp",
     "native/parallel.h", "native/patchmatch.cpp", "native/projection.h", "native/rasterizer.cpp", "native/rows.h",
-    "native/scene.h", "native/workspace.h",
+    "native/scene.h", "native/votes.cpp", "native/workspace.h",
 )  # fmt: skip
 """What the results depend on besides this module: its digests count in the keys of the tasks that use it.
 
@@ -89,8 +89,20 @@ class StereoProblem(ctypes.Structure):
     )
 
 
-_SCENE, _IMAGES, _GRADIENTS, _PROBLEM = (
-    ctypes.POINTER(structure) for structure in (Scene, Images, Gradients, StereoProblem)
+class VotingView(ctypes.Structure):
+    """`VotingView` of native/votes.cpp."""
+
+    _fields_ = (
+        *((name, _POINTER) for name in ("depth", "mask", "rows", "columns")),
+        *((name, _INT32) for name in ("width", "height", "depth_width", "number")),
+        *((name, _DOUBLE) for name in ("fx", "fy", "cx", "cy")),
+        ("world_to_camera", _DOUBLE * 12),
+        *((name, _DOUBLE) for name in ("tolerance", "share")),
+    )
+
+
+_SCENE, _IMAGES, _GRADIENTS, _PROBLEM, _VIEW = (
+    ctypes.POINTER(structure) for structure in (Scene, Images, Gradients, StereoProblem, VotingView)
 )
 _INTERFACE: dict[str, tuple[Any, list[Any]]] = {
     "ss_workspace": (_POINTER, []),
@@ -104,6 +116,7 @@ _INTERFACE: dict[str, tuple[Any, list[Any]]] = {
     "ss_surface_loss": (None, [_INT64, *[_POINTER] * 9, _FLOAT, _FLOAT, _INT, *[_POINTER] * 3]),
     "ss_adam": (None, [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE, _INT]),
     "ss_patchmatch": (_INT, [_PROBLEM]),
+    "ss_vote": (None, [_VIEW, _INT64, *[_POINTER] * 4]),
 }
 """What each function returns and takes."""
 

@@ -99,6 +99,13 @@ class CropParams:
     """Longest side of the crop, pixels; larger crops are scaled down."""
 
 
+def channels_of_mask(mask: Bool) -> Int32:
+    """What `group_view` takes of an instance with this mask [H, W]: 0 inside, NONE_OF_MINE outside."""
+    channels = np.full(mask.shape, NONE_OF_MINE, np.int32)
+    channels[mask] = 0
+    return channels
+
+
 def sample_depth(depth: DepthMap, full: Camera, crop: Camera) -> Float32:
     """A view's depth at the pixel centres of a crop of its camera, nearest neighbour: [h, w], 0 where unknown.
 
@@ -238,8 +245,10 @@ class _Crop:
     """[h, w] z-depth, world units, 0 = unknown."""
 
     def training(self, free: Bool) -> TrainView:
-        ids = np.where(self.inside, self.channels, np.where(free, NONE_OF_MINE, IGNORED)).astype(np.int32)
-        depth = np.where(self.inside, self.depth, 0).astype(np.float32)
+        ids = np.full(free.shape, IGNORED, np.int32)
+        ids[free] = NONE_OF_MINE
+        np.copyto(ids, self.channels, where=self.inside)
+        depth = np.where(self.inside, self.depth, np.float32(0))
         return TrainView(self.camera, self.image, self.inside, free, depth, ids)
 
 

@@ -5,6 +5,7 @@ Beyond Split&Splat.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -12,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, InstanceMasks, Int32, UInt8
-from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE, SceneViews
+from ss_flow.tasks.gaussians.library import VotingView, address, library
+from ss_flow.tasks.gaussians.views import IGNORED, SceneViews, channels_of_mask
 from ss_flow.tasks.geometry.cameras import surface_of_pixels
 from ss_flow.tasks.geometry.clustering import dbscan, nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
-from ss_flow.tasks.geometry.images import shared_rgb
+from ss_flow.tasks.geometry.images import pixels_under, shared_rgb
 from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.packed import bounds
 
@@ -64,7 +66,7 @@ def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator
     near = (_surface(scene, views, k, *_border(instance.mask(k))) for k in range(len(views)))
     for some, votes, held in _votes(scene, instance, views, near):
         mask = instance.mask(some.place)
-        channels = np.where(mask, 0, NONE_OF_MINE).astype(np.int32)
+        channels = channels_of_mask(mask)
         same = np.where(mask[some.row, some.column], held, votes - held) + 1
         doubtful = (votes >= 2) & (same < share * (votes + 1))
         channels[some.row[doubtful], some.column[doubtful]] = IGNORED
@@ -149,18 +151,48 @@ def _votes(
 ) -> Iterator[tuple[_Pixels, Int32, Int32]]:
     """The pixels of each view, [N] how many other views see each one's point, and how many of these have it in their
     mask."""
-    asked = [(k, instance.mask(k)) for k in range(0, len(views), -(-len(views) // MOST_VIEWS))]
+    asked = [Voter(scene, views[k], instance.mask(k), k) for k in range(0, len(views), -(-len(views) // MOST_VIEWS))]
     for some in _some_together(of_views):
         sizes = [len(pixels.points) for pixels in some]
-        points, place = np.concatenate([p.points for p in some]), np.repeat([p.place for p in some], sizes)
+        points = np.concatenate([pixels.points for pixels in some])
+        place = np.repeat(np.array([pixels.place for pixels in some], np.int32), sizes)
         seen, held = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
-        for k, mask in asked:
-            visible, column, row, _ = scene.surface_points(views[k], points)
-            other = place[visible] != k
-            seen[visible] += other
-            held[visible] += other & mask[row, column]
+        for voter in asked:
+            voter.vote(points, place, seen, held)
         ends = np.cumsum(sizes)[:-1]
         yield from zip(some, np.split(seen, ends), np.split(held, ends), strict=True)
+
+
+class Voter:
+    """A view that is asked about points of a surface; the loop is in native/votes.cpp, beside the rasterizer."""
+
+    def __init__(self, scene: SceneViews, view: int, mask: Bool, place: int) -> None:
+        """place: of the view among those of the instance."""
+        camera, depth, visibility = scene.cameras[view], scene.depths[view].depth, scene.visibility
+        height, width = depth.shape
+        rows, columns = pixels_under(camera.height, height), pixels_under(camera.width, width)
+        self._arrays = np.ascontiguousarray(depth), mask, rows, columns  # the view below holds only their addresses
+        self._view = VotingView(
+            *(array.ctypes.data for array in self._arrays),
+            camera.width,
+            camera.height,
+            width,
+            place,
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            (ctypes.c_double * 12)(*np.asarray(camera.world_to_camera, np.float64)[:3].ravel()),
+            visibility.tau_depth * scene.unit.length,
+            visibility.tau_depth * visibility.share_of_depth,
+        )
+
+    def vote(self, points: Float32, place: Int32, seen: Int32, held: Int32) -> None:
+        """Count which points [N, 3] the view sees, as `surface_points` tells, and which of these its mask holds; none
+        of its own. place: [N] of each point's view."""
+        library().ss_vote(
+            ctypes.byref(self._view), len(points), address(points), address(place), address(seen), address(held)
+        )
 
 
 def _some_together(of_views: Iterable[_Pixels]) -> Iterator[list[_Pixels]]:

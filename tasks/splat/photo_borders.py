@@ -14,6 +14,7 @@ from ss_flow.tasks.artifacts import Float32, Int32, UInt8
 from ss_flow.tasks.geometry.images import near_border
 
 _Ids = NDArray[np.uint16]
+_Flat = NDArray[np.intp]
 
 
 def settled_by_photo(rgb: UInt8, masks: _Ids, shown: _Ids, reach: int) -> _Ids:
@@ -30,12 +31,11 @@ def settled_by_photo(rgb: UInt8, masks: _Ids, shown: _Ids, reach: int) -> _Ids:
         return shown
     thin = np.ones(int(strip.max()) + 1, bool)
     thin[strip[~near_border(strip.astype(np.float32), reach)]] = False
-    first, second = _side_by_side(*strip.shape)
+    own, beside = _side_by_side(np.flatnonzero(strip), *strip.shape)
     change = _change(rgb).ravel()
-    square = np.maximum(change[first], change[second]).astype(np.float64) ** 2
+    square = np.maximum(change[own], change[beside]).astype(np.float64) ** 2
     cost = np.exp(-square / max(2 * float(np.mean(change.astype(np.float64) ** 2)), 1e-12))
-    own, beside = np.concatenate([first, second]), np.concatenate([second, first])
-    of, cost = strip.ravel()[own], np.concatenate([cost, cost])
+    of = strip.ravel()[own]
     by_masks, by_scene = (
         np.bincount(of, cost * (ids.ravel()[own] != ids.ravel()[beside]), len(thin)) for ids in (masks, shown)
     )
@@ -51,21 +51,22 @@ def _strips(masks: _Ids, shown: _Ids) -> Int32:
 
     differs = ((masks != shown) & (masks > 0)).ravel()
     row = np.cumsum(differs) - 1
-    first, second = _side_by_side(*masks.shape)
+    own, beside = _side_by_side(np.flatnonzero(differs), *masks.shape)
     pair = masks.astype(np.int64).ravel() << 16 | shown.ravel()
-    same = differs[first] & differs[second] & (pair[first] == pair[second])
+    same = (own < beside) & differs[beside] & (pair[own] == pair[beside])
     count = int(differs.sum())
-    links = coo_array((np.ones(int(same.sum()), bool), (row[first[same]], row[second[same]])), (count, count))
+    links = coo_array((np.ones(int(same.sum()), bool), (row[own[same]], row[beside[same]])), (count, count))
     strip = np.zeros(masks.size, np.int32)
     strip[differs] = 1 + connected_components(links, directed=False)[1]
     return strip.reshape(masks.shape)
 
 
-def _side_by_side(height: int, width: int) -> tuple[Int32, Int32]:
-    """Flat indices of all pairs of pixels side by side or one above the other."""
-    pixel = np.arange(height * width, dtype=np.int32).reshape(height, width)
-    first = np.concatenate([pixel[:, :-1].ravel(), pixel[:-1].ravel()])
-    return first, np.concatenate([pixel[:, 1:].ravel(), pixel[1:].ravel()])
+def _side_by_side(pixels: _Flat, height: int, width: int) -> tuple[_Flat, _Flat]:
+    """Flat indices of pixels, and of those right of, below, left of and above them in the image."""
+    row, column = np.divmod(pixels, width)
+    sides = ((1, column < width - 1), (width, row < height - 1), (-1, column > 0), (-width, row > 0))
+    own, steps = [pixels[there] for _, there in sides], [step for step, _ in sides]
+    return np.concatenate(own), np.concatenate([some + step for some, step in zip(own, steps, strict=True)])
 
 
 def _change(rgb: UInt8) -> Float32:

@@ -18,12 +18,12 @@ from ss_flow.tasks.gaussians.objective import Objective
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import (
-    NONE_OF_MINE,
     CropParams,
     PointSurface,
     SceneViews,
     Views,
     background_view,
+    channels_of_mask,
     group_view,
 )
 from ss_flow.tasks.geometry.cameras import camera_extent
@@ -253,7 +253,7 @@ def _channels(scene: SceneViews, instance: InstanceMasks, params: ReconstructPar
     # What is background is what is left over: there is no mask of it to doubt.
     if params.tau_agree and instance.instance_id:
         return agreed(scene, instance, params.tau_agree)
-    return (np.where(mask, 0, NONE_OF_MINE).astype(np.int32) for mask in map(instance.mask, range(len(instance.views))))
+    return map(channels_of_mask, map(instance.mask, range(len(instance.views))))
 
 
 def _settings(params: ReconstructParams, iterations: int, scale: float) -> TrainParams:

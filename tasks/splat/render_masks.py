@@ -91,16 +91,18 @@ def render_masks(
 
 def _ids_of_view(scene: Gaussians, camera: Camera, known: np.ndarray, share: float) -> np.ndarray:
     """[H, W] uint16."""
-    whole = render(scene, camera, winners=False)
-    shown = select(scene, whole.visible)
     ids = np.zeros((camera.height, camera.width), np.uint16)
     heaviest, of_known = np.zeros(ids.shape, np.float32), np.zeros(ids.shape, np.float32)
-    present = np.unique(shown.instance_id)
     at_once = max(1, _MASK_BYTES // heaviest.nbytes)
+    present = np.unique(scene.instance_id)
+    few = len(present) <= at_once  # so that one rendering shows them all
+    whole = render(scene, camera, label_ids=present.tolist() if few else (), winners=False)
+    shown = scene if few else select(scene, whole.visible)
+    present = np.unique(shown.instance_id)
     for start in range(0, len(present), at_once):
         labels = present[start : start + at_once]
-        weights = render(shown, camera, label_ids=labels.tolist(), winners=False).label_masks
-        for label, weight in zip(labels, weights, strict=True):
+        drawn = whole if few else render(shown, camera, label_ids=labels.tolist(), winners=False)
+        for label, weight in zip(labels, drawn.label_masks, strict=True):
             ids[weight > heaviest] = label
             np.maximum(heaviest, weight, out=heaviest)
             np.copyto(of_known, weight, where=known == label)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from ball_and_box import BALL as CENTRE
 from ball_and_box import HEIGHT, RADIUS, WIDTH, SmallScene
+from native_builds import skip_without
 from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import InstanceMasks
+from ss_flow.tasks.gaussians import library
 from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.splat.consensus import agreed, completed
+from ss_flow.tasks.splat.consensus import Voter, agreed, completed
 
 BALL = 2
 
@@ -36,6 +38,31 @@ def channels_of(small: SmallScene, instance: InstanceMasks, share: float = 0.5) 
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)) > 0
+
+
+@pytest.mark.parametrize("build", library.BUILDS)
+@pytest.mark.parametrize("scale", [1, 2])
+def test_a_view_votes_on_the_points_that_it_sees_and_on_those_that_its_mask_holds(small, build, scale, monkeypatch):
+    skip_without(build)
+    monkeypatch.setattr("ss_flow.tasks.splat.consensus.library", lambda: library.library(build))
+    depths = [replace(d, depth=np.repeat(np.repeat(d.depth, scale, 0), scale, 1)) for d in small.depths]
+    depths[3].depth[: HEIGHT // 2 * scale] = 0  # unknown there
+    scene = replace(small.views, depths=depths).compared(VisibilityParams())
+    rng = np.random.default_rng(5)
+    points = np.concatenate([small.points[::7], rng.normal(0, 2, (2000, 3)).astype(np.float32)])
+    place = rng.integers(0, 6, len(points)).astype(np.int32)
+    mask = rng.random((HEIGHT, WIDTH)) < 0.5
+    seen, held = np.zeros(len(points), np.int32), np.ones(len(points), np.int32)
+    Voter(scene, 3, mask, 2).vote(points, place, seen, held)
+
+    rows, column, row, _ = scene.surface_points(3, points)
+    others = place[rows] != 2
+    expected = np.zeros_like(seen), np.ones_like(held)
+    expected[0][rows] += others
+    expected[1][rows] += others & mask[row, column]
+    assert 100 < others.sum() < len(rows) < len(points) / 2
+    # A point on the border between two pixels may fall on either side of it.
+    assert ((seen != expected[0]) | (held != expected[1])).sum() <= 1
 
 
 def test_masks_on_which_all_views_agree_stay_as_they_are(small):
