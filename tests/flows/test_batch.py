@@ -144,7 +144,7 @@ def test_a_scene_that_lost_an_instance_is_degraded(den, tmp_path, monkeypatch):
         return real(instance, params)
 
     monkeypatch.setattr(reconstruct_module, "_from_points", begin)
-    called = batch_tiny(tmp_path / "store", tmp_path / "batch", den)
+    called = batch_tiny(tmp_path / "store", tmp_path / "batch", den, "--executor", "threads")
     assert called.code == 3
     (row,) = called.document()
     assert (row["status"], row["out"]) == ("degraded", str(tmp_path / "batch/den"))

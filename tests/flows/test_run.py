@@ -275,7 +275,7 @@ def test_a_dry_run_tells_of_many_nodes_of_a_step_once(warm, tmp_path):
 
 @pytest.fixture
 def failing(monkeypatch):
-    """Have the training of some instances fail."""
+    """Have the training of some instances fail, in runs that start no process of their own."""
     real = reconstruct_module._from_points
 
     def fail(which) -> None:
@@ -291,7 +291,7 @@ def failing(monkeypatch):
 
 def test_when_one_instance_fails_the_others_are_delivered_and_the_run_is_degraded(tiny, failing, tmp_path):
     failing(lambda instance_id: instance_id == 2)
-    called = run_tiny(tiny.scene, tmp_path / "store", out=tmp_path / "out")
+    called = run_tiny(tiny.scene, tmp_path / "store", "--executor", "threads", out=tmp_path / "out")
     assert called.code == 3, called.err
     document = called.document()
     assert document["status"] == "degraded"
@@ -318,7 +318,7 @@ def test_a_pair_and_a_last_pass_that_fail_leave_the_union_and_the_run_is_degrade
     for module in ("merge", "global_pass"):
         monkeypatch.setattr(f"ss_flow.tasks.splat.{module}.train", fail)
     all_collide = ["--set", "plan.overlap=voxel", "--set", "plan.voxel=20", "--set", "merge.rates.color=0.03"]
-    called = run_tiny(warm.scene, warm.store, *all_collide, out=warm.out)
+    called = run_tiny(warm.scene, warm.store, *all_collide, "--executor", "threads", out=warm.out)
     assert called.code == 3, called.err
     document = called.document()
     failed = {failure["label"].partition("[")[0] for failure in document["failures"]}

@@ -50,6 +50,11 @@ def generate_desk(seed: int, views: int = 10, width: int = 640, height: int = 48
     return replace(room, depth=depth)
 
 
+def renderer_of_desk(seed: int) -> Renderer:
+    """What photographs the desk of a seed from anywhere."""
+    return Renderer(_furnish(np.random.default_rng(1000 + seed)), seed)
+
+
 def _furnish(rng: np.random.Generator) -> tuple[Thing, ...]:
     """Everything on and around the desk; the walls and the floor have id 0."""
     c = [str(name) for name in rng.permutation(list(COLORS))]
