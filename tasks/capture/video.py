@@ -26,10 +26,13 @@ _A_SECOND = 10
 _FEWEST = 20
 """Frames that a video gives by its length alone, be it without motion."""
 _LIKELY_RATE = 1000
-"""Frames a second above which a video does not know its own rate; _UNKNOWN_RATE is then the step between frames."""
-_UNKNOWN_RATE = 3
+"""Frames a second above which a video does not know its own rate."""
+_STEP = 3
+"""From frame to frame where motion is measured, if the rate is not known."""
 _WIDTH = 160
 """Pixels of a row in which motion is measured."""
+_LEAST_HEIGHT = 64
+"""Pixels of a column, there and for sharpness; in less, OpenCV's flow reads outside of the picture."""
 _TOO_FAR = 3
 """Times the motion that is wanted between frames from which neighbours may have too little in common."""
 
@@ -140,7 +143,7 @@ def _moved(video: Path) -> Float64:
     # The container's own count is often wrong, too low mostly: only one that is far too high tells of a damage.
     announced = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     rate = reader.get(cv2.CAP_PROP_FPS)
-    every = max(1, round(rate / _A_SECOND)) if 0 < rate <= _LIKELY_RATE else _UNKNOWN_RATE
+    every = max(1, round(rate / _A_SECOND)) if 0 < rate <= _LIKELY_RATE else _STEP
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     places, ways, last = [0], [0.0], None
     total = 0
@@ -168,11 +171,11 @@ def _moved(video: Path) -> Float64:
 
 
 def _small_gray(image: UInt8, width: int) -> UInt8:
-    """An image [H, W, 3] BGR in grey, so many pixels wide."""
+    """An image [H, W, 3] BGR in grey, so many pixels wide, and at least _LEAST_HEIGHT high."""
     import cv2
 
     gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    height = max(1, round(width * gray.shape[0] / gray.shape[1]))
+    height = max(_LEAST_HEIGHT, round(width * gray.shape[0] / gray.shape[1]))
     return cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
 
 

@@ -45,6 +45,14 @@ def test_a_still_video_gives_frames_by_its_length(tmp_path):
     assert len(taken(along_a_wall(tmp_path / "b.avi", np.zeros(7)))) == 7
 
 
+def test_a_video_of_a_few_rows_is_read(tmp_path):
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 16))
+    for i in range(30):
+        writer.write(np.ascontiguousarray(WALL[:16, i : i + 320]))
+    writer.release()
+    assert 1 < len(taken(ref(tmp_path / "a.avi"))) <= 30
+
+
 def test_a_video_that_moves_too_far_for_its_frames_is_followed_evenly_with_a_word(tmp_path):
     video = along_a_wall(tmp_path / "a.avi", np.linspace(0, 800, 200))
     with pytest.warns(
