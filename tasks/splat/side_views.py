@@ -136,7 +136,7 @@ def cameras_around(points: Float32, spacing: float, count: int) -> Iterator[Came
     farthest = np.linalg.norm(np.abs(points - middle).max(axis=0))
     radius = min(GROWN * np.linalg.norm(high - low) / 2, farthest) + GAP * spacing
     size = int(np.clip(np.ceil(4 * radius / spacing), 16, MOST_PIXELS))
-    away = max(4.0, 1 + NEAR_PLANE / radius)  # radii; of what is tiny, none of it before the nearest depth
+    away = max(4.0, 1 + NEAR_PLANE / float(radius))  # radii; of what is tiny, none of it before the nearest depth
     focal = size / 2 * np.sqrt(away**2 - 1)  # a sphere seen from there
     for direction in sphere(count):
         pose = looking(middle + away * radius * direction, -direction, np.array([0.0, 0.0, 1.0]))
