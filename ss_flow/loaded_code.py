@@ -56,9 +56,15 @@ def bound_in(module_name: str) -> dict[str, list[Any]]:
 
 
 def _code(held: Any) -> Any:
-    if isinstance(held, staticmethod | classmethod | property):
-        held = held.fget if isinstance(held, property) else held.__func__
+    held = _in_class(held)
     return held.__code__ if type(held) is FunctionType else held
+
+
+def _in_class(held: Any) -> Any:
+    """The function that a class holds as a static or class method, or as a property; anything else as it is."""
+    if isinstance(held, property):
+        return held.fget
+    return held.__func__ if isinstance(held, staticmethod | classmethod) else held
 
 
 def _functions(module_name: str) -> Iterator[FunctionType]:
@@ -68,8 +74,7 @@ def _functions(module_name: str) -> Iterator[FunctionType]:
     """
     for value in list(vars(sys.modules[module_name]).values()):
         for held in list(vars(value).values()) if issubclass(type(value), type) else (value,):
-            if isinstance(held, staticmethod | classmethod | property):
-                held = held.fget if isinstance(held, property) else held.__func__
+            held = _in_class(held)
             while (inner := _wrapped(held)) is not None:
                 held = inner
             if type(held) is FunctionType and held.__code__.co_filename == _file(held.__module__):
