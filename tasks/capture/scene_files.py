@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ss_flow.cache import plain_json
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.lens import Lens
@@ -220,17 +219,9 @@ def read_json(path: Path) -> Any:
 
     Raises InputError when it is absent or no JSON, or names something twice in one object.
     """
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict(pairs)
-        if len(found) < len(pairs):
-            twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
-            raise ValueError(f"{twice!r} stands twice in one object")
-        return found
-
     try:
-        return json.loads(read_text(path), object_pairs_hook=unique)
-    except (ValueError, RecursionError) as error:
+        return plain_json.read_json(read_text(path), once=True)
+    except ValueError as error:
         raise InputError(f"{path} is not valid JSON ({error}).") from error
 
 
