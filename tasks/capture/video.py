@@ -57,6 +57,11 @@ class VideoParams:
     jpeg_quality: JpegQuality = 95
     """Quality at which frames are encoded; 0 keeps them lossless as PNG."""
 
+    @property
+    def by_motion(self) -> bool:
+        """Whether motion says which frames are taken, and not their number."""
+        return self.motion > 0 and not self.stride
+
     def every(self, stride: int) -> VideoParams:
         """Where only one frame out of so many of them is to be taken."""
         return replace(
@@ -77,7 +82,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
     Warns where fewer frames can be decoded than the video announces.
     Raises InputError when the video cannot be opened or shows nothing.
     """
-    moved = _moved(video.path)
+    moved = _moved(video.path, measured=params.by_motion)
     total = len(moved)
     starts = _starts(moved, params)
     reader = open_video(video.path)
@@ -107,7 +112,7 @@ def video_frames(*, video: FileRef, params: VideoParams = VideoParams()) -> tupl
 def _starts(moved: Float64, params: VideoParams) -> list[int]:
     """The frames at which the stretches of a video begin, ascending, from 0."""
     total = len(moved)
-    if params.stride or not params.motion:
+    if not params.by_motion:
         stride = max(params.stride, -(-total // params.max_frames))
         if 0 < params.stride < stride:
             warn(
@@ -127,11 +132,12 @@ def _starts(moved: Float64, params: VideoParams) -> list[int]:
     return [int(i) for i in np.unique(stretch, return_index=True)[1]]
 
 
-def _moved(video: Path) -> Float64:
+def _moved(video: Path, *, measured: bool) -> Float64:
     """[frames] how far the picture of a video has moved from its first frame on, all ways added up, in its diagonals.
 
     The motion between two frames is the mean length of the optical flow over all pixels (Kroeger et al., "Fast Optical
-    Flow using Dense Inverse Search"), measured some times a second; in between it is taken to be even.
+    Flow using Dense Inverse Search"), measured some times a second; in between it is taken to be even. All 0 where it
+    is not to be measured.
     """
     import cv2
 
@@ -148,7 +154,7 @@ def _moved(video: Path) -> Float64:
     places, ways, last = [0], [0.0], None
     total = 0
     while reader.grab():
-        if total % every == 0:
+        if measured and total % every == 0:
             ok, image = reader.retrieve()
             if ok:
                 gray = _small_gray(image, _WIDTH)
