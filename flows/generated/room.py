@@ -176,9 +176,9 @@ def write_scene(
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} already exists and is not an empty folder; name a new one for the generated scene.")
-    _write_views(room, folder)
+    write_views(room, folder)
     if len(room.held_out):
-        _write_views(room.held_out, folder / "held_out")
+        write_views(room.held_out, folder / "held_out")
     names = {str(o.instance_id): o.name for o in (room.structure, *room.objects)}
     (folder / "instances.json").write_text(json.dumps(names, indent=1) + "\n", encoding="utf-8")
     if room.parts.any():
@@ -276,7 +276,8 @@ def _points(views: Views) -> dict[str, Any]:
     }
 
 
-def _write_views(views: Views, folder: Path) -> None:
+def write_views(views: Views, folder: Path) -> None:
+    """Write views as `write_scene` writes those of a room, without what its things are called."""
     import cv2
 
     for i, name in enumerate(views.cameras.names):
