@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
+from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.split.agreement import ramp
 from ss_flow.tasks.split.votes.touching import Borders
 
@@ -32,6 +33,13 @@ class Contact:
         between = np.asarray(member.T @ self.points @ member, np.float32)
         np.fill_diagonal(between, 0)
         return Contact(between, np.asarray(self.size @ member, np.float32))
+
+    def parted(self, members: tuple[int, ...]) -> list[tuple[int, ...]]:
+        """These pieces, together those that touch each other, directly or by others of these."""
+        from scipy.sparse.csgraph import connected_components
+
+        _, part = connected_components(self.points[np.ix_(members, members)] > 0, directed=False)
+        return [tuple(np.array(members)[rows].tolist()) for rows in rows_by_label(part).values()]
 
     def own(self, member: Float32) -> Float64:
         """[S] share of what the pieces of each set touch, each for itself, that is of the set, 0..1."""

@@ -39,6 +39,7 @@ from ss_flow.tasks.split.looks import Looks
 from ss_flow.tasks.split.mounds import Mounds, find_mounds
 from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
+from ss_flow.tasks.split.supports import Supports, find_supports
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
@@ -125,12 +126,13 @@ def hierarchy(
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)
     contact = find_contact(ends, labels.label)
     sheets = find_sheets(points, labels, ends, flush=params.flush, height=params.bulge)
+    supports = find_supports(points, cameras, labels, height=params.bulge)
     edges = np.zeros((len(leaves), len(leaves)), bool)
     if params.convex:
         edges = convex_edges(points, cameras, visibility, labels.label, ends)
     inlays = find_inlays(looks, labels.label, ~is_stuff & (params.inlaid > 0))
     own: list[Members] = [(row,) for row in range(len(leaves))]
-    pieces = _Pieces(views_of(leaves, tallies), is_stuff, contact, edges, own, mounds, sheets, inlays, params)
+    pieces = _Pieces(views_of(leaves, tallies), is_stuff, contact, edges, own, mounds, sheets, supports, inlays, params)
     node, parent, agreement, stuff = leaves.tolist(), [0] * len(leaves), [1.0] * len(leaves), is_stuff.tolist()
     top = list(range(len(leaves)))  # the tree's row of each piece
     lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
@@ -169,6 +171,7 @@ class _Pieces:
     """G x the labels (rows) that each is made of."""
     mounds: Mounds
     sheets: Sheets
+    supports: Supports
     inlays: Inlays
     params: HierarchyParams
 
@@ -215,7 +218,7 @@ class _Pieces:
             taken |= set(sets[row])
         return chosen
 
-    def _agreements(self, sets: list[Members], groups: dict[Members, tuple[Members, Members]]) -> Float64:
+    def _agreements(self, sets: list[Members], groups: dict[Members, tuple[Members, ...]]) -> Float64:
         """How far the views agree on each set, less or more by what its places tell: [S]. groups: as of `_sets`."""
         member = np.zeros((len(sets), len(self.stuff)), np.float32)
         for row, members in enumerate(sets):
@@ -236,9 +239,9 @@ class _Pieces:
         agreement *= np.where(is_group, _ON_TOP, np.where(self.contact.hang_together(member), 1, 1 - params.apart))
         return agreement
 
-    def _sets(self) -> tuple[list[Members], dict[Members, tuple[Members, Members]]]:
+    def _sets(self) -> tuple[list[Members], dict[Members, tuple[Members, ...]]]:
         """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
-        on the others. For each set in which something does, what is below, and what stands on that."""
+        on the others. For each set in which something does, what is below, and each thing that stands on that."""
         shown: Counter[Members] = Counter()
         for view in self.counted:
             for shows in view.shows:
@@ -252,7 +255,7 @@ class _Pieces:
                 left.setdefault(left[members], self._below(left[members]))
         sets = [members for members, _ in sorted(shown.items(), key=lambda item: (-item[1], item[0]))[:_MOST_SETS]]
         return sets, {
-            members: (below, tuple(piece for piece in members if piece not in below))
+            members: (below, *self.contact.parted(tuple(piece for piece in members if piece not in below)))
             for members, below in left.items()
             if below != members
         }
@@ -285,5 +288,20 @@ class _Pieces:
         labels = [row for piece in members for row in self.labels[piece]]
         on_top = dict(zip(labels, self.mounds.standing(labels).tolist(), strict=True))
         on_sheet = self.sheets.standing([self.labels[piece] for piece in members])
-        risen = zip(members, on_sheet.tolist(), strict=True)
-        return tuple(piece for piece, rises in risen if not (rises or all(on_top[row] for row in self.labels[piece])))
+        on_level = self._on_level(members)
+        return tuple(
+            piece
+            for piece, rises in zip(members, on_sheet.tolist(), strict=True)
+            if not (rises or piece in on_level or all(on_top[row] for row in self.labels[piece]))
+        )
+
+    def _on_level(self, members: Members) -> set[int]:
+        """Those of these pieces that, with those they touch, stand on a level one."""
+        found: set[int] = set()
+        for base in members:
+            levels = self.supports.levels(self.labels[base])
+            for part in self.contact.parted(tuple(piece for piece in members if piece != base)) if levels else []:
+                labels = tuple(row for piece in part for row in self.labels[piece])
+                if any(self.supports.hold(level, labels) for level in levels):
+                    found.update(part)
+        return found

@@ -1,7 +1,8 @@
 """How many things are exactly one instance: Split with a segmenter's masks on generated rooms of composite things.
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
-                                          [--gripper | --sensor | --desk] [--lying] [--store DIR] [--look DIR]
+                                          [--gripper | --sensor | --desk | --kitchen | --shelf] [--lying]
+                                          [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
 whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
@@ -9,8 +10,8 @@ a tenth), mIoU, PQ, over- and under-segmentation, in per cent; the predicted ids
 each thing its best IoU, and of how many predicted ids each covers at least a tenth of it. With --store, rooms and
 results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
 shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
-of small things on a table, in few near views of a depth sensor. With --lying, photos lie on their side, as a phone
-stores them.
+of small things on a table, in few near views of a depth sensor; with --kitchen, a kitchen, with --shelf, a shelf of
+goods instead (`tests/support/generated_*.py`). With --lying, photos lie on their side, as a phone stores them.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from depth_sensor import sensed
 from generated_desk import generate_desk
+from generated_kitchen import generate_kitchen
+from generated_shelf import generate_shelf
 
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
@@ -49,6 +52,7 @@ from ss_flow.tasks.evaluate.panoptic import pieces, whole
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 
 ROOM = RoomParams(composite=True, views=24, width=480, height=360, held_out=0)
+OTHERS = {"desk": generate_desk, "kitchen": generate_kitchen, "shelf": generate_shelf}
 COLUMNS = ("whole", "miou", "pq", "over_segmentation", "under_segmentation")
 COUNTS = ("num_predicted", "num_truth")
 STEPS = "ingest", "masks_split"
@@ -73,11 +77,11 @@ def folder_of(room: RoomParams, place: Path, sensor: bool = False) -> Path:
     return folder
 
 
-def desk_of(seed: int, place: Path) -> Path:
-    """The capture of a desk, likewise."""
-    folder = place / f"desk-{seed}"
+def other_of(kind: str, seed: int, place: Path) -> Path:
+    """The capture of a desk, a kitchen or a shelf, likewise."""
+    folder = place / f"{kind}-{seed}"
     if not folder.exists():
-        write_scene(generate_desk(seed), folder)
+        write_scene(OTHERS[kind](seed), folder)
     return folder
 
 
@@ -155,7 +159,8 @@ def main() -> None:
     scene = parser.add_mutually_exclusive_group()
     scene.add_argument("--gripper", action="store_true", help="with a gripper before the lens")
     scene.add_argument("--sensor", action="store_true", help="with the depth of a depth camera")
-    scene.add_argument("--desk", action="store_true", help="desks instead of rooms")
+    for kind in OTHERS:
+        scene.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=f"a {kind}, not a room")
     parser.add_argument("--lying", action="store_true", help="photos that lie on their side")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
@@ -164,7 +169,7 @@ def main() -> None:
     with nullcontext(args.store) if args.store else tempfile.TemporaryDirectory() as kept:
         for seed in args.seeds:
             room = replace(ROOM, seed=seed, gripper=args.gripper)
-            folder = desk_of(seed, Path(kept)) if args.desk else folder_of(room, Path(kept), args.sensor)
+            folder = other_of(args.kind, seed, Path(kept)) if args.kind else folder_of(room, Path(kept), args.sensor)
             folder = lying(folder) if args.lying else folder
             found = outcome(folder, params, Store(Path(kept)))
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from depth_sensor import noisy, with_holes
+from household import sized
 
 from ss_flow.flows.generated.composite_room import TABLE, in_a_row, structure, table
 from ss_flow.flows.generated.composites import Composite, Piece, book, brick, cup, paint, picture, printed_box
@@ -59,11 +60,11 @@ def _furnish(rng: np.random.Generator) -> tuple[Thing, ...]:
     """Everything on and around the desk; the walls and the floor have id 0."""
     c = [str(name) for name in rng.permutation(list(COLORS))]
     turn = rng.uniform(-0.2, 0.2)
-    mug = _sized(cup(c[0], c[8], "white"), 0.6).turned(rng.uniform(-2.6, -0.2))
-    printed = _sized(printed_box(c[2:], rng), 0.6).turned(rng.uniform(-0.6, 0.6))
-    toy = _sized(brick(c[1], "grey", rng), 0.75).turned(rng.uniform(-0.5, 0.5))
+    mug = sized(cup(c[0], c[8], "white"), 0.6).turned(rng.uniform(-2.6, -0.2))
+    printed = sized(printed_box(c[2:], rng), 0.6).turned(rng.uniform(-0.6, 0.6))
+    toy = sized(brick(c[1], "grey", rng), 0.75).turned(rng.uniform(-0.5, 0.5))
     flowers = Composite(f"{c[5]} vase", (Piece("vase", vase(0.06, 0.2), paint(c[5])),))
-    lying = _sized(book(c[3], c[4]), 0.8).turned(rng.uniform(-0.4, 0.4))
+    lying = sized(book(c[3], c[4]), 0.8).turned(rng.uniform(-0.4, 0.4))
     on_desk = [*in_a_row([mug, printed, toy], -0.08, rng), *in_a_row([lying, flowers], 0.22, rng)]
     paper = _page().turned(rng.uniform(-0.5, 0.5))
     on_desk.append(paper.moved(rng.choice([-1, 1]) * rng.uniform(0.25, 0.35), -0.1 + rng.uniform(-0.1, 0.1), 0))
@@ -89,10 +90,6 @@ def _coaster(color: str, ring: str) -> Composite:
     """A disc of 6 mm with a lighter middle."""
     disc, middle = can(0.055, 0.006), can(0.035, 0.0068)
     return Composite(f"{color} coaster", (Piece("disc", disc, paint(color)), Piece("ring", middle, paint(ring))))
-
-
-def _sized(thing: Composite, factor: float) -> Composite:
-    return replace(thing, pieces=tuple(replace(piece, mesh=piece.mesh.sized(factor)) for piece in thing.pieces))
 
 
 def _poses(views: int, rng: np.random.Generator) -> Float64:

@@ -71,3 +71,12 @@ def test_pieces_that_become_one_touch_what_they_touched():
     member = np.array([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     joined = a_row().joined(member)
     assert joined.points.tolist() == [[0, 50, 0], [50, 0, 50], [0, 50, 0]] and joined.size.tolist() == [130, 3, 100]
+
+
+def test_pieces_that_touch_by_others_of_the_same_set_are_together():
+    points = np.zeros((6, 6), np.float32)
+    for a, b in ((0, 3), (3, 5), (1, 2), (2, 4)):
+        points[a, b] = points[b, a] = 7
+    contact = Contact(points, np.ones(6, np.float32))
+    assert contact.parted((0, 1, 3, 4, 5)) == [(0, 3, 5), (1,), (4,)]
+    assert contact.parted((4, 2, 1)) == [(4, 2, 1)]

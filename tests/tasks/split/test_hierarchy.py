@@ -305,7 +305,8 @@ def test_a_mask_of_a_seat_and_the_bag_on_it_shows_the_seat_and_a_group(monkeypat
     assert unions(tree([view], 3)) == {frozenset({1, 2, 3}): 1.0}
 
 
-def test_masks_of_a_seat_and_the_bag_on_it_show_each_as_one(monkeypatch):
+@pytest.mark.parametrize("touch", [True, False])
+def test_masks_of_a_seat_and_the_bag_on_it_show_each_as_one_where_its_pieces_touch(touch, monkeypatch):
     both = ({1, 2, 3, 4}, 0.9)
     views = [tally([both], both[0]), tally([both, ({1, 2}, 0.9), ({3, 4}, 0.9)], both[0])]
     assert unions(tree(views, 4)) == {frozenset({1, 2, 3, 4}): 1.0}
@@ -314,7 +315,8 @@ def test_masks_of_a_seat_and_the_bag_on_it_show_each_as_one(monkeypatch):
         return tuple(piece for piece in members if set(pieces.labels[piece]) <= {0, 1}) or members
 
     monkeypatch.setattr(module._Pieces, "_below", seat_of)
-    each = {frozenset({1, 2}): 1.0, frozenset({3, 4}): 1.0}
+    monkeypatch.setattr(Contact, "parted", lambda _, members: [members] if touch else [(one,) for one in members])
+    each = {frozenset({1, 2}): 1.0, frozenset({3, 4}): 1.0 if touch else 0.5}  # two bags may stand on it
     assert unions(tree(views, 4)) == {**each, frozenset({1, 2, 3, 4}): 0.5}
 
 

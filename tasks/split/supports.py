@@ -1,0 +1,126 @@
+"""What stands on something level: it rises from a surface that goes on all round its foot. Beyond Split&Splat.
+
+A mask of a table often holds what stands on it, too. Of a whole thing, in however many pieces, its place tells more
+than the border of each piece does: the body of a mug goes on into its handle and meets the book beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ss_flow.tasks.artifacts import Cameras, Float64, PointCloud, PointLabels
+from ss_flow.tasks.geometry.cameras import up_of
+from ss_flow.tasks.geometry.clustering import rows_by_label
+from ss_flow.tasks.geometry.shape import Plane, box_diagonal, middle_of, on_plane, plane_of_most, thinned, towards
+
+_FEW = 20
+"""Points below which nothing has a shape."""
+_ENOUGH = 2000
+"""At least so many points of a group, and less than twice as many, tell."""
+_THICKNESS = 2.0
+"""Distance from a plane up to which a point lies on it, in multiples of the cloud's spacing."""
+_FLAT = 0.7
+"""Share of its points that must lie on one plane: the rest is the edge of a table top, or noise."""
+_LEVEL = 0.5
+"""Least cosine between the plane's normal and upwards: a handle does not stand on its door. Where cameras look down,
+what is up in photos leans away from them, and from such a door."""
+_RISES = 3.0
+"""Distance, in multiples of the cloud's spacing, that what stands rises at least."""
+_SMALL = 0.5
+"""What stands on a surface spreads over less than this share of it."""
+_FOOT = 0.3
+"""Share of its points, the lowest, that are its foot."""
+_SECTORS = 16
+"""Directions round the foot."""
+_ROUND = 0.75
+"""Share of these in which the surface goes on. Behind the back of a chair there is no seat."""
+_TRIM = 0.02
+"""Share of the points, on every side, that an extent leaves out."""
+
+Labels = tuple[int, ...]
+"""Some labels, by their rows."""
+
+
+@dataclass(frozen=True)
+class Supports:
+    """Where L labels lie, those that occur, ascending."""
+
+    rows: list[NDArray[np.intp]]
+    """L x the points of each."""
+    points: PointCloud
+    up: Float64
+    """[3] of unit length, world: what is up in most photos."""
+    eye: Float64
+    """[3] the mean place of the cameras."""
+    height: float
+    """How far something must rise from a surface to stand on it, as a share of its extent."""
+    _planes: dict[Labels, Plane | None] = field(default_factory=dict, init=False)
+    _answers: dict[tuple[Labels, Labels], bool] = field(default_factory=dict, init=False)
+    """What was found so far: many sets share their pieces."""
+
+    def levels(self, labels: Labels) -> list[Labels]:
+        """Which of these labels lie in a level plane: all together, or single ones."""
+        together = [labels] if len(labels) > 1 else []
+        return [level for level in (*together, *((row,) for row in labels)) if self._plane_of(level)]
+
+    def hold(self, level: Labels, labels: Labels) -> bool:
+        """Whether labels, taken together, stand on others that lie in a level plane."""
+        if (level, labels) not in self._answers:
+            plane = self._plane_of(level)
+            self._answers[level, labels] = plane is not None and self._stands(plane, level, labels)
+        return self._answers[level, labels]
+
+    def _plane_of(self, labels: Labels) -> Plane | None:
+        """The level plane, its normal upwards, in which labels lie; None where they do not lie in one."""
+        if labels not in self._planes:
+            self._planes[labels] = None
+            places = self._places(labels)
+            if len(places) >= _FEW:
+                plane = plane_of_most(places, self._thickness, 3)
+                normal = towards(plane[1], plane[0], self.eye)
+                if normal @ self.up >= _LEVEL and on_plane(places, plane, self._thickness).mean() >= _FLAT:
+                    self._planes[labels] = plane[0], normal
+        return self._planes[labels]
+
+    def _stands(self, plane: Plane, level: Labels, labels: Labels) -> bool:
+        """Whether labels rise from the plane of others, which go on round their foot."""
+        own = self._places(labels)
+        if len(own) < _FEW:
+            return False
+        centre, normal = plane
+        height, extent = (own - centre) @ normal, box_diagonal(own, _TRIM)
+        low, high = np.quantile(height, (0.1, 0.9))
+        if high < max(self.height * extent, _RISES * self.points.spacing) or low < -self._thickness:
+            return False
+        along = np.linalg.svd(normal[None])[2][1:]  # two directions in the plane
+        lies, ground = (own - centre) @ along.T, (self._places(level) - centre) @ along.T
+        if _spread(lies) >= _SMALL * _spread(ground):
+            return False
+        foot = lies[height <= np.quantile(height, _FOOT)]
+        middle = foot.mean(axis=0)
+        reach = np.quantile(np.linalg.norm(foot - middle, axis=1), 0.9) + extent / 2
+        x, y = (ground[np.linalg.norm(ground - middle, axis=1) <= reach] - middle).T
+        sector = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS) % _SECTORS
+        return len(np.unique(sector)) >= _ROUND * _SECTORS
+
+    @property
+    def _thickness(self) -> float:
+        return _THICKNESS * self.points.spacing
+
+    def _places(self, labels: Labels) -> Float64:
+        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])], _ENOUGH)
+
+
+def find_supports(points: PointCloud, cameras: Cameras, labels: PointLabels, *, height: float) -> Supports:
+    """Where the labels of `points` lie, and which way is up; height: see `Supports`."""
+    rows_of = rows_by_label(labels.label)
+    rows = [rows_of[name] for name in np.unique(labels.label[labels.label > 0]).tolist()]
+    return Supports(rows, points, up_of(cameras.world_to_camera), middle_of(cameras), height)
+
+
+def _spread(places: Float64) -> float:
+    """How much area points [N, 2] take, but for a factor that is the same for all of one shape."""
+    return float(np.sqrt(max(np.linalg.det(np.cov(places.T)), 0)))

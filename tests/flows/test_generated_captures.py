@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from generated_desk import generate_desk
+from generated_kitchen import generate_kitchen
+from generated_shelf import generate_shelf
+
+from ss_flow.flows.generated import Room, write_scene
+from ss_flow.tasks.geometry.cameras import backproject, camera_of
+
+
+@pytest.fixture(scope="module")
+def desk() -> Room:
+    return generate_desk(3, views=3, width=160, height=120)
+
+
+def test_a_desk_is_the_same_each_time(desk):
+    again = generate_desk(3, views=3, width=160, height=120)
+    assert np.array_equal(desk.rgb, again.rgb)
+    assert np.array_equal(desk.depth, again.depth)
+    assert np.array_equal(desk.ids, again.ids)
+
+
+def test_small_things_lie_and_stand_on_the_table(desk):
+    kinds = [thing.name.split()[-1] for thing in desk.objects]
+    assert sorted(kinds) == sorted(["table", "mug", "box", "brick", "book", "vase", "page", "coaster", "picture"])
+    top = 0.5
+    for thing in desk.objects[1:8]:
+        places = desk.points[desk.point_ids == thing.instance_id]
+        assert len(places) and top - 0.01 < places[:, 2].min() and places[:, 2].max() < top + 0.35
+    assert not len(desk.held_out)
+
+
+def test_depth_is_a_sensors(desk):
+    known = desk.depth > 0
+    assert 0.6 < known.mean() < 0.95
+    assert not known[:, 4].any() and not known[:, :, 4].any()
+    # Taken with another lens: what lies beside the middle of the picture is not where the photo has it.
+    camera = camera_of(desk.cameras, 0)
+    height = backproject(desk.depth[0], camera).reshape(120, 160, 3)[..., 2]
+    table = known[0] & (desk.ids[0] == 1)
+    assert 0.001 < np.median(np.abs(height[table] - 0.5)) < 0.02
+
+
+@pytest.fixture(scope="module")
+def kitchen() -> Room:
+    return generate_kitchen(3, views=5, width=160, height=120)
+
+
+@pytest.fixture(scope="module")
+def shelf() -> Room:
+    return generate_shelf(3, width=160, height=120)
+
+
+@pytest.mark.parametrize(("kind", "generate"), [("kitchen", generate_kitchen), ("shelf", generate_shelf)])
+def test_a_kitchen_and_a_shelf_are_the_same_each_time(kind, generate, request):
+    first = request.getfixturevalue(kind)
+    again = generate(3, views=len(first), width=160, height=120)
+    assert np.array_equal(first.rgb, again.rgb)
+    assert np.array_equal(first.depth, again.depth)
+    assert np.array_equal(first.ids, again.ids)
+
+
+def test_a_kitchen_has_things_on_its_counter_and_its_table_and_every_view_shows_some(kitchen):
+    kinds = [thing.name.split()[-1] for thing in kitchen.objects]
+    on_table, on_counter = (
+        ["mug", "bottle", "book"],
+        ["microwave", "kettle", "toaster", "bowl", "block", "plant", "jar"],
+    )
+    assert sorted(kinds) == sorted([*on_table, *on_counter, "bottle", "board", "table", "chair", "chair"])
+    height = {thing.name: kitchen.points[kitchen.point_ids == thing.instance_id, 2] for thing in kitchen.objects}
+    for name, heights in height.items():
+        low = 0.735 if name.split()[-1] in ("mug", "book") else 0.9 if name.split()[-1] in on_counter else 0.0
+        assert len(heights) and low - 0.03 < heights.min()
+    assert all(len(np.unique(ids)) > 2 for ids in kitchen.ids)
+
+
+def test_a_shelf_has_nine_things_on_three_boards(shelf):
+    kinds = [thing.name.split()[-1] for thing in shelf.objects]
+    assert sorted(kinds) == sorted(["carton", "book", "bag", "bottle", "pot", "duck", "box", "carton", "brick"])
+    boards = 0.9 + (0.3 + 0.018) * np.array([-1, 0, 1])
+    for thing in shelf.objects:
+        places = shelf.points[shelf.point_ids == thing.instance_id]
+        assert np.abs(places[:, 2].min() - boards).min() < 0.05 and (np.abs(places[:, 0]) < 0.34).all()
+    assert 0.8 < (shelf.depth > 0).mean() < 0.999
+
+
+def test_a_desk_is_written_as_a_capture(desk, tmp_path):
+    write_scene(desk, tmp_path / "desk")
+    assert {p.name for p in (tmp_path / "desk").iterdir()} == {
+        "color", "depth", "instance", "instances.json", "intrinsic", "part", "parts.json", "pose",
+    }  # fmt: skip
