@@ -1,0 +1,179 @@
+"""What a module changes when it is loaded, besides the names that it binds.
+
+A table is filled by a loop, a function is registered by a decorator, a library is told its precision: whoever uses that
+table or library depends on the statement. What code of another module does is not looked at.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+DEFINITIONS = (*FUNCTIONS, ast.ClassDef)
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+_HOOK = "__init_subclass__"
+"""What a class calls when another one is derived from it."""
+_HARMLESS = frozenset().union(*map(dir, (str, bytes, float, tuple, frozenset, MappingProxyType)))
+"""Methods of what cannot be changed."""
+
+
+class Loading:
+    """The statements at the top of a module, as they run when it is loaded.
+
+    imported: the top-level module that each of its imports comes from, by local name. own: that of the module itself.
+    """
+
+    def __init__(self, statements: Sequence[ast.stmt], imported: Mapping[str, str], own: str) -> None:
+        self._imported = imported
+        self._libraries = {name: top for name, top in imported.items() if top != own}
+        self._callables: dict[str, list[ast.stmt]] = {}
+        """Its functions and classes by name."""
+        for statement in statements:
+            if isinstance(statement, DEFINITIONS):
+                self._callables.setdefault(statement.name, []).append(statement)
+        self._aliases: dict[str, set[str]] = {}
+        """Names that each may stand for (a part of) the same object as; what different functions call alike is one."""
+        self._elements: dict[str, set[str]] = {}
+        """What loops go through, by the names that they bind."""
+        self._run: dict[int, list[ast.AST]] = {id(one): [*self._parts(one)] for one in statements}
+        """The pieces of code that run with each statement."""
+        for parts in self._run.values():
+            for part in parts:
+                self._note_aliases(part)
+        for parts in self._run.values():
+            parts += [*self._called_from(parts)]
+
+    def changed(self, statement: ast.stmt) -> Iterator[str]:
+        """The names whose objects a statement changes, and those that functions which it calls declare global."""
+        changed: set[str] = set()
+        for part in self._run[id(statement)]:
+            names = {*self._changed_in(part)}
+            reached = self._reached(names) - self._callables.keys()
+            reached = reached.union(*(self._elements.get(name, ()) for name in names))
+            if isinstance(part, FUNCTIONS):  # what it makes of a library is its own
+                reached -= self._imported.keys()
+                names -= {node.arg for node in ast.walk(part) if isinstance(node, ast.arg)}
+                changed.update(declared_global(part))
+            changed |= names | reached
+        yield from changed
+        told = {self._libraries[name] for name in changed & self._libraries.keys()}
+        yield from (name for name, library in self._libraries.items() if library in told)  # they share its state
+
+    def _reached(self, names: Iterable[str]) -> set[str]:
+        """What names may stand for."""
+        pending, reached = [*names], set[str]()
+        while pending:
+            further = self._aliases.get(pending.pop(), set()) - reached
+            reached |= further
+            pending += further
+        return reached
+
+    def _called_from(self, parts: list[ast.AST]) -> Iterator[ast.AST]:
+        """The functions that are called in these pieces of code, all methods of a class, and what these call."""
+        pending = [*itertools.chain(*map(self._calls_in, parts))]
+        seen: set[int] = set()
+        while pending:
+            call, function = pending.pop()
+            given = [*call.args, *(keyword.value for keyword in call.keywords)]
+            for argument in ast.walk(function):
+                if isinstance(argument, ast.arg):
+                    self._alias(argument.arg, given)
+            if id(function) not in seen:
+                seen.add(id(function))
+                self._note_aliases(function)
+                yield function
+                pending += self._calls_in(function)
+
+    def _calls_in(self, part: ast.AST) -> Iterator[tuple[ast.Call, Function]]:
+        for node in ast.walk(part):
+            if isinstance(node, ast.Call) and (name := _root(node.func)):
+                hook = node.func.attr if isinstance(node.func, ast.Attribute) and node.func.attr == _HOOK else ""
+                for called in {name, *self._reached([name])}:
+                    for definition in self._callables.get(called, ()):
+                        inner = [one for one in ast.walk(definition) if isinstance(one, FUNCTIONS)]
+                        yield from ((node, one) for one in inner if hook in ("", one.name))
+
+    def _parts(self, statement: ast.stmt) -> Iterator[ast.AST]:
+        """What of a statement runs when its module is loaded: of a definition, its decorators, which are calls, unless
+        another module's; its defaults; the body of a class, and the hooks of its bases."""
+        if not isinstance(statement, DEFINITIONS):
+            yield statement
+            return
+        for decorator in statement.decorator_list:
+            if _root(decorator) not in self._imported:
+                yield ast.Expr(ast.Call(decorator, [], []))
+        if isinstance(statement, ast.ClassDef):
+            yield from (ast.Call(ast.Attribute(base, _HOOK, ast.Load()), [], []) for base in statement.bases)
+            yield from (ast.Call(keyword.value, [], []) for keyword in statement.keywords)  # a metaclass
+            for inner in statement.body:
+                yield from self._parts(inner)
+        else:
+            yield from statement.args.defaults
+            yield from filter(None, statement.args.kw_defaults)
+
+    def _changed_in(self, part: ast.AST) -> Iterator[str]:
+        """The names whose objects a piece of code changes: `x[...] = y`, `x.y = z`, `x.append(y)`, `fill(x)`.
+
+        Where its value is used, a method of an object counts, but no function of a library: that tells its result.
+        """
+        for node in ast.walk(part):
+            if isinstance(node, ast.Subscript | ast.Attribute) and is_written(node):
+                yield _root(node)
+            elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+                call = node.value
+                yield from map(_root, (*call.args, *(keyword.value for keyword in call.keywords)))
+                yield from _names(call) - self._callables.keys() - self._imported.keys()
+                if not isinstance(call.func, ast.Name):
+                    yield _root(call.func)
+            elif (
+                isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr not in _HARMLESS
+            ):
+                yield from {_root(node.func)} - self._callables.keys() - self._imported.keys()
+
+    def _note_aliases(self, part: ast.AST) -> None:
+        for node in ast.walk(part):
+            match node:
+                case ast.Assign(targets=targets, value=value):
+                    pairs = [(target, value) for target in targets]
+                case (
+                    ast.AnnAssign(target=target, value=ast.expr() as value) | ast.NamedExpr(target=target, value=value)
+                ):
+                    pairs = [(target, value)]
+                case ast.For() | ast.AsyncFor() | ast.comprehension():
+                    pairs = [(node.target, node.iter)]
+                    for name in _names(node.target):
+                        self._elements.setdefault(name, set()).update(_names(node.iter))
+                case ast.withitem(context_expr=value, optional_vars=ast.expr() as target):
+                    pairs = [(target, value)]
+                case _:
+                    continue
+            for target, value in pairs:
+                for name in _names(target):
+                    self._alias(name, [value])
+
+    def _alias(self, name: str, values: Iterable[ast.expr]) -> None:
+        self._aliases.setdefault(name, set()).update(*map(_names, values))
+
+
+def declared_global(function: ast.AST) -> list[str]:
+    """The names that a function declares global."""
+    return [name for node in ast.walk(function) if isinstance(node, ast.Global) for name in node.names]
+
+
+def is_written(node: ast.Name | ast.Subscript | ast.Attribute) -> bool:
+    """Whether something is bound, or deleted, here."""
+    return not isinstance(node.ctx, ast.Load)
+
+
+def _root(node: ast.expr) -> str:
+    """The name that `x.y[0].z(...)` begins with; "" of another expression."""
+    while isinstance(node, ast.Subscript | ast.Attribute | ast.Starred | ast.Call):
+        node = node.func if isinstance(node, ast.Call) else node.value
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def _names(part: ast.AST) -> set[str]:
+    return {node.id for node in ast.walk(part) if isinstance(node, ast.Name)}
