@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import functools
 import importlib.metadata
+import importlib.util
 import re
+import sys
+import sysconfig
 from collections.abc import Iterator
+from pathlib import Path
 
+_PYTHON = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
+_SITE = ("site-packages", "dist-packages")
+"""Where distributions are installed without a list of their files."""
 ABSENT = "absent"
 """The version of what is not installed."""
 
@@ -22,9 +29,42 @@ def versions_of(module: str) -> dict[str, str]:
 
 @functools.cache
 def is_distributed(module: str) -> bool:
-    """Whether an installed distribution holds a top-level module; not an editable one, whose version tells nothing."""
-    found = _distributions().get(module, [])
-    return bool(found) and not any('"editable": true' in (one.read_text("direct_url.json") or "") for one in found)
+    """Whether a top-level module is Python's own, or that of an installed distribution, whose version tells of an edit.
+
+    An editable one's does not, nor that of one whose sources are beside what was put down when it was built; and a
+    module of the same name that is found before it is another one.
+    """
+    places = _places_of(module)
+    if module in sys.stdlib_module_names:
+        folders = _PYTHON
+    else:
+        found = _distributions().get(module, [])
+        folders = [Path(str(one.locate_file(""))) for one in found]
+        if not found or any(map(_tells_nothing, found)):
+            return False
+    return all(any(place.is_relative_to(folder) for folder in folders) for place in places)
+
+
+def _tells_nothing(distribution: importlib.metadata.Distribution) -> bool:
+    """Whether the version stays as it is when the sources are edited."""
+    if '"editable": true' in (distribution.read_text("direct_url.json") or ""):
+        return True
+    folder = Path(str(distribution.locate_file("")))
+    is_installed = folder.name in _SITE or folder.suffix == ".egg" or distribution.read_text("RECORD") is not None
+    return not is_installed and distribution.read_text("PKG-INFO") is not None
+
+
+def _places_of(module: str) -> list[Path]:
+    """Where a top-level module is found; nothing for one that is nowhere, or in the interpreter."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return []
+    if spec is None:
+        return []
+    if spec.has_location and spec.origin:
+        return [Path(spec.origin)]
+    return [Path(folder) for folder in spec.submodule_search_locations or ()]
 
 
 def version(distribution: str) -> str:

@@ -175,7 +175,7 @@ def _loaded(packages: tuple[str, ...], loose: bool, count: int) -> list[str]:
 def is_loose(name: str) -> bool:
     """Whether a module is neither ours nor Python's own, and no distribution holds it: no version tells of an edit."""
     top = name.partition(".")[0]
-    return top != "ss_flow" and top not in sys.stdlib_module_names and not is_distributed(top)
+    return top != "ss_flow" and not is_distributed(top)
 
 
 def forget_sources() -> None:
@@ -218,7 +218,7 @@ def _read(name: str) -> Source | None:
     if spec.origin is None or not spec.has_location:
         return None
     path = Path(spec.origin)
-    content = path.read_bytes()
+    content = getattr(spec.loader, "get_data", lambda _: path.read_bytes())(spec.origin)  # it may be in a ZIP archive
     text = importlib.util.decode_source(content) if path.suffix == ".py" else blake3(content).hexdigest()
     return Source(path, folders is not None, text)
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import importlib
 import sys
 import textwrap
+import zipfile
 from importlib.machinery import EXTENSION_SUFFIXES
 
 import pytest
@@ -509,3 +510,10 @@ def test_a_source_in_another_encoding_is_read_as_python_reads_it(package, tmp_pa
     (tmp_path / "marked_probe.py").write_bytes(b"\xef\xbb\xbfdef f(x):\n    return x\n")
     step = "import latin_probe, marked_probe\n\ndef run(x):\n    return latin_probe.f(marked_probe.f(x))\n"
     assert {"latin_probe.f", "marked_probe.f"} < set(package(step=step))
+
+
+def test_a_module_in_an_archive_is_followed(package, tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "packed.zip", "w") as archive:
+        archive.writestr("packed_probe.py", "def f(x):\n    return x\n")
+    monkeypatch.syspath_prepend(tmp_path / "packed.zip")
+    assert "packed_probe.f" in package(step="from packed_probe import f\n\ndef run(x):\n    return f(x)\n")
