@@ -5,12 +5,16 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 import importlib.util
+import os
 import re
 import sys
 import sysconfig
 from collections.abc import Iterator
 from pathlib import Path
 
+from ss_flow.errors import ExecutorLost
+
+Changes = tuple[int, ...]
 _PYTHON = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
 _SITE = ("site-packages", "dist-packages")
 """Where distributions are installed without a list of their files."""
@@ -18,13 +22,20 @@ ABSENT = "absent"
 """The version of what is not installed."""
 
 
-def versions_of(module: str) -> dict[str, str]:
+def versions_of(module: str, changes: Changes = ()) -> dict[str, str]:
     """Versions, by name, of all distributions that hold a top-level module; under its own name where none does.
 
     OpenCV's `cv2`, for one, is in four distributions, and several of them may be installed over one another.
+    changes: those since this process asked first; () = as it was then, since what is loaded stays as it is.
     """
-    found = _distributions().get(module, [])
+    found = (_read(changes) if changes else _distributions()).get(module, [])
     return dict(map(_name_and_version, reversed(found))) if found else {module: ABSENT}
+
+
+def changes() -> Changes:
+    """Whether anything was installed or removed since this process asked first: () if not, else when it was."""
+    now = tuple(map(_time_of_change, _folders()[0]))
+    return () if now == _folders()[1] else now
 
 
 @functools.cache
@@ -77,6 +88,26 @@ def version(distribution: str) -> str:
 
 @functools.cache
 def _distributions() -> dict[str, list[importlib.metadata.Distribution]]:
+    """Those that were installed when this was asked first."""
+    return _read(())
+
+
+@functools.cache
+def _folders() -> tuple[tuple[Path, ...], Changes]:
+    """The folders that they are in, and when these were changed last."""
+    found = {Path(str(one.locate_file(""))) for several in _distributions().values() for one in several}
+    return tuple(found), tuple(map(_time_of_change, found))
+
+
+def _time_of_change(folder: Path) -> int:
+    try:
+        return os.stat(folder).st_mtime_ns
+    except OSError:
+        return 0
+
+
+@functools.lru_cache(maxsize=1)
+def _read(changes: Changes) -> dict[str, list[importlib.metadata.Distribution]]:
     """Distributions by top-level module; of one that is installed twice, both, the one that is imported first.
 
     `importlib.metadata.packages_distributions` says the same, after a third of a second.
@@ -106,4 +137,8 @@ def _name_and_version(distribution: importlib.metadata.Distribution) -> tuple[st
     """Of its metadata only the two lines: parsing the whole takes longer than all the rest."""
     header = (distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or "").partition("\n\n")[0]
     parts = dict(_HEADER.findall(header))
+    if not {"Name", "Version"} <= parts.keys():
+        raise ExecutorLost(
+            f"a package in {distribution.locate_file('')} was updated or removed since this process began: start anew."
+        )
     return parts["Name"], parts["Version"]

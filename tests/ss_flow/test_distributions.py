@@ -28,7 +28,8 @@ def installed(tmp_path, monkeypatch):
         return folder
 
     def forget():
-        distributions._distributions.cache_clear()
+        for remembered in (distributions._distributions, distributions._read, distributions._folders):
+            remembered.cache_clear()
         distributions.is_distributed.cache_clear()
 
     yield install
