@@ -18,7 +18,7 @@ from ss_flow.at_load import DEFINITIONS, FUNCTIONS, Loading, declared_global, is
 from ss_flow.cache.files import stamp
 from ss_flow.distributions import is_distributed
 from ss_flow.errors import ExecutorLost
-from ss_flow.loaded_code import bound_in, is_as_written
+from ss_flow.loaded_code import EDITED, bound_in, not_as_written
 
 STAR = "*"
 NATIVE_SOURCES = "NATIVE_SOURCES"
@@ -77,17 +77,18 @@ _known: dict[str, tuple[object, Source | None]] = {}
 """Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then."""
 _bound: dict[str, tuple[tuple[int, ...], dict[str, list[Any]]]] = {}
 """What their names stood for then, after the stamp of the file; () where the module was still being loaded."""
-_outdated: set[str] = set()
-"""Modules that are not loaded as they were read. Ours are read as soon as they are loaded."""
+_outdated: dict[str, str] = {}
+"""Modules that are not loaded as they were read, and why, as the end of a sentence. Ours are read as soon as they are
+loaded."""
 
 
 def source_of(name: str) -> Source | None:
     """A module as it is written; None when there is none. It is read once.
 
-    Raises ExecutorLost when it was edited between being loaded and being read.
+    Raises ExecutorLost when it was edited between being loaded and being read, or is not what was loaded.
     """
     if name in _outdated:
-        raise ExecutorLost(f"{name} was edited after it was loaded: load it again (importlib.reload), or start anew.")
+        raise ExecutorLost(f"{name} {_outdated[name]}.")
     if name not in _known:
         _bound[name] = _stamp(name), bound_in(name)
         _known[name] = _specification(name), _read(name)
@@ -105,22 +106,21 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
         specification = _specification(name)
         if name in _known and _known[name][0] is specification:
             if name not in _outdated and _is_exchanged(name):
-                _outdated.add(name)
+                _outdated[name] = EDITED
                 changed = True
             continue
         _bound[name] = _stamp(name), bound_in(name)
         try:
             source = _read(name)
-            as_written = source is None or name.startswith("ss_flow.") or is_as_written(name)
+            reason = "" if source is None or name.startswith("ss_flow.") else not_as_written(name)
         # Its file has gone, or is no text; who needs it will say so.
         except (OSError, ValueError, SyntaxError, ImportError):
             continue
         changed = changed or (name in _known and _known[name][1] != source)
         _known[name] = specification, source
-        if as_written:
-            _outdated.discard(name)
-        else:
-            _outdated.add(name)
+        _outdated.pop(name, None)
+        if reason:
+            _outdated[name] = reason
     return changed
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import os
 import shutil
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import pytest
 
@@ -206,6 +208,23 @@ def test_code_that_was_edited_before_it_is_loaded_is_refused(store, probed, step
     with pytest.raises(ExecutorLost, match=f"otherwise than its key says: code of ss_flow_probed:{step} changed"):
         run(store, probed(), step, Editing(probed.folder / file, *moment))
     assert run(store, probed(), step) == (7.0, "finished")
+
+
+def test_bytecode_that_python_takes_for_that_of_an_edited_file_is_refused(store, probed, monkeypatch):
+    file = probed.folder / "probed_helper.py"
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    for text in (HELPER, HELPER.replace("2", "3")):
+        file.write_text(text)
+        os.utime(file, (1, 1))
+        steps = probed()
+        if text == HELPER:
+            assert run(store, steps, "second") == (6.0, "finished")
+            assert run(store, probed(), "second") == (6.0, "hit")
+    assert steps.double(3.0) == 6.0  # Python compares sizes and times alone
+    with pytest.raises(ExecutorLost, match=r"probed_helper was loaded from .*__pycache__.*: delete that, and start"):
+        run(store, steps, "second")
+    Path(sys.modules["probed_helper"].__cached__).unlink()
+    assert run(store, probed(), "second") == (9.0, "finished")
 
 
 class Updating(Reporter):
