@@ -80,6 +80,8 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     _refuse(
         [r for r, before in stamps.items() if r.stamp_now()[:-1] != before[:-1] or r.has_changed()], invocation.label
     )
+    if task.returns_list and not isinstance(result, tuple | list):  # of a generator, nothing has run yet
+        raise TypeError(f"the task {task.name} declares a list and returned a {type(result).__name__}; return a tuple")
     items = result if task.returns_list else (result,)
     action = Action(
         key=invocation.key,
