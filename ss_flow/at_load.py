@@ -34,33 +34,51 @@ class Loading:
         for statement in statements:
             if isinstance(statement, DEFINITIONS):
                 self._callables.setdefault(statement.name, []).append(statement)
+        self._inner = {name: _functions_in(of) for name, of in self._callables.items()}
+        """The functions in each, methods among them, with the names of their parameters."""
         self._aliases: dict[str, set[str]] = {}
         """Names that each may stand for (a part of) the same object as; what different functions call alike is one."""
         self._elements: dict[str, set[str]] = {}
         """What loops go through, by the names that they bind."""
-        self._run: dict[int, list[ast.AST]] = {id(one): [*self._parts(one)] for one in statements}
-        """The pieces of code that run with each statement."""
-        for parts in self._run.values():
-            for part in parts:
-                self._note_aliases(part)
-        for parts in self._run.values():
-            parts += [*self._called_from(parts)]
+        self._parts = {id(one): [*self._parts_of(one)] for one in statements}
+        """The pieces of code that each statement is, as it runs."""
+        self._called: dict[ast.AST, set[ast.AST]] = {}
+        """The functions that are called in a piece of code."""
+        parts = [*itertools.chain(*self._parts.values())]
+        for part in parts:
+            self._note_aliases(part)
+        while parts:
+            if (part := parts.pop(0)) not in self._called:
+                if isinstance(part, FUNCTIONS):
+                    self._note_aliases(part)
+                self._called[part] = set(self._calls_in(part))
+                parts += self._called[part]
+        self._changed = {part: self._changed_by(part) for part in self._called}
 
-    def changed(self, statement: ast.stmt) -> Iterator[str]:
+    def changed(self, statement: ast.stmt) -> set[str]:
         """The names whose objects a statement changes, and those that functions which it calls declare global."""
-        changed: set[str] = set()
-        for part in self._run[id(statement)]:
-            names = {*self._changed_in(part)}
-            reached = self._reached(names) - self._callables.keys()
-            reached = reached.union(*(self._elements.get(name, ()) for name in names))
-            if isinstance(part, FUNCTIONS):  # what it makes of a library is its own
-                reached -= self._imported.keys()
-                names -= {node.arg for node in ast.walk(part) if isinstance(node, ast.arg)}
-                changed.update(declared_global(part))
-            changed |= names | reached
-        yield from changed
-        told = {self._libraries[name] for name in changed & self._libraries.keys()}
-        yield from (name for name, library in self._libraries.items() if library in told)  # they share its state
+        pending, seen, changed = [*self._parts[id(statement)]], set[ast.AST](), set[str]()
+        while pending:
+            part = pending.pop()
+            seen.add(part)
+            changed |= self._changed[part]
+            pending += self._called[part] - seen
+            seen |= self._called[part]
+        told = {
+            self._libraries[name] for name in changed & self._libraries.keys()
+        }  # its state is that of all its parts
+        return changed.union(name for name, library in self._libraries.items() if library in told)
+
+    def _changed_by(self, part: ast.AST) -> set[str]:
+        """The names whose objects a piece of code changes, without what it calls."""
+        names = {*self._changed_in(part)}
+        changed = self._reached(names) - self._callables.keys()
+        changed = changed.union(*(self._elements.get(name, ()) for name in names))
+        if isinstance(part, FUNCTIONS):  # what it makes of a library is its own
+            changed -= self._imported.keys()
+            names -= _parameters(part)
+            names.update(declared_global(part))
+        return changed | names
 
     def _reached(self, names: Iterable[str]) -> set[str]:
         """What names may stand for."""
@@ -71,32 +89,20 @@ class Loading:
             pending += further
         return reached
 
-    def _called_from(self, parts: list[ast.AST]) -> Iterator[ast.AST]:
-        """The functions that are called in these pieces of code, all methods of a class, and what these call."""
-        pending = [*itertools.chain(*map(self._calls_in, parts))]
-        seen: set[int] = set()
-        while pending:
-            call, function = pending.pop()
-            given = [*call.args, *(keyword.value for keyword in call.keywords)]
-            for argument in ast.walk(function):
-                if isinstance(argument, ast.arg):
-                    self._alias(argument.arg, given)
-            if id(function) not in seen:
-                seen.add(id(function))
-                self._note_aliases(function)
-                yield function
-                pending += self._calls_in(function)
-
-    def _calls_in(self, part: ast.AST) -> Iterator[tuple[ast.Call, Function]]:
+    def _calls_in(self, part: ast.AST) -> Iterator[ast.AST]:
+        """The functions that a piece of code calls, of a class all methods; parameters are what they are given."""
         for node in ast.walk(part):
             if isinstance(node, ast.Call) and (name := _root(node.func)):
                 hook = node.func.attr if isinstance(node.func, ast.Attribute) and node.func.attr == _HOOK else ""
-                for called in {name, *self._reached([name])}:
-                    for definition in self._callables.get(called, ()):
-                        inner = [one for one in ast.walk(definition) if isinstance(one, FUNCTIONS)]
-                        yield from ((node, one) for one in inner if hook in ("", one.name))
+                given = set[str]().union(*map(_names, (*node.args, *(keyword.value for keyword in node.keywords))))
+                for called in {name, *self._reached([name])} & self._inner.keys():
+                    for function, parameters in self._inner[called]:
+                        if hook in ("", function.name):
+                            for parameter in parameters - {"self", "cls"} if given else ():
+                                self._alias(parameter, given)
+                            yield function
 
-    def _parts(self, statement: ast.stmt) -> Iterator[ast.AST]:
+    def _parts_of(self, statement: ast.stmt) -> Iterator[ast.AST]:
         """What of a statement runs when its module is loaded: of a definition, its decorators, which are calls, unless
         another module's; its defaults; the body of a class, and the hooks of its bases."""
         if not isinstance(statement, DEFINITIONS):
@@ -109,7 +115,7 @@ class Loading:
             yield from (ast.Call(ast.Attribute(base, _HOOK, ast.Load()), [], []) for base in statement.bases)
             yield from (ast.Call(keyword.value, [], []) for keyword in statement.keywords)  # a metaclass
             for inner in statement.body:
-                yield from self._parts(inner)
+                yield from self._parts_of(inner)
         else:
             yield from statement.args.defaults
             yield from filter(None, statement.args.kw_defaults)
@@ -152,10 +158,20 @@ class Loading:
                     continue
             for target, value in pairs:
                 for name in _names(target):
-                    self._alias(name, [value])
+                    self._alias(name, _names(value))
 
-    def _alias(self, name: str, values: Iterable[ast.expr]) -> None:
-        self._aliases.setdefault(name, set()).update(*map(_names, values))
+    def _alias(self, name: str, others: set[str]) -> None:
+        self._aliases.setdefault(name, set()).update(others)
+
+
+def _functions_in(definitions: Iterable[ast.stmt]) -> list[tuple[Function, set[str]]]:
+    nodes = itertools.chain(*map(ast.walk, definitions))
+    return [(node, _parameters(node)) for node in nodes if isinstance(node, FUNCTIONS)]
+
+
+def _parameters(function: ast.AST) -> set[str]:
+    """Those of the functions in it, too."""
+    return {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
 
 
 def declared_global(function: ast.AST) -> list[str]:

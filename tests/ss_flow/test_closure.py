@@ -3,6 +3,7 @@ from __future__ import annotations
 import importlib
 import sys
 import textwrap
+import time
 import zipfile
 from importlib.machinery import EXTENSION_SUFFIXES
 
@@ -517,3 +518,13 @@ def test_a_module_in_an_archive_is_followed(package, tmp_path, monkeypatch):
         archive.writestr("packed_probe.py", "def f(x):\n    return x\n")
     monkeypatch.syspath_prepend(tmp_path / "packed.zip")
     assert "packed_probe.f" in package(step="from packed_probe import f\n\ndef run(x):\n    return f(x)\n")
+
+
+def test_a_module_in_which_much_is_called_when_it_is_loaded_is_read_in_a_moment(package):
+    methods = "".join(f"    def m{n}(self, x{n}):\n        return f{n}(x{n}), M(x{n})\n" for n in range(60))
+    functions = "".join(f"def f{n}(x):\n    return M(x), f{(7 * n) % 60}(x)\n" for n in range(60))
+    made = "".join(f"A{n} = M({n})\n" for n in range(100))
+    step = f"class M:\n    def __init__(self, x):\n        pass\n{methods}{functions}{made}def run(x):\n    return A1\n"
+    began = time.process_time()
+    assert "probe.step.M" in package(step=step)
+    assert time.process_time() - began < 3
