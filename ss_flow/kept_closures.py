@@ -29,7 +29,8 @@ from ss_flow.cache.files import read_checked, write_checked
 from ss_flow.closure import ENGINE, Closure, closure_of, reading
 from ss_flow.sources import is_loose, source_digest
 
-_ANALYSIS = b"".join(Path(one.__file__).read_bytes() for one in (at_load, closure, code_text, sources))
+_READERS = (at_load.__file__, closure.__file__, code_text.__file__, sources.__file__)
+_ANALYSIS = b"".join(Path(file).read_bytes() for file in _READERS)
 _SIGNS = {"python": platform.python_version(), "analysis": blake3(_ANALYSIS).hexdigest()}
 """What a closure depends on besides what it is read from."""
 
