@@ -1,4 +1,4 @@
-"""Digests of input files, remembered by size, modification time and inode, so that a file is read once.
+"""Digests of input files, remembered by what `stamp` says of them, so that a file is read once.
 
 Notes
 -----
@@ -45,11 +45,11 @@ class FileDigests:
         place = os.path.abspath(path)
         now: list[object] = [*stamp(place)]
         known = self._known.get(place)
-        if known is not None and known[:3] == now and not self._verify:
-            return str(known[3])
+        if known is not None and known[0] == now and not self._verify:
+            return str(known[1])
         content = digest_file(place)
         if [*stamp(place)] == now:  # else it is what a file held that was being written
-            self._known[place] = [*now, content]
+            self._known[place] = [now, content]
             self._changed = True
         return content
 

@@ -138,10 +138,15 @@ def read_stamped(path: str) -> tuple[bytes, float]:
         os.close(handle)
 
 
-def stamp(path: Path | str) -> tuple[int, int, int]:
-    """Size, time of change and inode of a file: while they are the same, so is its content. Raises OSError."""
+def stamp(path: Path | str) -> tuple[int, int, int, int]:
+    """Size, time of change, inode and time of the inode's change: while they are the same, so is a file's content.
+
+    Unpacking an archive gives the new file the time that the old one had, and often its inode; the last time of them
+    nobody sets. It is another one also after a change of permissions, or of how many links there are: that such a file
+    is another one, only its content tells. Raises OSError.
+    """
     status = os.stat(path)
-    return status.st_size, status.st_mtime_ns, status.st_ino
+    return status.st_size, status.st_mtime_ns, status.st_ino, status.st_ctime_ns
 
 
 def folder_bytes(folder: Path) -> int:

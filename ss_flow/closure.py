@@ -136,7 +136,10 @@ def _closure(module_name: str, function_name: str) -> Closure:
                 found[module_name] = compiled
             continue
         sources.update(module.stars)
-        for origin, attribute in module.imports.get(name, ()):
+        modules.update(star.partition(".")[0] for star in module.stars)
+        if origins := module.imports.get(name):  # passed on from there
+            found[f"{module_name}.{name}"] = blake3(f"{origins}".encode()).hexdigest()
+        for origin, attribute in origins or ():
             modules.add(origin.partition(".")[0])
             if attribute is not None and _is_followed(origin, own):
                 pending.append((origin, attribute))
@@ -214,44 +217,57 @@ def _read(module_name: str, name: str) -> tuple[str, list[ast.AST]]:
 def _dependencies(
     module: Module, nodes: list[ast.AST], local: Imports, own: str, looked_for: set[str]
 ) -> Iterator[tuple[str, str]]:
-    holders = {id(node.value) for node in nodes if isinstance(node, ast.Attribute)}
+    held = {id(node.value) for node in nodes if isinstance(node, ast.Attribute)}
     for node in nodes:
         if isinstance(node, ast.Attribute):
             first, *between = dotted(node.value)
             for origin, attribute in local.get(first, ()):
                 path = between if attribute is None else [attribute, *between]
-                if (holder := _module_at(origin, path, own, looked_for)) is not None:
-                    yield holder, node.attr
+                holders, through = _modules_at(origin, path, own, looked_for)
+                yield from through
+                yield from ((holder, node.attr) for holder in holders)
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
             if node.id in module.definitions:
                 yield module.name, node.id
             for origin, attribute in local.get(node.id, ()):
                 if attribute is not None and _is_followed(origin, own):
                     yield origin, attribute
-                if id(node) not in holders:  # as a value: any of what a module holds may be meant
-                    yield from _all_of(_module_at(origin, [attribute] if attribute else [], own, looked_for))
+                if id(node) not in held:  # as a value: any of what a module holds may be meant
+                    holders, through = _modules_at(origin, [attribute] if attribute else [], own, looked_for)
+                    yield from through
+                    for holder in holders:
+                        yield from _all_of(holder)
 
 
-def _all_of(module_name: str | None) -> Iterator[tuple[str, str]]:
-    if module_name is not None:
-        module = module_of(module_name)
-        yield from ((module_name, name) for name in (module.definitions if module else ("",)))
+def _all_of(module_name: str) -> Iterator[tuple[str, str]]:
+    module = module_of(module_name)
+    yield from ((module_name, name) for name in ({**module.definitions, **module.imports} if module else ("",)))
 
 
-def _module_at(module: str, path: list[str], own: str, looked_for: set[str]) -> str | None:
-    """The module that `module.a.b` stands for, through what packages import; None when that is none to follow."""
-    names, seen = list(path), set[tuple[str, ...]]()
-    while _is_followed(module, own) and (module, *names) not in seen:
-        seen.add((module, *names))
+def _modules_at(
+    module: str, path: list[str], own: str, looked_for: set[str]
+) -> tuple[list[str], list[tuple[str, str]]]:
+    """The modules to follow that `module.a.b` may stand for, and the imports of packages that lead there."""
+    found: list[str] = []
+    through: list[tuple[str, str]] = []
+    pending, seen = [(module, *path)], set[tuple[str, ...]]()
+    while pending:
+        place = pending.pop()
+        module, *names = place
+        if place in seen or not _is_followed(module, own):
+            continue
+        seen.add(place)
         if not names:
-            return module
+            found.append(module)
+            continue
         looked_for |= {module, inner := f"{module}.{names[0]}"}
         if source_of(inner):
-            module, names = inner, names[1:]
+            pending.append((inner, *names[1:]))
         elif (holder := module_of(module)) is not None and (origins := holder.imports.get(names[0])):
-            module, attribute = origins[0]
-            names = names[1:] if attribute is None else [attribute, *names[1:]]
-    return None
+            through.append((module, names[0]))
+            for origin, attribute in origins:
+                pending.append((origin, *names[1:]) if attribute is None else (origin, attribute, *names[1:]))
+    return found, through
 
 
 def _loaded_by_name(nodes: list[ast.AST]) -> Iterator[str]:

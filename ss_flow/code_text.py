@@ -7,7 +7,8 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any
 
-from ss_flow.sources import DEFINITIONS, Imports
+from ss_flow.at_load import DEFINITIONS
+from ss_flow.sources import Imports
 
 
 def canonical_code(node: Any, counted: list[ast.AST], imports: Imports) -> str:

@@ -24,12 +24,13 @@ from typing import Any
 
 from blake3 import blake3
 
-from ss_flow import closure, code_text, sources
+from ss_flow import at_load, closure, code_text, sources
 from ss_flow.cache.files import read_checked, write_checked
 from ss_flow.closure import ENGINE, Closure, closure_of, reading
 from ss_flow.sources import is_loose, source_digest
 
-_ANALYSIS = b"".join(Path(file).read_bytes() for file in (closure.__file__, code_text.__file__, sources.__file__))
+_READERS = (at_load.__file__, closure.__file__, code_text.__file__, sources.__file__)
+_ANALYSIS = b"".join(Path(file).read_bytes() for file in _READERS)
 _SIGNS = {"python": platform.python_version(), "analysis": blake3(_ANALYSIS).hexdigest()}
 """What a closure depends on besides what it is read from."""
 

@@ -6,20 +6,42 @@ Compared is compiled code, which of a value (a constant, a default) tells nothin
 from __future__ import annotations
 
 import inspect
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from types import CodeType, FunctionType
 from typing import Any
 
+EDITED = "was edited after it was loaded: load it again (importlib.reload), or start anew"
 
-def is_as_written(module_name: str) -> bool:
-    """Whether the functions of a loaded module are those of its file as it is now."""
-    read = getattr(getattr(sys.modules[module_name].__spec__, "loader", None), "get_code", None)
+
+def not_as_written(module_name: str) -> str:
+    """Why a loaded module is not what its file says now, as the end of a sentence; "" where its functions are."""
+    specification: Any = sys.modules[module_name].__spec__
+    read = getattr(getattr(specification, "loader", None), "get_code", None)
     code = read and read(module_name)
     if code is None:  # compiled by others, or a folder without an __init__.py
-        return True
+        return ""
+    if _may_be_stale(specification):
+        loader, file = specification.loader, specification.origin
+        if code != loader.source_to_code(loader.get_data(file), file):
+            return (
+                f"was loaded from {specification.cached}, which was made from an older text of the same size and time: "
+                "delete that, and start anew"
+            )
     written = set(_codes(code))
-    return all(f.__code__ in written for f in _functions(module_name) if f.__module__ == module_name)
+    if all(f.__code__ in written for f in _functions(module_name) if f.__module__ == module_name):
+        return ""
+    return EDITED
+
+
+def _may_be_stale(specification: Any) -> bool:
+    """Whether a module's file was written after the bytecode that Python keeps of it: Python compares only its size and
+    its time, in whole seconds, which an edit within the second, or an archive, leaves as they were."""
+    try:
+        return os.stat(specification.origin).st_ctime_ns >= os.stat(specification.cached).st_mtime_ns
+    except (OSError, TypeError):  # there is none
+        return False
 
 
 def left_behind(definitions: Iterable[str]) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ss_flow.closure import fix_sources
+from ss_flow.distributions import Changes, changes
 from ss_flow.errors import ExecutorLost
 from ss_flow.explain import first_difference
 from ss_flow.kept_closures import kept_closure
@@ -22,7 +23,7 @@ def check_sameness(task: Task[..., Any], components: Components, label: str, clo
     components: those of the key. label: of the call. closures: the folder of kept closures.
     Raises ExecutorLost when they differ.
     """
-    here = _recipe(task, closures, fix_sources())
+    here = _recipe(task, closures, fix_sources(), changes())
     if all(components[part] == value for part, value in here.items()):
         return
 
@@ -33,13 +34,13 @@ def check_sameness(task: Task[..., Any], components: Components, label: str, clo
         raise ExecutorLost(
             f"a worker on the host {socket.gethostname()} would compute {label} otherwise than its key says: "
             f"{difference}. Code, packages and kind of processor must be everywhere what they were where and when the "
-            "run started: run again, and restart the workers of a cluster after an update."
+            "run started: run again, after an update in a new process, and restart the workers of a cluster."
         )
 
 
 @functools.cache
-def _recipe(task: Task[..., Any], closures: Path, generation: int) -> Components:
-    recipe = Recipe.of(task, kept_closure(task.function, closures))
+def _recipe(task: Task[..., Any], closures: Path, generation: int, changes: Changes) -> Components:
+    recipe = Recipe.of(task, kept_closure(task.function, closures), changes)
     if reason := left_behind(recipe.closure):
         raise ExecutorLost(f"{task.name} would be computed otherwise than its key says: {reason}.")
     return recipe.components

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import functools
 import importlib.util
-import itertools
 import operator
 import sys
 from collections.abc import Iterable, Iterator
@@ -15,10 +14,11 @@ from typing import Any
 
 from blake3 import blake3
 
+from ss_flow.at_load import DEFINITIONS, FUNCTIONS, Loading, declared_global, is_written
 from ss_flow.cache.files import stamp
 from ss_flow.distributions import is_distributed
 from ss_flow.errors import ExecutorLost
-from ss_flow.loaded_code import bound_in, is_as_written
+from ss_flow.loaded_code import EDITED, bound_in, not_as_written
 
 STAR = "*"
 NATIVE_SOURCES = "NATIVE_SOURCES"
@@ -77,17 +77,18 @@ _known: dict[str, tuple[object, Source | None]] = {}
 """Modules that were read, each after its specification: another one whenever it is loaded; None = not loaded then."""
 _bound: dict[str, tuple[tuple[int, ...], dict[str, list[Any]]]] = {}
 """What their names stood for then, after the stamp of the file; () where the module was still being loaded."""
-_outdated: set[str] = set()
-"""Modules that are not loaded as they were read. Ours are read as soon as they are loaded."""
+_outdated: dict[str, str] = {}
+"""Modules that are not loaded as they were read, and why, as the end of a sentence. Ours are read as soon as they are
+loaded."""
 
 
 def source_of(name: str) -> Source | None:
     """A module as it is written; None when there is none. It is read once.
 
-    Raises ExecutorLost when it was edited between being loaded and being read.
+    Raises ExecutorLost when it was edited between being loaded and being read, or is not what was loaded.
     """
     if name in _outdated:
-        raise ExecutorLost(f"{name} was edited after it was loaded: load it again (importlib.reload), or start anew.")
+        raise ExecutorLost(f"{name} {_outdated[name]}.")
     if name not in _known:
         _bound[name] = _stamp(name), bound_in(name)
         _known[name] = _specification(name), _read(name)
@@ -105,22 +106,21 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
         specification = _specification(name)
         if name in _known and _known[name][0] is specification:
             if name not in _outdated and _is_exchanged(name):
-                _outdated.add(name)
+                _outdated[name] = EDITED
                 changed = True
             continue
         _bound[name] = _stamp(name), bound_in(name)
         try:
             source = _read(name)
-            as_written = source is None or name.startswith("ss_flow.") or is_as_written(name)
+            reason = "" if source is None or name.startswith("ss_flow.") else not_as_written(name)
         # Its file has gone, or is no text; who needs it will say so.
         except (OSError, ValueError, SyntaxError, ImportError):
             continue
         changed = changed or (name in _known and _known[name][1] != source)
         _known[name] = specification, source
-        if as_written:
-            _outdated.discard(name)
-        else:
-            _outdated.add(name)
+        _outdated.pop(name, None)
+        if reason:
+            _outdated[name] = reason
     return changed
 
 
@@ -175,7 +175,7 @@ def _loaded(packages: tuple[str, ...], loose: bool, count: int) -> list[str]:
 def is_loose(name: str) -> bool:
     """Whether a module is neither ours nor Python's own, and no distribution holds it: no version tells of an edit."""
     top = name.partition(".")[0]
-    return top != "ss_flow" and top not in sys.stdlib_module_names and not is_distributed(top)
+    return top != "ss_flow" and not is_distributed(top)
 
 
 def forget_sources() -> None:
@@ -218,7 +218,7 @@ def _read(name: str) -> Source | None:
     if spec.origin is None or not spec.has_location:
         return None
     path = Path(spec.origin)
-    content = path.read_bytes()
+    content = getattr(spec.loader, "get_data", lambda _: path.read_bytes())(spec.origin)  # it may be in a ZIP archive
     text = importlib.util.decode_source(content) if path.suffix == ".py" else blake3(content).hexdigest()
     return Source(path, folders is not None, text)
 
@@ -252,21 +252,22 @@ def module_without_stars(name: str) -> Module | None:
         return None
     module = Module(name, source.is_package)
     statements = list(_top_level(ast.parse(source.text, str(source.path)).body, ()))
-    bound = {name for statement, _ in statements for name in _bound_at_top(statement)}
-    functions = {s.name: s for s, _ in statements if isinstance(s, ast.FunctionDef)}
-    if "global" in source.text:  # a look at every function takes as long as all else here
-        bound |= {name for function in functions.values() for name in _declared_global(function)}
     for statement, tests in statements:
-        called = map(_changed_by_call, _run_by(statement, functions))
-        at_once = () if isinstance(statement, DEFINITIONS) else _changed_in(statement)
-        changed = [*at_once, *itertools.chain(*called)]
-        for name in dict.fromkeys([*_bound_at_top(statement), *(name for name in changed if name in bound)]):
-            module.add(name, *tests, statement)
         nodes = ast.walk(statement) if isinstance(statement, _BLOCKS) else (statement,)
         for name, origins in imports_of(module, nodes).items():
             module.imports.setdefault(name, []).extend(origins)
             if tests:  # which of several it is
                 module.add(name, *tests)
+    imported = {local: origins[0][0].partition(".")[0] for local, origins in module.imports.items()}
+    bound = {*imported, *(name for statement, _ in statements for name in _bound_at_top(statement))}
+    if "global" in source.text:  # a look at every function takes as long as all else here
+        functions = (statement for statement, _ in statements if isinstance(statement, FUNCTIONS))
+        bound.update(*map(declared_global, functions))
+    loading = Loading([statement for statement, _ in statements], imported, name.partition(".")[0])
+    for statement, tests in statements:
+        changed = bound.intersection(loading.changed(statement))
+        for local in dict.fromkeys([*_bound_at_top(statement), *sorted(changed)]):
+            module.add(local, *tests, statement)
     return module
 
 
@@ -284,8 +285,11 @@ def _top_level(body: list[ast.stmt], tests: tuple[ast.stmt, ...]) -> Iterator[tu
                 yield test, tests
                 yield from _top_level([*statement.body, *statement.orelse], (*tests, test))
         elif isinstance(statement, ast.Try | ast.TryStar):
-            for part in (statement.body, *(h.body for h in statement.handlers), statement.orelse, statement.finalbody):
-                yield from _top_level(part, tests)
+            yield from _top_level(statement.body, tests)
+            for handler in statement.handlers:
+                caught = [ast.copy_location(ast.Expr(handler.type), handler)] if handler.type else []
+                yield from _top_level(handler.body, (*tests, *caught))
+            yield from _top_level([*statement.orelse, *statement.finalbody], tests)
         else:
             yield statement, tests
 
@@ -299,9 +303,7 @@ def _bound_at_top(statement: ast.stmt) -> list[str]:
 
 def _bound_names(statement: ast.AST) -> list[str]:
     match statement:
-        case ast.FunctionDef(decorator_list=decorators):
-            return [statement.name, *dict.fromkeys(_dispatching(decorators))]
-        case ast.AsyncFunctionDef() | ast.ClassDef():
+        case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
             return [statement.name]
         case ast.Assign():
             return [n.id for target in statement.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
@@ -311,71 +313,11 @@ def _bound_names(statement: ast.AST) -> list[str]:
             return [name]
         case _ if isinstance(statement, _BLOCKS):
             inner = [name for child in ast.walk(statement) if child is not statement for name in _bound_names(child)]
-            return [*inner, *(n.id for n in ast.walk(statement) if isinstance(n, ast.Name) and _is_written(n))]
+            return [*inner, *(n.id for n in ast.walk(statement) if isinstance(n, ast.Name) and is_written(n))]
     return []
 
 
-DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 _BLOCKS = (ast.For, ast.AsyncFor, ast.While, ast.With, ast.AsyncWith, ast.Match)
-
-
-def _declared_global(function: ast.FunctionDef) -> list[str]:
-    return [name for node in ast.walk(function) if isinstance(node, ast.Global) for name in node.names]
-
-
-def _changed_by_call(function: ast.FunctionDef) -> list[str]:
-    """The names that a function declares global, and those whose objects it changes: where they are its module's."""
-    own = {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
-    return [*_declared_global(function), *(name for name in _changed_in(function) if name not in own)]
-
-
-def _run_by(statement: ast.stmt, functions: dict[str, ast.FunctionDef]) -> Iterator[ast.FunctionDef]:
-    """The functions of a module that are called when a statement of it runs, decorators among them, and those that
-    they call in their turn."""
-    pending: list[str] = []
-    for part in statement.decorator_list if isinstance(statement, DEFINITIONS) else (statement,):
-        pending += [part.id] if isinstance(part, ast.Name) else _called_in(part)
-    seen: set[str] = set()
-    while pending:
-        if (name := pending.pop()) in functions and name not in seen:
-            seen.add(name)
-            yield functions[name]
-            pending += _called_in(functions[name])
-
-
-def _called_in(part: ast.AST) -> list[str]:
-    """The functions that are called somewhere in a piece of code, by their names."""
-    calls = (node.func for node in ast.walk(part) if isinstance(node, ast.Call))
-    return [function.id for function in calls if isinstance(function, ast.Name)]
-
-
-def _changed_in(statement: ast.stmt) -> Iterator[str]:
-    """The names whose objects a statement changes: `x[...] = y`, `x.y = z`, `x.append(y)`, `fill(x)`."""
-    for node in ast.walk(statement):
-        changed: list[ast.expr] = []
-        if isinstance(node, ast.Subscript | ast.Attribute) and _is_written(node):
-            changed = [node]
-        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
-            changed = [*node.value.args, *(keyword.value for keyword in node.value.keywords)]
-            if not isinstance(node.value.func, ast.Name):
-                changed.append(node.value.func)
-        for part in changed:
-            while isinstance(part, ast.Subscript | ast.Attribute | ast.Starred | ast.Call):
-                part = part.func if isinstance(part, ast.Call) else part.value
-            if isinstance(part, ast.Name):
-                yield part.id
-
-
-def _is_written(node: ast.Name | ast.Subscript | ast.Attribute) -> bool:
-    return not isinstance(node.ctx, ast.Load)
-
-
-def _dispatching(decorators: list[ast.expr]) -> Iterator[str]:
-    """The functions of `functools.singledispatch` that `@f.register` and `@f.register(type)` add a branch to."""
-    for decorator in decorators:
-        match decorator.func if isinstance(decorator, ast.Call) else decorator:
-            case ast.Attribute(value=ast.Name(id=function), attr="register"):
-                yield function
 
 
 def imports_of(module: Module, nodes: Iterable[ast.AST]) -> Imports:

@@ -47,7 +47,7 @@ class FileRef:
     digest: str
     """blake3 of the content, hexadecimal."""
     stamp: tuple[int, ...] = field(default=(), init=False, compare=False, metadata={"key": False})
-    """Size, time of change and inode when this was made; () when there was no such file."""
+    """What `stamp` said of it when this was made; () when there was no such file."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stamp", self.stamp_now())
@@ -66,7 +66,7 @@ class FileRef:
         raise InputError(f"{path} changes while it is read; run again when it is complete.")
 
     def stamp_now(self) -> tuple[int, ...]:
-        """Size, time of change and inode of the file as it is now; () when there is no such file."""
+        """What `stamp` says of the file now; () when there is no such file."""
         try:
             return stamp(self.path)
         except OSError:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import time
 from pathlib import Path
 
+from ss_flow.cache.canonical import digest_file
 from ss_flow.cache.file_digests import FileDigests
+from ss_flow.cache.files import write_checked
 
 
 def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
@@ -83,4 +87,28 @@ def test_the_digest_of_a_file_whose_name_is_no_text_is_remembered(tmp_path):
     digests = FileDigests(tmp_path / "files.json")
     known = digests(file)
     digests.save()
-    assert FileDigests(tmp_path / "files.json")._known[str(file)][3] == known
+    assert FileDigests(tmp_path / "files.json")._known[str(file)][1] == known
+
+
+def test_a_file_that_was_written_over_with_its_old_time_is_read_again(tmp_path):
+    """As archives unpack over one another whose files have all the same time: the inode, too, is often the old one."""
+    file = tmp_path / "depth.raw"
+    file.write_bytes(b"one")
+    os.utime(file, (1, 1))
+    with FileDigests(tmp_path / "files.json") as digests:
+        before, known = file.stat(), digests(file)
+    time.sleep(0.05)  # as fine as a kernel's clock
+    file.write_bytes(b"two")
+    os.utime(file, (1, 1))
+    after = file.stat()
+    assert (before.st_size, before.st_mtime_ns, before.st_ino) == (after.st_size, after.st_mtime_ns, after.st_ino)
+    assert FileDigests(tmp_path / "files.json")(file) == digest_file(file) != known
+
+
+def test_a_table_of_an_older_version_is_learnt_again(tmp_path):
+    file = tmp_path / "photo"
+    file.write_text("one")
+    status = file.stat()
+    old = {str(file): [status.st_size, status.st_mtime_ns, status.st_ino, "of another"]}
+    write_checked(tmp_path / "files.json", json.dumps(old))
+    assert FileDigests(tmp_path / "files.json")(file) == digest_file(file)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -107,3 +108,39 @@ def test_a_file_that_was_only_touched_is_read_again_and_found_to_be_the_same(sto
         return {"x": toy.times_file(toy.source(values=(3.0,))[0], files=(ref,))}
 
     assert run_flow(flow, store, scene="toy").failures == []
+
+
+def test_a_link_to_a_file_that_is_made_while_it_is_used_changes_nothing(store, tmp_path, monkeypatch):
+    file = tmp_path / "factor.txt"
+    file.write_text("2.0")
+    read = Path.read_text
+
+    def linked(path, *args, **options):
+        if path == file:
+            time.sleep(0.05)
+            os.link(file, tmp_path / "copy of a backup")
+        return read(path, *args, **options)
+
+    monkeypatch.setattr(Path, "read_text", linked)
+    ref = FileRef(file, digest_file(file))
+
+    def flow():
+        return {"x": toy.times_file(toy.source(values=(3.0,))[0], files=(ref,))}
+
+    assert run_flow(flow, store, scene="toy").failures == [] and ref.stamp_now() != ref.stamp
+
+
+def test_a_file_that_was_written_over_with_its_old_time_after_its_key_was_made_fails_its_step(store, tmp_path):
+    file = tmp_path / "factor.txt"
+    file.write_text("2.0")
+    os.utime(file, (1, 1))
+
+    def flow():
+        ref = FileRef(file, digest_file(file))
+        time.sleep(0.05)
+        file.write_text("5.0")
+        os.utime(file, (1, 1))
+        return {"x": toy.times_file(toy.source(values=(3.0,))[0], files=(ref,))}
+
+    failure = run_flow(flow, store, scene="toy").values["x"]
+    assert "factor.txt, which has changed since the run started" in str(failure.error)

@@ -3,6 +3,8 @@ from __future__ import annotations
 import importlib
 import sys
 import textwrap
+import time
+import zipfile
 from importlib.machinery import EXTENSION_SUFFIXES
 
 import pytest
@@ -123,8 +125,45 @@ def test_every_form_of_import_is_followed(package, step):
         "while not TABLE:\n    fill(TABLE, TWO)\n",
         "import contextlib\nwith contextlib.suppress(KeyError):\n    TABLE = {1: TWO}\n",
         "match TWO:\n    case int(TABLE):\n        pass\n",
+        "_ = fill(TABLE, TWO)\n",
+        "assert fill(TABLE, TWO) is None\n",
+        "kept = TABLE.setdefault('a', TWO)\n",
+        "[TABLE.update({k: TWO}) for k in range(3)]\n",
+        "list(map(TABLE.update, [{'a': TWO}]))\n",
+        "alias = TABLE\nalias['a'] = TWO\n",
+        "for one in (TABLE, {}):\n    one['a'] = TWO\n",
+        "def among(f, t=TABLE.setdefault('a', TWO)):\n    pass\n",
+        "class Filling:\n    TABLE['a'] = TWO\n",
+        "class Filling:\n    def __init__(self, x):\n        TABLE['a'] = x\n\nmade = Filling(TWO)\n",
+        "class Filling:\n    @staticmethod\n    def fill(x):\n        TABLE['a'] = x\n\nFilling.fill(TWO)\n",
+        "class Base:\n    def __init_subclass__(cls):\n        TABLE[0] = cls\n\nclass A(Base):\n    x = TWO\n",
+        "class Meta(type):\n    def __init__(cls, *of):\n        TABLE[0]=cls\n\nclass A(metaclass=Meta):\n    x=TWO\n",
+        "def into(t):\n    return lambda f: t.update(f=f)\n\n@into(TABLE)\ndef f(x):\n    return TWO\n",
     ],
-    ids=["loop", "method", "chain", "added to", "argument", "while", "block", "pattern"],
+    ids=[
+        "loop",
+        "method",
+        "chain",
+        "added to",
+        "argument",
+        "while",
+        "block",
+        "pattern",
+        "call whose value is kept",
+        "assertion",
+        "method whose value is kept",
+        "comprehension",
+        "map",
+        "another name",
+        "loop over tables",
+        "default",
+        "body of a class",
+        "making an object",
+        "method of a class",
+        "hook of a base",
+        "metaclass",
+        "decorator",
+    ],
 )
 def test_the_statements_that_fill_a_table_belong_to_it(package, filling):
     step = "TWO = 2\nOTHER = 1\nTABLE = {}\n\ndef fill(t, x):\n    t[x] = x\n\n\ndef run(x):\n    return TABLE\n\n"
@@ -313,6 +352,19 @@ EDITS = {
     ),
     "filled by a call": ("TABLE = {}\ndef add(n, v):\n    TABLE[n] = v\nadd('f', 3)\n", "3", "4", "TABLE"),
     "set by a call": ("TABLE = None\ndef _start():\n    global TABLE\n    TABLE = 3\n_start()\n", "3", "4", "TABLE"),
+    "registered by a method": (
+        "class Table(dict):\n    def add(self, f):\n        self[f.__name__] = f\n        return f\n"
+        "TABLE = Table()\n@TABLE.add\ndef g(): return 3\n", "return 3", "return 4", "TABLE"),
+    "class that is registered": (
+        "class Table(dict):\n    def register(self, f):\n        self[f.__name__] = f\n        return f\n"
+        "TABLE = Table()\n@TABLE.register\nclass G:\n    k = 3\n", "k = 3", "k = 4", "TABLE"),
+    "classes changed in a loop": ("class A: pass\nclass B: pass\nfor one in (A, B):\n    one.k = 3\n", "3", "4", "A.k"),
+    "what a library is told": (
+        "import numpy as np\nnp.set_printoptions(precision=3)\n", "3", "5", "np.array2string(x)"),
+    "what a library is told by a part of it": (
+        "import decimal\nfrom decimal import Decimal\ndecimal.getcontext().prec = 3\n", "3", "5", "Decimal(x)"),
+    "which exception": ("try:\n    raise KeyError\nexcept KeyError:\n    N = 1\nexcept LookupError:\n    N = 2\n",
+                        "except KeyError", "except ValueError", "N"),
     "module as a value": ("from probe import maths\n", "", "", "{1: maths}[1].twice(x)"),
 }  # fmt: skip
 
@@ -324,6 +376,57 @@ def test_an_edit_that_changes_what_a_name_stands_for_is_seen(package, case):
     found = package(step=step, maths=MATHS)
     maths = MATHS if old else MATHS.replace("2", "3")
     assert found != package(step=step.replace(before, before.replace(old, new)) if old else step, maths=maths)
+
+
+PASSED_ON = {
+    "name of a library": ("from numpy import mean as f\n", "mean", "median", "probe.f(x)"),
+    "names": ("from probe.maths import twice as f, unrelated as g\n", "f, unrelated as g", "g, unrelated as f",
+              "probe.f(x) - probe.g(x)"),
+    "modules": ("from probe import maths as f, other as g\n", "f, other as g", "g, other as f",
+                "probe.f.twice(x) - probe.g.twice(x)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", PASSED_ON)
+def test_what_a_package_passes_on_counts(package, case):
+    passing, old, new, used = PASSED_ON[case]
+    modules = {"step": f"import probe\n\ndef run(x):\n    return {used}\n", "maths": MATHS, "other": MATHS}
+    found, edited = (package(**modules, __init__=text) for text in (passing, passing.replace(old, new)))
+    assert "probe.f" in found and {name for name in found if found[name] != edited[name]} == {
+        name for name in found if name.startswith("probe.") and name.count(".") == 1
+    }
+
+
+def test_of_two_modules_that_a_package_passes_on_under_one_name_both_are_followed(package):
+    passing = "try:\n    from probe import fast as f\nexcept ImportError:\n    from probe import maths as f\n"
+    modules = {"maths": MATHS, "fast": "import not_here\n\ndef twice(x):\n    return x\n", "__init__": passing}
+    found = package(step="import probe\n\ndef run(x):\n    return probe.f.twice(x)\n", **modules)
+    assert {"probe.fast.twice", "probe.maths.twice"} <= set(found)
+
+
+def test_what_a_module_that_is_used_as_a_value_passes_on_counts(package):
+    step = "from probe import passing\n\ndef run(x, how):\n    return getattr(passing, how)(x)\n"
+    assert "probe.maths.twice" in package(step=step, passing="from probe.maths import twice\n", maths=MATHS)
+
+
+def test_a_library_of_which_all_is_imported_counts(package):
+    step = "from scipy.special import *\n\ndef run(x):\n    return expit(x)\n"
+    assert modules_of(package, step=step) == {"scipy"}
+
+
+def test_what_a_library_makes_for_a_function_is_no_change_of_the_library(package):
+    step = (
+        "import numpy as np\n\ndef made(n):\n    found = np.zeros(3)\n    found[n] = 1\n    return found\n\n"
+        "FIRST = made(1)\n\ndef run(x):\n    return np.abs(x)\n"
+    )
+    assert set(package(step=step)) == {"probe.step.run"}
+
+
+def test_a_table_that_is_only_read_does_not_depend_on_who_reads_it(package):
+    step = (
+        "TABLE = {1: 'a b'}\nWORDS = [TABLE[1].split(), *TABLE.items(), len(TABLE)]\n\ndef run(x):\n    return TABLE\n"
+    )
+    assert package(step=step) == package(step=step.replace("len(TABLE)", "sum(TABLE)"))
 
 
 @pytest.mark.parametrize("hints", ["x: 'Out'", "x: list['Out']", "x: 'list[Out]'"])
@@ -408,3 +511,20 @@ def test_a_source_in_another_encoding_is_read_as_python_reads_it(package, tmp_pa
     (tmp_path / "marked_probe.py").write_bytes(b"\xef\xbb\xbfdef f(x):\n    return x\n")
     step = "import latin_probe, marked_probe\n\ndef run(x):\n    return latin_probe.f(marked_probe.f(x))\n"
     assert {"latin_probe.f", "marked_probe.f"} < set(package(step=step))
+
+
+def test_a_module_in_an_archive_is_followed(package, tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "packed.zip", "w") as archive:
+        archive.writestr("packed_probe.py", "def f(x):\n    return x\n")
+    monkeypatch.syspath_prepend(tmp_path / "packed.zip")
+    assert "packed_probe.f" in package(step="from packed_probe import f\n\ndef run(x):\n    return f(x)\n")
+
+
+def test_a_module_in_which_much_is_called_when_it_is_loaded_is_read_in_a_moment(package):
+    methods = "".join(f"    def m{n}(self, x{n}):\n        return f{n}(x{n}), M(x{n})\n" for n in range(60))
+    functions = "".join(f"def f{n}(x):\n    return M(x), f{(7 * n) % 60}(x)\n" for n in range(60))
+    made = "".join(f"A{n} = M({n})\n" for n in range(100))
+    step = f"class M:\n    def __init__(self, x):\n        pass\n{methods}{functions}{made}def run(x):\n    return A1\n"
+    began = time.process_time()
+    assert "probe.step.M" in package(step=step)
+    assert time.process_time() - began < 3

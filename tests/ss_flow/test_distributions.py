@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import sys
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,8 @@ def installed(tmp_path, monkeypatch):
         return folder
 
     def forget():
-        distributions._distributions.cache_clear()
+        for remembered in (distributions._distributions, distributions._read, distributions._folders):
+            remembered.cache_clear()
         distributions.is_distributed.cache_clear()
 
     yield install
@@ -63,3 +65,42 @@ def test_the_version_of_an_editable_installation_tells_of_no_edit(installed):
     installed("frames", "1.0", "frame")
     (folder / "direct_url.json").write_text('{"dir_info": {"editable": true}, "url": "file:///src"}')
     assert not distributions.is_distributed("pix") and distributions.is_distributed("frame")
+
+
+def written(folder: Path, module: str) -> Path:
+    file = folder / module / "__init__.py"
+    file.parent.mkdir(parents=True)
+    file.touch()
+    return file.parent
+
+
+def test_the_version_of_another_module_of_the_same_name_tells_of_no_edit(installed, tmp_path, monkeypatch):
+    written(installed("frames", "1.0", "frame").parent, "frame")
+    assert distributions.is_distributed("frame")
+    written(tmp_path / "mine", "frame")  # found before the one that is installed
+    monkeypatch.syspath_prepend(tmp_path / "mine")
+    distributions.is_distributed.cache_clear()
+    assert not distributions.is_distributed("frame")
+
+
+@pytest.mark.parametrize(("folder", "is_installed"), [("src", False), ("site-packages", True), ("dist-packages", True)])
+def test_the_version_of_sources_that_were_once_built_in_their_folder_tells_of_no_edit(
+    installed, tmp_path, monkeypatch, folder, is_installed
+):
+    written(tmp_path / folder, "frame")
+    egg = tmp_path / folder / "frames.egg-info"
+    egg.mkdir()
+    (egg / "PKG-INFO").write_text("Metadata-Version: 2.1\nName: frames\nVersion: 1.0\n")
+    (egg / "top_level.txt").write_text("frame\n")
+    monkeypatch.syspath_prepend(tmp_path / folder)
+    assert distributions.versions_of("frame") == {"frames": "1.0"}
+    assert distributions.is_distributed("frame") == is_installed
+
+
+def test_a_module_named_as_one_of_python_is_not_taken_for_it(installed, tmp_path, monkeypatch):
+    assert all(map(distributions.is_distributed, ("math", "os", "tabnanny", "sys", "_socket", "xml")))
+    written(tmp_path / "mine", "tabnanny")
+    monkeypatch.syspath_prepend(tmp_path / "mine")
+    monkeypatch.delitem(sys.modules, "tabnanny", raising=False)
+    distributions.is_distributed.cache_clear()
+    assert not distributions.is_distributed("tabnanny") and distributions.is_distributed("os")

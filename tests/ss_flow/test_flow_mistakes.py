@@ -121,3 +121,10 @@ def test_an_artifact_at_hand_is_no_input_but_becomes_one_through_the_store(store
             run(store, lambda at_hand=at_hand: {"x": toy.clip(at_hand, limit=2.0)})
     report = run(store, lambda: {"x": toy.clip(stored("x", store.put(toy.number(3.0))), limit=2.0)})
     assert value(store, report.values["x"]) == 2.0
+
+
+def test_a_generator_is_no_list_of_results(store):
+    """Its code would run when its files and its code have been looked at, and nobody hears what it says."""
+    report = run(store, lambda: {"x": toy.yielded(count=2)})
+    said = "the task ss_flow_toy.yielded declares a list and returned a generator; return a tuple"
+    assert str(report.values["x"].error) == said

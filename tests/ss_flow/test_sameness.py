@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import os
+import shutil
 import sys
 import textwrap
+import time
+from pathlib import Path
 
 import pytest
 
-from ss_flow import closure
+from ss_flow import closure, distributions, sameness
 from ss_flow.engine import run_flow
 from ss_flow.errors import ExecutorLost
 from ss_flow.events import Reporter
@@ -39,6 +43,14 @@ STEPS = """
     @task()
     def late(x: Number) -> Number:
         from probed_late import double
+
+        return number(double(float(x.value[0])))
+"""
+PACKAGED = """
+
+    @task()
+    def packaged(x: Number) -> Number:
+        from probed_package import double
 
         return number(double(float(x.value[0])))
 """
@@ -196,3 +208,82 @@ def test_code_that_was_edited_before_it_is_loaded_is_refused(store, probed, step
     with pytest.raises(ExecutorLost, match=f"otherwise than its key says: code of ss_flow_probed:{step} changed"):
         run(store, probed(), step, Editing(probed.folder / file, *moment))
     assert run(store, probed(), step) == (7.0, "finished")
+
+
+def test_bytecode_that_python_takes_for_that_of_an_edited_file_is_refused(store, probed, monkeypatch):
+    file = probed.folder / "probed_helper.py"
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    for text in (HELPER, HELPER.replace("2", "3")):
+        file.write_text(text)
+        os.utime(file, (1, 1))
+        steps = probed()
+        if text == HELPER:
+            assert run(store, steps, "second") == (6.0, "finished")
+            assert run(store, probed(), "second") == (6.0, "hit")
+    assert steps.double(3.0) == 6.0  # Python compares sizes and times alone
+    with pytest.raises(ExecutorLost, match=r"probed_helper was loaded from .*__pycache__.*: delete that, and start"):
+        run(store, steps, "second")
+    Path(sys.modules["probed_helper"].__cached__).unlink()
+    assert run(store, probed(), "second") == (9.0, "finished")
+
+
+class Updating(Reporter):
+    """Updates a package as soon as a step has begun."""
+
+    def __init__(self, site):
+        self.site = site
+
+    def event(self, kind, **details):
+        if (kind, details.get("step")) == ("started", "ss_flow_probed.packaged"):
+            install(self.site, "2.0", EDITED)
+
+
+def install(site, version, text):
+    for old in site.glob("*.dist-info"):
+        shutil.rmtree(old)
+    about = site / f"probed_package-{version}.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: probed-package\nVersion: {version}\n")
+    (about / "RECORD").write_text("probed_package.py,sha256=x,1\n")
+    (site / "probed_package.py").write_text(text)
+
+
+def test_a_package_that_is_updated_before_it_is_loaded_is_refused(store, probed, monkeypatch):
+    site = probed.folder.parent / "site-packages"
+    install(site, "1.0", HELPER)
+    monkeypatch.syspath_prepend(str(site))
+    (probed.folder / "ss_flow_probed.py").write_text(textwrap.dedent(STEPS) + textwrap.dedent(PACKAGED))
+
+    def load():
+        forget_packages()
+        return probed()
+
+    steps = load()
+    time.sleep(0.05)  # as fine as a kernel's clock
+    with pytest.raises(ExecutorLost, match=r"its key says: package probed-package 1\.0 -> 2\.0"):
+        run(store, steps, "packaged", Updating(site))
+    assert run(store, load(), "packaged") == (7.0, "finished")
+    install(site, "1.0", HELPER)
+    assert run(store, load(), "packaged") == (6.0, "finished")
+    forget_packages()
+
+
+def forget_packages():
+    for name in ("_distributions", "_read", "_folders", "is_distributed"):
+        getattr(distributions, name).cache_clear()
+    sameness._recipe.cache_clear()
+
+
+def test_a_package_that_was_updated_before_its_version_was_read_is_refused(probed, monkeypatch):
+    site = probed.folder.parent / "site-packages"
+    install(site, "1.0", HELPER)
+    monkeypatch.syspath_prepend(str(site))
+    forget_packages()
+    probed.forget()
+    assert distributions.is_distributed("probed_package")
+    install(site, "2.0", EDITED)
+    with pytest.raises(ExecutorLost, match="site-packages was updated or removed since this process began"):
+        distributions.versions_of("probed_package")
+    forget_packages()
+    assert distributions.versions_of("probed_package") == {"probed-package": "2.0"}
+    forget_packages()

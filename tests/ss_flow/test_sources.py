@@ -38,7 +38,7 @@ def test_of_several_modules_that_are_loaded_anew_each_one_that_changed_is_told(m
     monkeypatch.setattr(sources, "_loaded", lambda *_: list(text))
     monkeypatch.setattr(sources, "_specification", lambda name: object())  # another one each time
     monkeypatch.setattr(sources, "_read", text.__getitem__)
-    monkeypatch.setattr(sources, "is_as_written", lambda name: True)
+    monkeypatch.setattr(sources, "not_as_written", lambda name: "")
     assert not sources.read_loaded(("probe",), False) and not sources.read_loaded(("probe",), False)
     text[changed] = "2"
     assert sources.read_loaded(("probe",), False) and not sources.read_loaded(("probe",), False)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ss_flow.graph import each, expand
-from ss_flow.running import cores, last_try, load_checkpoint, progress, save_checkpoint
+from ss_flow.running import cores, last_try, load_checkpoint, progress, save_checkpoint, warn
 from ss_flow.task import Bundle, FileRef, Resources, task
 
 if TYPE_CHECKING:
@@ -353,6 +353,14 @@ def unmade(x: Number) -> Number:
 def raising(x: Number, *, error: str) -> Number:
     """Raises a built-in exception."""
     raise getattr(builtins, error)("two is too much")
+
+
+@task()
+def yielded(*, count: int) -> tuple[Number, ...]:
+    """A generator, in which nothing runs before someone asks for its items."""
+    for n in range(count):
+        warn(f"item {n}")
+        yield number(n)
 
 
 @task()
