@@ -134,6 +134,7 @@ class Objects:
         points = [entry["num_points"] for entry in entries]
         mean = sum(n * e["confidence"] for n, e in zip(points, entries, strict=True)) / max(1, sum(points))
         whole_entry = entries[0] | {
+            **_placed_together(entries),
             "views": sorted({view for entry in entries for view in entry["views"]}),
             "confidence": round(mean, 4) if sum(points) else entries[0]["confidence"],
             "num_points": sum(points),
@@ -236,6 +237,20 @@ def unused_name(name: str, used: Collection[str]) -> str:
     """A name as it is, or with the first number from 2 on that makes it another than those that are used."""
     numbered = (f"{name} {number}" for number in itertools.count(2))
     return next(one for one in itertools.chain([name], numbered) if one not in used)
+
+
+def _placed_together(entries: Sequence[Entry]) -> Entry:
+    """The box and the mean of instances as one, for where none of them has Gaussians, which tell both anew."""
+    known = [entry for entry in entries if entry["bbox"]]
+    if not known:
+        return {"bbox": None, "centroid": None}
+    points = [max(1, entry["num_points"]) for entry in known]
+    middle = np.average([entry["centroid"] for entry in known], axis=0, weights=points)
+    corners = {
+        "min": np.min([entry["bbox"]["min"] for entry in known], axis=0).tolist(),
+        "max": np.max([entry["bbox"]["max"] for entry in known], axis=0).tolist(),
+    }
+    return {"bbox": corners, "centroid": np.round(middle, 6).tolist()}
 
 
 def _unseen(entry: Entry) -> Entry:

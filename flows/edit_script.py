@@ -24,6 +24,8 @@ T = TypeVar("T")
 _REQUIRED = cast(Any, object())
 _VERSION = 1
 _NO_TURN: tuple[Vector, float] = ((0.0, 0.0, 1.0), 0.0)
+_BACKGROUND = "background"
+"""What `remove` and `keep` call what has the id 0, so no object is given this name."""
 _OF_GAUSSIANS = ("duplicate", "transform", "recolour", "replace", "split")
 """Operations that need Gaussians to work on."""
 
@@ -172,6 +174,8 @@ class _Call:
     def _free_name(self, value: Any) -> str:
         if edit_fields.TEXT.read(value) in self.objects.names():
             raise Unfit("there is an object of this name; give it another one")
+        if value == _BACKGROUND:
+            raise Unfit("the background goes by this name; give it another one")
         return str(value)
 
     def motion(self) -> Motion:
@@ -186,7 +190,7 @@ class _Call:
         )
 
     def _one(self, value: Any, *, background: bool = False) -> int:
-        if background and value in (0, "background") and not isinstance(value, bool):
+        if background and value in (0, _BACKGROUND) and not isinstance(value, bool):
             return 0
         found = self.objects.find(value) if isinstance(value, int | str) and not isinstance(value, bool) else None
         if found is None:

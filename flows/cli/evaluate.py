@@ -162,7 +162,8 @@ class Evaluate:
             "true objects": _rows(**each),
             "instances taken out": _rows(instance=taken.instance, residual=taken.residual),
         }
-        return _Tables({"held out views" if kept_back else "training views": means}, objects)
+        measured = {name: value for name, value in means.items() if not math.isnan(value)}  # without a border no band
+        return _Tables({"held out views" if kept_back else "training views": measured}, objects)
 
     def _of_labels(self, warnings: list[str]) -> _Tables:
         run = open_run(self.result, self.store, _LERF_NEEDED[self.protocol])

@@ -78,7 +78,7 @@ def fill(
     still there hides it; and where no view looked through it, by its depth map. One such place in each cube of the
     points' spacing becomes a Gaussian, with the median colour of the 32 nearest points of the plane and the ids of the
     nearest Gaussian of all that stayed. Small Gaussians near filled places that only came to light when the instances
-    left are taken away.
+    left are taken away. What was filled before stays, and no place within a spacing of it is filled a second time.
 
     gone: labels of the dense points that are no longer there, those of the instances among them.
     """
@@ -96,6 +96,7 @@ def fill(
     solid = ~_seen_through(places, cameras, measured.depths, thickness)
     places, plane_of = places[solid], plane_of[solid]
     chosen = _one_a_cube(places, spacing)
+    chosen = chosen[_farther(places[chosen], after.means[after.filled > 0], spacing)]
     places, plane_of = places[chosen], plane_of[chosen]
     if not len(places):
         return after
@@ -305,8 +306,18 @@ def _came_to_light(
             np.maximum(with_it, render(before, camera_of(measured.cameras, number)).max_contribution, out=with_it)
     came = np.zeros(len(after), bool)
     stayed = np.flatnonzero(~np.isin(after.instance_id, instances))[: len(rest)]  # what is new comes last
-    came[stayed] = (grown & small & within(places)) | (alone & (with_it[stays] < _FAINT))
+    came[stayed] = (rest.filled == 0) & ((grown & small & within(places)) | (alone & (with_it[stays] < _FAINT)))
     return came
+
+
+def _farther(places: Float64, others: Float32, distance: float) -> Bool:
+    """[M] which places [M, 3] are farther than a distance from all others."""
+    from scipy.spatial import cKDTree
+
+    if not len(others):
+        return np.ones(len(places), bool)
+    far: Bool = cKDTree(others).query(places, workers=1)[0] > distance
+    return far
 
 
 def _one_a_cube(places: Float64, side: float) -> Int32:

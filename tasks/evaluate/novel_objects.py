@@ -75,7 +75,8 @@ def object_views(
 
     frames, cameras: the views, those without ground truth among them. truth: true ids, 0 = none. perception: the
     network of LPIPS.
-    Pixels that a frame's `valid` mask excludes do not count. Raises InputError when no view shows an instance.
+    Pixels that a frame's `valid` mask excludes do not count, nor does a view that has no others. Raises InputError when
+    no view shows an instance.
     """
     from ss_flow.tasks.gaussians.render import render
 
@@ -85,6 +86,8 @@ def object_views(
     for done, ids in enumerate(truth):
         frame = frames[row_of[ids.name]]
         valid, photo = decode_valid(frame), decode_rgb(frame)
+        if not valid.any():  # nothing to compare, and a mean of nothing is no number
+            continue
         camera = camera_of(cameras, row_of[ids.name]).scaled(frame.width, frame.height)
         image = to_8bit(render(scene, camera).rgb)
         differences = None if perception is None else perceived(image, photo, valid, perception)

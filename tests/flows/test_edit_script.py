@@ -60,6 +60,7 @@ def applied(*steps: object) -> tuple[EditedScene, Objects]:
         ({"op": "recolour", "instances": 2, "color": "red"}, "color is 'red'; it must be \"#rrggbb\", or red, green"),
         ({"op": "recolour", "instances": 2, "color": [0, 0, 256]}, "whole numbers of 0 to 255."),
         ({"op": "duplicate", "instance": 2, "name": "lamp"}, "name is 'lamp'; there is an object of this name"),
+        ({"op": "relabel", "instance": 2, "name": "background"}, "the background goes by this name; give it"),
         ({"op": "relabel", "instance": 2, "name": ""}, "name is ''; it must be a text that is not empty."),
         ({"op": "relabel", "instance": 2, "kind": "tool"}, 'kind is \'tool\'; it must be "thing" or "stuff".'),
         ({"op": "merge", "instances": [2]}, "instances is [2]; it must name at least 2 instances."),
@@ -138,6 +139,20 @@ def test_merging_makes_parts_of_what_had_none_and_splitting_gives_them_back():
     pairs = np.stack([scene().instance_id * 10 + scene().part_id, apart.instance_id])
     assert len(np.unique(pairs, axis=1).T) == len(np.unique(pairs[0])) == len(np.unique(pairs[1]))
     assert objects.names() == ["speck", *(f"still life part {p}" for p in (1, 2, 3, 4))]
+
+
+def test_instances_that_only_masks_show_lie_together_where_both_lie_when_they_are_merged():
+    faint = [
+        {**DOCUMENT["instances"][3], "id": 5, "bbox": {"min": [0, 0, 0], "max": [1, 2, 1]}, "centroid": [0.5, 1, 0.5]},
+        {**DOCUMENT["instances"][3], "id": 6, "name": "mote", "bbox": {"min": [3, 1, -1], "max": [4, 4, 0]},
+         "centroid": [3.5, 2, -0.5], "num_points": 120},
+    ]  # fmt: skip
+    document = {**DOCUMENT, "instances": [*DOCUMENT["instances"][:3], *faint]}
+    script = {"operations": [{"op": "merge", "instances": [5, "mote"]}]}
+    steps, objects = check(script, Objects.of(copy.deepcopy(document), scene()), Path("here"))
+    merged = objects.document(document, steps[0].apply(scene()))["instances"][-1]
+    assert (merged["id"], merged["num_points"], merged["file"]) == (5, 160, None)
+    assert merged["bbox"] == {"min": [0, 0, -1], "max": [4, 4, 1]} and merged["centroid"] == [2.75, 1.75, -0.25]
 
 
 _AWAY = {"move": [1, 0, 0]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from importlib.util import find_spec
 
+import cv2
 import numpy as np
 import pytest
 from random_networks import vgg_like
@@ -134,6 +135,18 @@ def test_objects_are_compared_one_by_one(tiny):
     assert taken and all(0 <= row["residual"] < 0.2 for row in taken)
     assert found["worst_residual"] == max(row["residual"] for row in taken)
     assert 5 < found["band_psnr"] < 100 and 0 < found["band_ssim"] < 1
+
+
+def test_where_no_border_is_seen_no_figure_of_borders_is_told(tmp_path):
+    room = write_room(tmp_path / "room", params=RoomParams(objects=1, views=4, width=64, height=48, held_out=0))
+    for file in (room / "instance").iterdir():
+        cv2.imwrite(str(file), np.ones((48, 64), np.uint16))
+    out = tmp_path / "out"
+    assert run_tiny(room, tmp_path / "store", out=out).code == 0
+    answer = ss_flow("eval", out, "--protocol", "objects", "--json", "--cache", tmp_path / "store")
+    assert answer.code == 0 and "NaN" not in answer.out, "JSON has no NaN"
+    found = answer.document()["metrics"]["training views"]
+    assert "object_psnr" in found and not any(name.startswith("band") for name in found)
 
 
 @pytest.fixture

@@ -128,6 +128,16 @@ def test_what_is_not_filled_is_the_scene_as_it_was(seen, removed):
     assert len(kept) > 0.95 * len(removed) and all(tuple(row) in rows for row in kept.tolist())
 
 
+def test_what_was_filled_stays_when_what_stood_on_it_since_leaves_and_is_not_filled_twice(seen, removed):
+    measured, scene = seen
+    floor = fill(scene, removed, measured, instances=(BOX,), gone=(BOX,))
+    box = select(scene, scene.instance_id == BOX)
+    again = concatenate([floor, replace(box, instance_id=np.full(len(box), 9, np.int32))])
+    after = fill(again, floor, measured, instances=(9,), gone=(BOX,))
+    first, second = ({tuple(row) for row in one.means[one.filled > 0].tolist()} for one in (floor, after))
+    assert len(first) > 100 and first <= second and len(second) < 1.05 * len(first)
+
+
 def test_a_place_that_a_view_looked_through_is_not_filled(seen, removed):
     measured, scene = seen
     far = [DepthMap(d.name, np.full_like(d.depth, 9.0), d.source) for d in measured.depths]

@@ -103,6 +103,15 @@ def test_a_view_without_an_object_has_no_band_and_counts_in_the_whole_alone() ->
     assert found.whole_psnr == pytest.approx((alone.whole_psnr + 100) / 2)
 
 
+def test_a_view_without_a_valid_pixel_counts_nowhere() -> None:
+    cameras = Cameras(("a", "b"), *(np.repeat(x, 2, axis=0) for x in list(vars(CAMERAS).values())[1:4]), True)
+    frames = _frame(SEEN // 2), replace(_frame(SEEN, np.zeros((HEIGHT, WIDTH), bool)), name="b")
+    alone = object_views(frames[:1], CAMERAS, SCENE, (TRUTH,))
+    found = object_views(frames, cameras, SCENE, (TRUTH, LabelMap("b", TRUTH.ids)))
+    assert (found.whole_psnr, found.whole_ssim) == (alone.whole_psnr, alone.whole_ssim)
+    assert (found.psnr.tolist(), found.views.tolist()) == (alone.psnr.tolist(), [1, 1])
+
+
 def test_views_without_an_object_are_refused() -> None:
     with pytest.raises(InputError, match="show no instance"):
         object_views((_frame(SEEN),), CAMERAS, SCENE, (LabelMap("a", np.zeros_like(TRUTH.ids)),))
