@@ -8,9 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
+from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
+from ss_flow.flows import settings
+from ss_flow.flows.cli.context import file_digests
+from ss_flow.flows.cli.prepare import RunOptions, prepare
+from ss_flow.flows.params import Params
 from ss_flow.tasks.capture.ingest import black_border, cameras, frames
-from ss_flow.tasks.capture.layout_stray import steadiest
 from ss_flow.tasks.capture.recordings import recorded_frames
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.sensor_depth import depth
@@ -175,31 +179,20 @@ def test_strays_frames_without_depth_and_rows_beyond_the_video_are_left_out(tmp_
     assert left.skipped == (scene.names[0], "frame-000004")
 
 
-def test_of_each_stretch_of_a_recording_the_frame_is_taken_at_which_the_phone_moved_least(tmp_path):
-    scene = open_made("stray", tmp_path, frames=10)
-    rows = (tmp_path / "odometry.csv").read_text().splitlines()
-    places = [0, 1, 2, 2.1, 2.2, 3, 4, 4.1, 4.2, 5]
-    for i, place in enumerate(places):
-        words = rows[i + 1].split(", ")
-        rows[i + 1] = ", ".join([*words[:2], str(place), *words[3:]])
-    (tmp_path / "odometry.csv").write_text("\n".join(rows))
-    moved = open_scene(tmp_path)
-    chosen = steadiest(moved, 5, 120)
-    assert chosen.entries == (3, 7) and chosen.names == ("frame-000003", "frame-000007") == chosen.all_names
-    assert [file.stem for file in chosen.depths] == ["000003", "000007"]
-    assert len(steadiest(scene, 0, 3).names) == 3  # four frames each, and what is left
-    assert steadiest(scene, 1, 120).names == scene.names
-    assert len(steadiest(scene, 0, 120, every=5).names) == 2 and len(steadiest(scene, 0, 5, every=2).names) == 3
+def test_a_long_recording_gives_frames_as_a_video_does(tmp_path):
+    scene = open_made("stray", tmp_path, frames=30)
+    digests = file_digests(Store(tmp_path / "store"))
 
+    def used(*texts):
+        params = settings.apply(Params(), [f"capture.{text}" for text in texts])
+        return prepare(scene, params, RunOptions(), digests).scene
 
-def test_a_turn_on_the_spot_counts_as_motion_too(tmp_path):
-    scene = open_made("stray", tmp_path, frames=6)
-    poses = []
-    for degrees in (0, 10, 20, 20.5, 21, 31):
-        turn = np.eye(4)
-        turn[:3, :3] = cv2.Rodrigues(np.array([0, np.radians(degrees), 0]))[0]
-        poses.append(tuple(turn.ravel().tolist()))
-    assert steadiest(replace(scene, poses=tuple(poses)), 6, 120).entries == (3,)
+    assert used().names == scene.names == used("max_views=5").names
+    few = used("video.max_frames=5")
+    assert len(few.names) == 5 and "--set capture.video.max_frames=30 uses all" in few.remarks[0]
+    assert [file.stem for file in few.depths] == [f"{entry:06d}" for entry in few.entries]
+    assert len(used("video.max_frames=8", "stride=2").names) == 4
+    assert used("video.stride=3").entries == tuple(range(0, 30, 3)) == used("stride=3").entries
 
 
 @pytest.mark.parametrize(
