@@ -14,6 +14,7 @@ from ss_flow.tasks.capture.scene_files import (
     Pose,
     SceneFiles,
     check_lens,
+    depth_maps,
     files_in,
     is_number,
     read_json,
@@ -48,7 +49,7 @@ def open_polycam(root: Path) -> SceneFiles:
     prefix = "corrected_" if all((keyframes / f"corrected_{name}").is_dir() for name in ("cameras", "images")) else ""
     photos = by_stem(files_in(keyframes / f"{prefix}images"))
     cameras = by_stem(files_in(keyframes / f"{prefix}cameras", _JSON))
-    depths = by_stem(files_in(keyframes / "depth"))
+    depths = depth_maps(keyframes / "depth")
     confidences = by_stem(files_in(keyframes / "confidence"))
     taken = by_stem(files_in(keyframes / "cameras", _JSON)) | cameras
     names = sorted(taken, key=lambda name: (natural_key(name), name))

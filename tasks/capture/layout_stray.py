@@ -16,6 +16,7 @@ from ss_flow.tasks.capture.scene_files import (
     Pose,
     SceneFiles,
     check_lens,
+    depth_maps,
     files_in,
     open_video,
     read_text,
@@ -44,7 +45,7 @@ def open_stray(root: Path) -> SceneFiles:
     rows = _rows(track)
     size, length = _video(root / "rgb.mp4")
     common = None if all(key in rows[0] for key in _LENS) else _camera_matrix(root / "camera_matrix.csv", size)
-    depths, confidences = by_stem(files_in(root / "depth")), by_stem(files_in(root / "confidence"))
+    depths, confidences = depth_maps(root / "depth"), by_stem(files_in(root / "confidence"))
     stems = _stems(rows, track)
     names = [f"frame-{stem}" for stem in stems]
     kept = [i for i, stem in enumerate(stems) if i < length and (stem in depths or not depths)]

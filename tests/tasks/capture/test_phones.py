@@ -179,6 +179,19 @@ def test_strays_frames_without_depth_and_rows_beyond_the_video_are_left_out(tmp_
     assert left.skipped == (scene.names[0], "frame-000004")
 
 
+@pytest.mark.parametrize("layout", ["polycam", "stray"])
+def test_depth_that_is_not_read_is_not_passed_over(layout, tmp_path):
+    scene = open_made(layout, tmp_path)
+    for file in scene.depths:
+        file.rename(file.with_suffix(".npy"))
+    with pytest.raises(InputError, match=r"depth holds no depth map that is read, but \d+\.npy, for one; PNG of 16"):
+        open_scene(tmp_path)
+    for file in scene.depths:
+        file.with_suffix(".npy").unlink()
+    (scene.depths[0].parent / ".DS_Store").write_bytes(b"")
+    assert open_scene(tmp_path).depths is None
+
+
 def test_a_long_recording_gives_frames_as_a_video_does(tmp_path):
     scene = open_made("stray", tmp_path, frames=30)
     digests = file_digests(Store(tmp_path / "store"))
