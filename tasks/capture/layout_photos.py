@@ -10,6 +10,7 @@ from ss_flow.tasks.capture.scene_files import (
     PHOTO_SUFFIXES,
     PNM_SUFFIXES,
     UNREAD_SUFFIXES,
+    VIDEO_SUFFIXES,
     SceneFiles,
     files_in,
 )
@@ -52,7 +53,8 @@ def open_photos(path: Path) -> SceneFiles | None:
 
 def unused(scene: SceneFiles) -> tuple[str, ...]:
     """What to say of images that are not used: in folders beside the photos, though not of copies scaled down
-    (images_4), which are no loss; and PGM and its kin beside other photos."""
+    (images_4), which are no loss; PGM and its kin beside other photos; and recordings, but for those of the same names,
+    as phones store with a photo what moved."""
     used = {file.parent.resolve() for file in scene.files()} | {(scene.root / "held_out").resolve()}
     beside = [f for f in sorted(scene.root.glob("*/")) if not f.name.startswith((".", "images_"))]
     left = [f for f in beside if not any(place.is_relative_to(f.resolve()) for place in used)]
@@ -65,6 +67,8 @@ def unused(scene: SceneFiles) -> tuple[str, ...]:
             f"{min(pnm)} is not used, nor what else of PGM and its kin ({len(pnm)}) lies beside the photos: if "
             "this is depth, lay all out as color/, depth/ and pose/ (docs/rgbd.md)."
         )
+    recordings = [f for f in files_in(scene.root, VIDEO_SUFFIXES | {".sens"}) if f.stem not in scene.names]
+    told += [f"{f} is not used, as photos lie beside it; give its own path to use it." for f in recordings]
     return tuple(told)
 
 

@@ -122,6 +122,15 @@ def test_folders_of_images_beside_photos_that_are_not_used_are_told(tmp_path, ph
     assert said.startswith(f"{tmp_path} holds images that are not used, in day2/ (3), depth/ (1): ")
 
 
+def test_a_recording_beside_photos_is_told_unless_it_belongs_to_one_of_them(tmp_path):
+    made.photos(tmp_path)
+    (tmp_path / "2.MOV").write_bytes(b"")
+    assert open_scene(tmp_path).remarks == ()
+    (tmp_path / "walk.mp4").write_bytes(b"")
+    said = f"{tmp_path / 'walk.mp4'} is not used, as photos lie beside it; give its own path to use it."
+    assert open_scene(tmp_path).remarks == (said,)
+
+
 def test_opening_is_light_and_quick(tmp_path):
     import subprocess
 
