@@ -30,6 +30,17 @@ def test_scannet_has_metric_poses_and_half_a_pixel_is_added_to_its_centres(tmp_p
     assert [p.parent.name for p in scene.valid] == ["valid"] * 3
 
 
+def test_scannets_sample_of_frames_has_its_intrinsics_in_no_folder(tmp_path):
+    export = open_scene(made.scannet(tmp_path))
+    for sensor in ("color", "depth"):
+        (tmp_path / f"intrinsic/intrinsic_{sensor}.txt").rename(tmp_path / f"intrinsics_{sensor}.txt")
+    (tmp_path / "intrinsic").rmdir()
+    assert open_scene(tmp_path) == export
+    (tmp_path / "intrinsics_color.txt").unlink()
+    with pytest.raises(InputError, match=r"intrinsic/intrinsic_color\.txt is missing"):
+        open_scene(tmp_path)
+
+
 def test_nerfstudio_cameras_look_the_other_way(tmp_path):
     scene = open_scene(made.nerfstudio(tmp_path))
     assert scene.kind == "nerfstudio" and scene.metric

@@ -104,6 +104,19 @@ def test_depth_of_the_lowest_confidence_is_unknown(tmp_path):
     assert measured[0].depth[0, 0] > 2.9 and measured[1].depth[0, 0] == 0
 
 
+def test_corrected_cameras_of_newer_versions_tell_no_size_and_it_is_that_of_their_photos(tmp_path):
+    scene = open_made("polycam", tmp_path, turns=1)
+    for file in tmp_path.glob("keyframes/corrected_cameras/*.json"):
+        values = json.loads(file.read_text())
+        del values["width"], values["height"]
+        file.write_text(json.dumps(values))
+    again = open_scene(tmp_path)
+    assert again.lenses == scene.lenses and scene.lenses[0].width == made.HEIGHT
+    edit(tmp_path, width=made.WIDTH)
+    with pytest.raises(InputError, match="has no number `height`"):
+        open_scene(tmp_path)
+
+
 def test_a_view_of_polycams_that_is_not_whole_is_left_out(tmp_path):
     scene = open_made("polycam", tmp_path)
     scene.depths[1].unlink()
