@@ -26,9 +26,9 @@ def thinned(scene: SceneFiles, most: int, motion: float, parameter: str) -> Scen
     """Of a capture with poses that has more than `most` views, those to which all others are near.
 
     Farthest-point sampling: each next view is the one that is farthest from all taken ones, until no view is farther
-    than `motion`, or `most` are taken; first among the views with ground truth. In the place of others comes the
-    steadiest view near by, before and after which the camera moved least: it is the sharpest. Views with clicks are
-    taken in any case.
+    than `motion`, or `most` are taken; first among the views with ground truth. In its place comes the steadiest view
+    near by, before and after which the camera moved least: it is the sharpest. Views with clicks come on top, so that
+    the choice of the others is what it was when their user saw them.
     most: 0 = all views are used, as they are where there are no poses.
     motion: how far a picture moves from one view to the other (`_moves`), as a share of its diagonal.
     parameter: what `most` is called, for the remark that tells what was left out.
@@ -47,11 +47,7 @@ def thinned(scene: SceneFiles, most: int, motion: float, parameter: str) -> Scen
         taken.append(view)
 
     taken: list[int] = []
-    clicked = {hint.view for clicks in (scene.hints, scene.corrections) if clicks is not None for hint in clicks.hints}
     annotated = np.array([truth is not None for truth in scene.ground_truth or [None] * len(poses)])
-    for view, name in enumerate(scene.names):
-        if name in clicked:
-            take(view)
     for among in (annotated, np.ones(len(poses), bool)):
         while len(taken) < most:
             farthest = int(np.argmax(np.where(among, reach, -1)))
@@ -59,11 +55,11 @@ def thinned(scene: SceneFiles, most: int, motion: float, parameter: str) -> Scen
                 break
             take(farthest)
     stir, near = _stir(poses), reach <= reach.max() / 2
-    chosen = set()
+    clicked = {hint.view for clicks in (scene.hints, scene.corrections) if clicks is not None for hint in clicks.hints}
+    chosen = {view for view, name in enumerate(scene.names) if name in clicked}
     for view in taken:
-        around = np.flatnonzero(near & (nearest == view))
-        kept = annotated[view] or scene.names[view] in clicked
-        chosen.add(view if kept else int(around[np.argmin(stir[around])]))
+        around = np.flatnonzero(near & (nearest == view) & (annotated | ~annotated[view]))
+        chosen.add(int(around[np.argmin(stir[around])]))
     return _only(scene, sorted(chosen), np.min([moves(view) for view in chosen], axis=0).max(), parameter)
 
 
@@ -93,7 +89,9 @@ def _moves(scene: SceneFiles, poses: Float64) -> Callable[[int], Float64]:
     centers = centers_of(poses)
     spread = np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False) / np.sqrt(len(centers) / 2)
     distance = _DISTANCE if scene.metric else max(spread[1], _STRAIGHT * spread[0]) or 1.0
-    focal = np.array([(lens.fx + lens.fy) / 4 / np.hypot(lens.cx, lens.cy) for lens in scene.lenses])
+    # A lens without a size has its principal point near the middle.
+    sizes = [(lens.width or 2 * lens.cx, lens.height or 2 * lens.cy) for lens in scene.lenses]
+    focal = np.array([lens.fx for lens in scene.lenses]) / np.maximum(np.hypot(*np.transpose(sizes)), 1)
 
     def moves(view: int) -> Float64:
         steps = np.linalg.norm(centers - centers[view], axis=1) / distance

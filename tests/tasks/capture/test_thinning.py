@@ -109,13 +109,16 @@ def test_near_by_the_view_is_taken_at_which_the_camera_moves_least():
 def test_views_with_clicks_are_taken_and_those_with_ground_truth_first():
     way = np.linspace(0, 2, 400)
     truth = [Path(f"{i}.png") if i in (33, 34, 211) else None for i in range(400)]
-    clicks = Hints(Path("hints.json"), ("mug",), tuple(Hint(f"{i:04d}", 1, ((1, 1),), ()) for i in (101, 102)))
-    scene = recording(way, 0 * way, ground_truth=tuple(truth), hints=clicks)
+    scene = recording(way, 0 * way, ground_truth=tuple(truth))
     views = taken(scene)
-    assert {101, 102, 33, 211} <= {*views}
+    assert 211 in views and {33, 34} & {*views} and {101, 102} - {*views}
+    clicks = Hints(Path("hints.json"), ("mug",), tuple(Hint(f"{i:04d}", 1, ((1, 1),), ()) for i in (101, 102)))
+    assert (
+        taken(replace(scene, hints=clicks)) == sorted({101, 102, *views}) == taken(replace(scene, corrections=clicks))
+    )
     few = thinned(scene, 100, 0.04, "capture.max_views")
     assert few.ground_truth[few.names.index("0211")] == Path("211.png")
-    assert len(views) < 2 + 1.25 / 0.04 + 20  # and 34, whose picture is that of 33, only as one of the fewest
+    assert len(views) < 1.25 / 0.04 + 20  # and 34, whose picture is that of 33, only as one of the fewest
 
 
 @pytest.mark.parametrize("scale", [0.01, 1000])
