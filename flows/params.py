@@ -21,7 +21,7 @@ from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.capture.stereo import StereoParams
 from ss_flow.tasks.capture.video import VideoParams
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.ranges import Count, Fraction, NonNegative, QuarterTurns
+from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, QuarterTurns
 from ss_flow.tasks.semantics.dense_describe import DenseDescribeParams
 from ss_flow.tasks.semantics.describe import DescribeParams
 from ss_flow.tasks.semantics.query import QueryParams
@@ -52,6 +52,9 @@ class CaptureParams:
     stride: Count = 1
     """Take every n-th view, where views that are left out count too (ScanNet is evaluated at 20); of a video, one n-th
     of the frames."""
+    max_views: Natural = 300
+    """The most views of a capture that brings poses. Of more, those are taken from which all others are no farther than
+    `capture.video.motion`, by their poses; 0 = all are used."""
     depth: Literal["auto", "sensor", "mvs", "mono", "rendered"] = "auto"
     """Where depth comes from; "auto" is the sensor where there is one, else the scene of --scene where one is given
     ("rendered"), else several views (mvs)."""

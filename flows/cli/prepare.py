@@ -27,9 +27,9 @@ from ss_flow.flows.split import Networks
 from ss_flow.flows.split_splat import LEADS_TO, LEADS_TO_CAMERAS, split_splat
 from ss_flow.graph import Call, Flow, Gather, Node, gather, nodes_by_step
 from ss_flow.resolution import Failure
-from ss_flow.tasks.capture.layout_stray import steadiest
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.scene_files import SceneFiles
+from ss_flow.tasks.capture.thinning import thinned
 from ss_flow.tasks.device import processes_with_room
 from ss_flow.tasks.gaussians.rasterize import device_here
 from ss_flow.tasks.models.catalogue import DISTANCES
@@ -161,10 +161,12 @@ def prepare(
     Raises InputError when a network cannot be used.
     """
     if scene.kind == "stray":
-        taken = params.capture.video
-        scene = steadiest(scene, taken.stride, taken.max_frames, params.capture.stride)
+        taken = params.capture.video.every(params.capture.stride)
+        scene = scene.every(taken.stride or params.capture.stride)
+        scene = thinned(scene, taken.max_frames, taken.motion, "capture.video.max_frames")
     else:
         scene = scene.every(params.capture.stride)
+        scene = thinned(scene, params.capture.max_views, params.capture.video.motion, "capture.max_views")
     params = replace(params, capture=turned(scene, params.capture))
     if params.evaluate.zero_is_void is None:
         params = replace(params, evaluate=replace(params.evaluate, zero_is_void=scene.zero_is_void))

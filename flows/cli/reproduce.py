@@ -125,7 +125,7 @@ class Reproduce:
         params = settings.preset(Params(), self.execution.preset)
         # The paper's authors scale ScanNet's photos to its depth maps, 640 x 480 (spec 2.1).
         small = ["capture.ingest.max_side=640"] if plan.data == "scan" and self.data != GENERATED else []
-        texts = [f"capture.stride={stride}", *small, *(f"{name}={seed}" for name in _SEEDS)]
+        texts = [f"capture.stride={stride}", "capture.max_views=0", *small, *(f"{name}={seed}" for name in _SEEDS)]
         return settings.apply(params, [*texts, *self.execution.texts, *variant.settings])
 
     def _prepared(self, runs: Sequence[Run], plan: Plan, digests: FileDigests) -> tuple[dict[int, _Ready], list[str]]:

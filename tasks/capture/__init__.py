@@ -3,8 +3,8 @@
 The steps, in the order in which they run:
 
 1. `scene` finds out what lies in a folder and lists it as `scene_files`; no step yet. The layouts: `layout_colmap`,
-   `layout_nerfstudio`, `layout_polycam`, `layout_replica`, `layout_scannet`, `layout_stray`, `layout_tum`. `names`:
-   which files belong together.
+   `layout_nerfstudio`, `layout_photos`, `layout_polycam`, `layout_replica`, `layout_scannet`, `layout_stray`,
+   `layout_tum`. `names`: which files belong together. `thinning`: which views of a long recording are used.
 2. `ingest`, or `video` and `recordings` where frames lie in one file: frames, and cameras that were given. What is
    known of photos: `photo_files`, `lens`, `upright`; `photo_pixels`: the way back to the photos as they were taken.
 3. Without poses: `features`, `pairs`, `matches`, `sfm` (with `colmap`, `colmap_database`; `turning`: photos from one

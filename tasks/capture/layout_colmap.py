@@ -15,7 +15,15 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float32, Float64
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.names import natural_key, view_names
-from ss_flow.tasks.capture.scene_files import Pose, SceneFiles, check_lens, check_rigid, files_in, read_text
+from ss_flow.tasks.capture.scene_files import (
+    Pose,
+    SceneFiles,
+    check_lens,
+    check_rigid,
+    files_in,
+    place_of,
+    read_text,
+)
 
 _MODELS: tuple[tuple[str, int], ...] = (
     ("SIMPLE_PINHOLE", 3),
@@ -56,7 +64,8 @@ def is_colmap(root: Path) -> bool:
 def open_colmap(root: Path) -> SceneFiles:
     """The largest model of a COLMAP workspace, by registered images.
 
-    Photos lie in `images/`, or beside the model; those that the model lacks are skipped. World units are arbitrary
+    Photos lie in `images/`, or beside the model; of a model in `sparse/` that is named itself, in the workspace above.
+    Those that the model lacks are skipped. World units are arbitrary
     (`metric` is False).
     Raises InputError when a file is damaged, a photo missing, or a lens unknown.
     """
@@ -65,14 +74,14 @@ def open_colmap(root: Path) -> SceneFiles:
     if not views:
         raise InputError(f"{folder} has no registered image; reconstruct the scene again, or give its photos alone.")
     views.sort(key=lambda v: (natural_key(v.file_name), v.file_name))
-    images = root / "images" if (root / "images").is_dir() else root
-    photos = tuple(images / v.file_name for v in views)
+    images = _images(root, folder, views[0].file_name)
+    photos = tuple(place_of(images, v.file_name) for v in views)
     for view in views:
         if view.camera not in lenses:
             raise InputError(f"{folder} has no camera {view.camera}, which its image {view.file_name} refers to.")
     registered = set(photos)
     # COLMAP looks for photos in all folders below `images/`; beside a model without one lie other things, too.
-    places = {p.parent for p in photos} | set((root / "images").glob("**/"))
+    places = {p.parent for p in photos} | (set() if images == root else set(images.glob("**/")))
     unregistered = [p for place in sorted(places) for p in files_in(place) if p not in registered]
     everything = sorted([*photos, *unregistered], key=lambda p: natural_key(p.as_posix()))
     called = view_names(photos, unregistered)
@@ -122,6 +131,14 @@ def _models(root: Path) -> list[Path]:
     # Of the scene's own folder, images.txt may be any list of its photos.
     alone = [root] if _holds_any(root, "cameras", "points3D") else []
     return alone + [folder for folder in folders if _holds_any(folder, "cameras", "images", "points3D")]
+
+
+def _images(root: Path, model: Path, first: str) -> Path:
+    """The folder below which photos are listed; first: one of them."""
+    if (root / "images").is_dir():
+        return root / "images"
+    above = root.absolute().parents[:2] if model == root and not place_of(root, first).exists() else ()
+    return next((place / "images" for place in above if (place / "images").is_dir()), root)
 
 
 def _holds_any(folder: Path, *stems: str) -> bool:

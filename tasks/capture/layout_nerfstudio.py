@@ -14,42 +14,54 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.names import natural_key, view_names
 from ss_flow.tasks.capture.photo_files import header_size
-from ss_flow.tasks.capture.scene_files import OPENGL_TO_OPENCV, Pose, SceneFiles, check_lens, read_text, rigid_inverse
+from ss_flow.tasks.capture.scene_files import (
+    OPENGL_TO_OPENCV,
+    Pose,
+    SceneFiles,
+    check_lens,
+    place_of,
+    read_text,
+    rigid_inverse,
+)
 from ss_flow.tasks.geometry.cameras import Camera
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 """Those that a photo's name may leave out, as in NeRF's synthetic scenes."""
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
+_DEPTH = ("depth_file_path", "depth_unit_scale_factor")
+_DEPTH_OF_NGP = ("depth_path", "integer_depth_scale")
+"""What a frame's depth file is called, and world units per unit of these, by nerfstudio and by instant-ngp."""
 
 
 def open_nerfstudio(path: Path) -> SceneFiles:
     """The capture that a `transforms.json` describes.
 
     Its poses are camera-to-world with OpenGL's axes (y up, looking along -z); where all frames have depth, all may be
-    without. A unit of its depth files is `depth_unit_scale_factor` world units (0.001 unless said). The scene counts as
-    metric exactly when it has depth maps: those of a sensor come in metres, while poses alone are mostly structure from
-    motion's.
+    without. A unit of its depth files is `depth_unit_scale_factor` world units (0.001 unless said), or, where they are
+    listed as `depth_path`, `integer_depth_scale`. The scene counts as metric exactly when it has depth maps: those of a
+    sensor come in metres, while poses alone are mostly structure from motion's.
     Frames whose photo is not there are left out: such a file is often passed on with a part of its photos.
     Raises InputError when the file or another file that it lists is missing or makes no sense, or no photo is there.
     """
     root = path.parent
     document = _document(path)
     listed = sorted(document["frames"], key=lambda f: (natural_key(f["file_path"]), f["file_path"]))
-    places = [(frame, _photo(_place(root, frame["file_path"]))) for frame in listed]
+    places = [(frame, _photo(place_of(root, frame["file_path"]))) for frame in listed]
     found = [(frame, photo) for frame, photo in places if photo is not None]
     if not found:
-        first = _place(root, listed[0]["file_path"])
+        first = place_of(root, listed[0]["file_path"])
         raise InputError(
             f"{path} lists {len(listed)} photos, and none of them exists; the first is looked for at {first}"
             f"{'' if first.suffix else ', also with .png, .jpg or .jpeg at its end'}."
         )
     frames, photos = [frame for frame, _ in found], tuple(photo for _, photo in found)
-    missing = [_place(root, frame["file_path"]) for frame, photo in places if photo is None]
+    missing = [place_of(root, frame["file_path"]) for frame, photo in places if photo is None]
     called = view_names(photos, missing)
-    with_depth = [f for f in frames if f.get("depth_file_path")]
+    depth, unit = _DEPTH if any(f.get(_DEPTH[0]) for f in frames) else _DEPTH_OF_NGP
+    with_depth = [f for f in frames if f.get(depth)]
     if with_depth and len(with_depth) < len(frames):
-        lacking = next(f["file_path"] for f in frames if not f.get("depth_file_path"))
-        raise InputError(f"{path} gives no depth_file_path for {lacking}; give one for every frame, or for none.")
+        lacking = next(f["file_path"] for f in frames if not f.get(depth))
+        raise InputError(f"{path} gives no {depth} for {lacking}; give one for every frame, or for none.")
     unposed = with_depth and not any("transform_matrix" in frame for frame in frames)
     poses = None if unposed else tuple(_pose(frame, path) for frame in frames)
     return SceneFiles(
@@ -58,13 +70,13 @@ def open_nerfstudio(path: Path) -> SceneFiles:
         names=tuple(called[p] for p in photos),
         photos=photos,
         valid=tuple(_listed(root, f.get("mask_path"), path) for f in frames),
-        depths=tuple(_place(root, f["depth_file_path"]) for f in frames) if with_depth else None,
-        depth_scale=_depth_scale(document, path),
+        depths=tuple(place_of(root, f[depth]) for f in frames) if with_depth else None,
+        depth_scale=_depth_scale(document, unit, path) if with_depth else 1e-3,
         lenses=tuple(_lens({**document, **f}, p, path) for f, p in zip(frames, photos, strict=True)),
         poses=poses,
         metric=bool(with_depth),
         skipped=tuple(called[p] for p in missing),
-        all_names=tuple(called[photo or _place(root, frame["file_path"])] for frame, photo in places),
+        all_names=tuple(called[photo or place_of(root, frame["file_path"])] for frame, photo in places),
     )
 
 
@@ -120,17 +132,11 @@ def _document(path: Path) -> dict[str, Any]:
     if not frames:
         raise InputError(f"{path} lists no frame; at least one photo is needed.")
     for number, frame in enumerate(frames):
-        for key in ("file_path", "depth_file_path", "mask_path"):
+        for key in ("file_path", _DEPTH[0], _DEPTH_OF_NGP[0], "mask_path"):
             value = frame.get(key)
             if not (isinstance(value, str) and value) and (key == "file_path" or value not in (None, "")):
                 raise InputError(f"{path} has `{key}` {value!r} in frame {number}; the name of a file is expected.")
     return document
-
-
-def _place(root: Path, name: str) -> Path:
-    """Where a listed file lies; Windows writes folders with backslashes."""
-    place = root / name
-    return place if place.exists() else root / name.replace("\\", "/")
 
 
 def _photo(photo: Path) -> Path | None:
@@ -142,7 +148,7 @@ def _photo(photo: Path) -> Path | None:
 def _listed(root: Path, name: str | None, path: Path) -> Path | None:
     if not name:
         return None
-    file = _place(root, name)
+    file = place_of(root, name)
     if not file.is_file():
         raise InputError(f"{file}, which {path.name} lists, does not exist; put it there or drop the entry.")
     return file
@@ -198,11 +204,14 @@ def _number(value: Any, key: str, path: Path) -> float:
     return number
 
 
-def _depth_scale(document: dict[str, Any], path: Path) -> float:
-    scale = _number(document.get("depth_unit_scale_factor", 1e-3), "depth_unit_scale_factor", path)
+def _depth_scale(document: dict[str, Any], unit: str, path: Path) -> float:
+    if unit not in document and unit == _DEPTH_OF_NGP[1]:
+        raise InputError(
+            f"{path} has `{_DEPTH_OF_NGP[0]}` and no `{unit}`; world units per unit of the depth files are expected."
+        )
+    scale = _number(document.get(unit, 1e-3), unit, path)
     if scale <= 0:
         raise InputError(
-            f"{path} has `depth_unit_scale_factor` {scale:g}; world units per unit of the depth files are expected, "
-            "above 0."
+            f"{path} has `{unit}` {scale:g}; world units per unit of the depth files are expected, above 0."
         )
     return scale

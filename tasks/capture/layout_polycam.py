@@ -9,11 +9,13 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.names import by_stem, natural_key
+from ss_flow.tasks.capture.photo_files import header_size
 from ss_flow.tasks.capture.scene_files import (
     OPENGL_TO_OPENCV,
     Pose,
     SceneFiles,
     check_lens,
+    depth_maps,
     files_in,
     is_number,
     read_json,
@@ -40,7 +42,8 @@ def open_polycam(root: Path) -> SceneFiles:
     Where the app has optimised the poses, `corrected_cameras/` and `corrected_images/`, whose distortion is taken out,
     are read in place of `cameras/` and `images/`. Poses are camera-to-world in ARKit's world, with y up, of cameras
     that look along -z; depth counts millimetres, and where its confidence is lowest, it counts as unknown. A view that
-    lacks its camera, photo or depth is left out. Photos are turned upright.
+    lacks its camera, photo or depth is left out. Where a camera has no width and height, as corrected ones of newer
+    versions, they are its photo's. Photos are turned upright.
     Raises InputError when a file makes no sense, or no view is whole.
     """
     keyframes = _keyframes(root)
@@ -48,7 +51,7 @@ def open_polycam(root: Path) -> SceneFiles:
     prefix = "corrected_" if all((keyframes / f"corrected_{name}").is_dir() for name in ("cameras", "images")) else ""
     photos = by_stem(files_in(keyframes / f"{prefix}images"))
     cameras = by_stem(files_in(keyframes / f"{prefix}cameras", _JSON))
-    depths = by_stem(files_in(keyframes / "depth"))
+    depths = depth_maps(keyframes / "depth")
     confidences = by_stem(files_in(keyframes / "confidence"))
     taken = by_stem(files_in(keyframes / "cameras", _JSON)) | cameras
     names = sorted(taken, key=lambda name: (natural_key(name), name))
@@ -59,7 +62,7 @@ def open_polycam(root: Path) -> SceneFiles:
             f"{' and a depth map in depth/' if depths else ''}, all of one name; export the raw data again."
         )
     used = set(whole)
-    read = [_camera(cameras[name]) for name in whole]
+    read = [_camera(cameras[name], photos[name]) for name in whole]
     lenses, poses = upright([lens for lens, _ in read], [pose for _, pose in read])
     return SceneFiles(
         kind="polycam",
@@ -77,8 +80,10 @@ def open_polycam(root: Path) -> SceneFiles:
     )
 
 
-def _camera(path: Path) -> tuple[Lens, Pose]:
+def _camera(path: Path, photo: Path) -> tuple[Lens, Pose]:
     values = read_json(path)
+    if isinstance(values, dict) and not {"width", "height"} & values.keys():
+        values["width"], values["height"] = header_size(photo)
     entries = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
     needed = ["width", "height", "fx", "fy", "cx", "cy", *(key for row in entries for key in row)]
     lacking = [key for key in needed if not isinstance(values, dict) or not is_number(values.get(key))]

@@ -39,7 +39,7 @@ def open_scannet(root: Path) -> SceneFiles:
     photos = list(by_stem(files_in(root / "color")).items())
     if not photos:
         raise InputError(f"{root / 'color'} holds no photo; ScanNet's colour frames (0.jpg, 1.jpg, ...) are expected.")
-    lens = _intrinsics(root / "intrinsic" / "intrinsic_color.txt")
+    lens = _intrinsics(_intrinsics_file(root, "color"))
     depths = by_stem(files_in(root / "depth")) if (root / "depth").is_dir() else None
     unposed = depths is not None and not (root / "pose").is_dir()
     poses: list[Pose] = []
@@ -63,7 +63,7 @@ def open_scannet(root: Path) -> SceneFiles:
         photos=tuple(photo for _, photo in kept),
         depths=None if depths is None else tuple(depths[stem] for stem, _ in kept),
         depth_scale=1e-3,
-        depth_lens=_depth_lens(root / "intrinsic") if depths else None,
+        depth_lens=_depth_lens(root) if depths else None,
         lenses=(lens,) * len(kept),
         poses=None if unposed else tuple(poses),
         metric=True,
@@ -94,11 +94,18 @@ def _lens(matrix: Float64, where: str, width: int = 0, height: int = 0) -> Lens:
     return check_lens(Lens(width, height, fx, fy, cx, cy), where)
 
 
-def _depth_lens(folder: Path) -> Lens | None:
-    path = folder / "intrinsic_depth.txt"
+def _intrinsics_file(root: Path, sensor: str) -> Path:
+    """Where the intrinsics of a sensor lie, "color" or "depth"; ScanNet's sample of 25,000 frames has them in no folder
+    of their own."""
+    of_sample = root / f"intrinsics_{sensor}.txt"
+    return of_sample if of_sample.is_file() else root / "intrinsic" / f"intrinsic_{sensor}.txt"
+
+
+def _depth_lens(root: Path) -> Lens | None:
+    path = _intrinsics_file(root, "depth")
     if not path.is_file():
         return None
-    extrinsic = folder / "extrinsic_depth.txt"
+    extrinsic = root / "intrinsic" / "extrinsic_depth.txt"
     if extrinsic.is_file():
         _check_shared_center(read_matrix(extrinsic), str(extrinsic))
     return _intrinsics(path)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.layout_colmap import pose_matrix
 from ss_flow.tasks.capture.lens import Lens
 from ss_flow.tasks.capture.names import by_stem
@@ -18,17 +16,15 @@ from ss_flow.tasks.capture.scene_files import (
     Pose,
     SceneFiles,
     check_lens,
+    depth_maps,
     files_in,
     open_video,
     read_text,
     rigid_inverse,
 )
 from ss_flow.tasks.capture.upright import upright
-from ss_flow.tasks.geometry.cameras import centers_of
 
 _PLACE, _TURN, _LENS = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("fx", "fy", "cx", "cy")
-_DISTANCE = 1.5
-"""Metres to what a phone is held towards: at this distance a step blurs as much as a turn by its angle does."""
 
 
 def is_stray(root: Path) -> bool:
@@ -49,7 +45,7 @@ def open_stray(root: Path) -> SceneFiles:
     rows = _rows(track)
     size, length = _video(root / "rgb.mp4")
     common = None if all(key in rows[0] for key in _LENS) else _camera_matrix(root / "camera_matrix.csv", size)
-    depths, confidences = by_stem(files_in(root / "depth")), by_stem(files_in(root / "confidence"))
+    depths, confidences = depth_maps(root / "depth"), by_stem(files_in(root / "confidence"))
     stems = _stems(rows, track)
     names = [f"frame-{stem}" for stem in stems]
     kept = [i for i, stem in enumerate(stems) if i < length and (stem in depths or not depths)]
@@ -74,31 +70,6 @@ def open_stray(root: Path) -> SceneFiles:
         skipped=tuple(name for i, name in enumerate(names) if i not in used),
         all_names=tuple(names),
     )
-
-
-def steadiest(scene: SceneFiles, stride: int, max_frames: int, every: int = 1) -> SceneFiles:
-    """One frame out of each `stride` of a recording, or of more where that gives above `max_frames`: the one before and
-    after which the phone moved least, and so the sharpest. every: so many times fewer frames."""
-    poses = scene.world_to_camera
-    assert poses is not None
-    count = len(poses)
-    stride = every * max(stride, -(-count // max_frames))
-    motion = _motion(poses)
-    chosen = [start + int(np.argmin(motion[start : start + stride])) for start in range(0, count, stride)]
-    told = {*(scene.names[i] for i in chosen), *scene.skipped}
-    return replace(scene.pick(chosen), all_names=tuple(name for name in scene.all_names if name in told))
-
-
-def _motion(poses: Float64) -> Float64:
-    """[K] how far what a camera sees moves across the picture, from the frame before or to the frame after: radians.
-
-    poses: [K, 4, 4] world to camera.
-    """
-    turn = np.einsum("kij,kij->k", poses[1:, :3, :3], poses[:-1, :3, :3])
-    steps = np.linalg.norm(np.diff(centers_of(poses), axis=0), axis=1) / _DISTANCE
-    steps += np.arccos(np.clip((turn - 1) / 2, -1, 1))
-    padded = np.concatenate([steps[:1], steps, steps[-1:]]) if len(steps) else np.zeros(2)
-    return np.maximum(padded[:-1], padded[1:])
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from ss_flow.errors import InputError
 from ss_flow.tasks.capture.hints import read_hints
 from ss_flow.tasks.capture.layout_colmap import is_colmap, open_colmap
 from ss_flow.tasks.capture.layout_nerfstudio import open_nerfstudio
+from ss_flow.tasks.capture.layout_photos import open_photos, unused
 from ss_flow.tasks.capture.layout_polycam import is_polycam, open_polycam
 from ss_flow.tasks.capture.layout_replica import is_replica, open_replica
 from ss_flow.tasks.capture.layout_scannet import is_scannet, open_scannet, open_sens
@@ -18,10 +19,7 @@ from ss_flow.tasks.capture.layout_stray import is_stray, open_stray
 from ss_flow.tasks.capture.layout_tum import open_tum
 from ss_flow.tasks.capture.names import by_name, finder, spelt
 from ss_flow.tasks.capture.scene_files import (
-    HEIC_SUFFIXES,
     PHOTO_SUFFIXES,
-    PNM_SUFFIXES,
-    UNREAD_SUFFIXES,
     VIDEO_SUFFIXES,
     SceneFiles,
     files_in,
@@ -88,17 +86,16 @@ def open_scene(
         scene = replace(scene, valid=_some_by_name(scene.root / "valid", scene.names))
     if not scene.valid:
         scene = replace(scene, valid=(None,) * len(scene.names))
-    return replace(scene, remarks=_unused(scene)) if scene.kind == "photos" else scene
+    remarks = unused(scene) if scene.kind == "photos" else ()
+    return replace(scene, remarks=(*remarks, *_alone(scene, path)))
 
 
-def _unused(scene: SceneFiles) -> tuple[str, ...]:
-    """What to say of folders beside photos that hold images, too; copies scaled down (images_4) are no loss."""
-    used = {file.parent.resolve() for file in scene.files()} | {(scene.root / "held_out").resolve()}
-    beside = [f for f in sorted(scene.root.glob("*/")) if not f.name.startswith((".", "images_"))]
-    left = [f for f in beside if not any(place.is_relative_to(f.resolve()) for place in used)]
-    listed = ", ".join(f"{folder.name}/ ({number})" for folder in left if (number := len(files_in(folder))))
-    why = "photos are read of one folder, and depth where a layout gives its lens and unit (docs/captures.md)"
-    return (f"{scene.root} holds images that are not used, in {listed}: {why}.",) if listed else ()
+def _alone(scene: SceneFiles, path: Path) -> tuple[str, ...]:
+    """What to say where only the photos, or the video, of a capture were named that brings more."""
+    above = path.absolute().parent
+    if scene.kind not in ("photos", "video") or _known_layout(above) is None:
+        return ()
+    return (f"{path} is used without the poses or the depth that lie beside it; give {above} to use them.",)
 
 
 def _names_zero(file: Path) -> bool:
@@ -135,21 +132,25 @@ def _open_layout(path: Path) -> SceneFiles:
             raise InputError(f"{path} is an archive; unzip it, and give the folder that comes out.")
         suffixes = " ".join(sorted(VIDEO_SUFFIXES))
         raise InputError(f"{path} is no scene; give {ACCEPTED}; videos end in {suffixes}.")
-    if (path / "transforms.json").is_file():
-        return open_nerfstudio(path / "transforms.json")
-    if is_scannet(path):
-        return open_scannet(path)
-    if (path / "rgb.txt").is_file():
-        return open_tum(path)
-    if is_replica(path):
-        return open_replica(path)
-    if is_polycam(path):
-        return open_polycam(path)
-    if is_stray(path):
-        return open_stray(path)
-    if is_colmap(path):
-        return open_colmap(path)
-    return _open_loose(path)
+    known = _known_layout(path)
+    return _open_loose(path) if known is None else known(path)
+
+
+def _known_layout(folder: Path) -> Callable[[Path], SceneFiles] | None:
+    """What opens a folder of a layout that tells more than photos alone; None where it is of no such."""
+    if (folder / "transforms.json").is_file():
+        return lambda place: open_nerfstudio(place / "transforms.json")
+    if is_scannet(folder):
+        return open_scannet
+    if (folder / "rgb.txt").is_file():
+        return open_tum
+    if is_replica(folder):
+        return open_replica
+    if is_polycam(folder):
+        return open_polycam
+    if is_stray(folder):
+        return open_stray
+    return open_colmap if is_colmap(folder) else None
 
 
 def _open_loose(path: Path) -> SceneFiles:
@@ -158,34 +159,9 @@ def _open_loose(path: Path) -> SceneFiles:
             f"{path} holds {others[0].name}, and poses are read from transforms.json only; copy it to that name, or "
             "move it away to have poses found."
         )
-    photos, more = _one_of_each(files_in(path)), _one_of_each(files_in(path / "images"))
-    if photos and more:
-        raise InputError(
-            f"{path} holds photos ({len(photos)}), and so does its folder images/ ({len(more)}); give {path / 'images'}"
-            " to use the latter, or move that folder away."
-        )
-    photos = photos or more
+    if (photos := open_photos(path)) is not None:
+        return photos
     recordings = files_in(path, VIDEO_SUFFIXES | {".sens"})
-    if photos:
-        folder, stems = photos[0].parent, {photo.stem for photo in photos}
-        depths = [photo for photo in photos if _is_depth(photo)]
-        if 0 < len(depths) < len(photos):
-            raise InputError(
-                f"{folder} holds depth maps beside its photos, such as {depths[0].name}; lay them out as color/, "
-                "depth/ and pose/ with one stem a view, and intrinsic/intrinsic_color.txt (docs/rgbd.md), or move the "
-                "depth maps away to use photos alone."
-            )
-        unread = [file for file in files_in(folder, UNREAD_SUFFIXES) if file.stem not in stems]
-        called = {photo: photo.stem for photo in photos} | {file: file.name for file in unread}
-        listed = files_in(folder, PHOTO_SUFFIXES | UNREAD_SUFFIXES)
-        return SceneFiles(
-            kind="photos",
-            root=path,
-            names=tuple(p.stem for p in photos),
-            photos=tuple(photos),
-            skipped=tuple(file.name for file in unread),
-            all_names=tuple(called[file] for file in listed if file in called),
-        )
     if len(recordings) > 1:
         raise InputError(f"{path} holds {len(recordings)} recordings; give the path of one of them.")
     if recordings:
@@ -199,32 +175,19 @@ def _open_loose(path: Path) -> SceneFiles:
 def _what_to_give(path: Path) -> str:
     """What to give in the place of a folder without a photo: its only folder that is a capture, or has some photos, or
     any capture."""
-    captures = [
-        folder for folder in sorted(path.glob("*/")) if is_colmap(folder) or (folder / "transforms.json").is_file()
-    ]
+    captures = [folder for folder in sorted(path.glob("*/")) if _known_layout(folder) is not None]
     if len(captures) == 1:
-        return f"its folder {captures[0].name}/ is a capture with poses, so give that"
+        return f"its folder {captures[0].name}/ is a capture with poses or depth, so give that"
+    if (path / "metadata.json").is_file() and any((path / name).is_dir() for name in ("rgbd", "rgb")):
+        return (
+            "Record3D's exports are read once nerfstudio has made a transforms.json of them (ns-process-data record3d, "
+            "docs/rgbd.md)"
+        )
     within = [(folder, photos) for folder in sorted(path.glob("*/")) if (photos := files_in(folder))]
     if len(within) == 1:
         folder, photos = within[0]
         return f"its folder {folder.name}/ holds {len(photos)} of them, so give that"
     return f"give {ACCEPTED}"
-
-
-def _one_of_each(photos: list[Path]) -> list[Path]:
-    """Photos without those in HEIC that lie beside a copy in another format, as phones export them, and without PGM and
-    its kin beside other formats: there they hold depth, as in recordings of RGB-D cameras."""
-    photos = [photo for photo in photos if photo.suffix.lower() not in PNM_SUFFIXES] or photos
-    copied = {photo.stem for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES}
-    return [photo for photo in photos if photo.suffix.lower() not in HEIC_SUFFIXES or photo.stem not in copied]
-
-
-def _is_depth(photo: Path) -> bool:
-    """Whether the header of a file is that of a PNG with 16 bits in one channel."""
-    if photo.suffix.lower() != ".png" or not photo.is_file():
-        return False
-    with photo.open("rb") as file:
-        return file.read(26)[24:] == bytes([16, 0])
 
 
 def _check_files(scene: SceneFiles) -> None:

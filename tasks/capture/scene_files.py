@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from ss_flow.cache import plain_json
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.capture.lens import Lens
-from ss_flow.tasks.capture.names import capture_name, natural_key
+from ss_flow.tasks.capture.names import by_stem, capture_name, natural_key
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
 PNM_SUFFIXES = frozenset({".pgm", ".ppm", ".pnm"})
@@ -187,6 +188,27 @@ def files_in(folder: Path, suffixes: frozenset[str] = PHOTO_SUFFIXES) -> list[Pa
     return sorted(found, key=lambda p: (natural_key(p.name), p.name))
 
 
+def depth_maps(folder: Path) -> dict[str, Path]:
+    """The depth maps of a recording by their stems; none where the folder is missing or empty.
+
+    Raises InputError when it holds other files only, or two of one stem.
+    """
+    found = by_stem(files_in(folder))
+    others = [] if found or not folder.is_dir() else sorted(e.name for e in os.scandir(folder) if e.name[0] != ".")
+    if others:
+        raise InputError(
+            f"{folder} holds no depth map that is read, but {others[0]}, for one; PNG of 16 bits is expected: convert "
+            "them, or take the folder away to do without depth."
+        )
+    return found
+
+
+def place_of(folder: Path, name: str) -> Path:
+    """Where a file lies that is listed by its name below a folder; Windows writes folders with backslashes."""
+    place = folder / name
+    return place if place.exists() else folder / name.replace("\\", "/")
+
+
 def open_video(path: Path) -> Any:
     """OpenCV's reader of a video; whether it could be opened, it tells.
 
@@ -207,7 +229,9 @@ def read_text(path: Path) -> str:
     Raises InputError when it is absent or no text.
     """
     try:
-        return path.read_text(encoding="utf-8-sig")  # editors on Windows put a mark in front
+        data = path.read_bytes()
+        # Editors on Windows put a mark in front, and its shell writes two bytes a letter.
+        return data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(f"{path} is missing; the capture needs it.") from error
     except (UnicodeDecodeError, OSError) as error:

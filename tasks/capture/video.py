@@ -44,8 +44,8 @@ class VideoParams:
     max_frames: Count = 120
     """The most frames that are taken, of a video or a recording of Stray Scanner."""
     motion: NonNegative = 0.04
-    """Take a frame of a video whenever the picture has moved by so much of its diagonal; 0 = as many as `max_frames`
-    allows, evenly over time."""
+    """Take a frame of a video whenever the picture has moved by so much of its diagonal, and of a long recording with
+    poses likewise; 0 = as many as `max_frames` (`max_views`) allows."""
     stride: Natural = 0
     """Take one frame out of so many, or of more where `max_frames` would be exceeded; 0 = by `motion`."""
     candidates: Count = 5

@@ -56,13 +56,13 @@ class Walk:
     """From elsewhere beside the way."""
 
 
-def walk(name: str) -> Walk:
+def walk(name: str, frames: int = FRAMES, width: int = 640) -> Walk:
     """desk:SEED or room:SEED."""
     kind, seed = name.split(":")
-    room = replace(ROOM, seed=int(seed), width=640, height=480)
+    room = replace(ROOM, seed=int(seed), width=width, height=width * 3 // 4)
     renderer = renderer_of_desk(room.seed) if kind == "desk" else renderer_of(room)
     round_it = _round_a_desk if kind == "desk" else _round_a_room
-    time_ = np.linspace(0, 1, FRAMES)
+    time_ = np.linspace(0, 1, frames)
     way = np.interp(time_, [0, 0.3, 0.5, 1], [0, 0.5, 0.5, 1])  # stands still from .3 to .5
     rng = np.random.default_rng(room.seed)
     kept_back = (np.arange(BETWEEN) + 0.5) / BETWEEN
@@ -125,6 +125,11 @@ def measured(of: Walk, video: Path, choice: str, params: Params, place: Path) ->
     taken = [int(frame.name.removeprefix("frame-")) for frame in frames]
     write_views(only(of.seen, taken), folder)
     write_views(of.between, folder / "held_out")
+    return row_of(of, choice, taken, folder, params, store)
+
+
+def row_of(of: Walk, choice: str, taken: Sequence[int], folder: Path, params: Params, store: Store) -> str:
+    """The line of a choice of frames, of which the capture in a folder comes to consist."""
     used, begun = _processor_seconds(), time.perf_counter()
     found = outcome(folder, params, 2, store)
     used, seconds = _processor_seconds() - used, time.perf_counter() - begun

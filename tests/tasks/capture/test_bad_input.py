@@ -51,7 +51,7 @@ def photos_and_depth_maps_in_one_folder(root):
     return root
 
 
-@case("scene", "its folder dense/ is a capture with poses, so give that.")
+@case("scene", "its folder dense/ is a capture with poses or depth, so give that.")
 def folder_of_a_workspace_among_others(root):
     made.colmap(root / "dense")
     made.photos(root / "walk")

@@ -121,6 +121,13 @@ def depth_in_a_negative_unit(root):
     return made.nerfstudio(root, depth_unit_scale_factor=-0.001)
 
 
+@case("transforms.json", "has `depth_path` and no `integer_depth_scale`; world units per unit of the depth files are")
+def transforms_with_depth_of_instant_ngp_in_no_unit(root):
+    text = (made.nerfstudio(root) / "transforms.json").read_text()
+    (root / "transforms.json").write_text(text.replace("depth_file_path", "depth_path"))
+    return root
+
+
 @case("transforms.json", "`depth_unit_scale_factor` 0; world units per unit")
 def depth_in_no_unit(root):
     return made.nerfstudio(root, depth_unit_scale_factor=0)

@@ -30,6 +30,17 @@ def test_scannet_has_metric_poses_and_half_a_pixel_is_added_to_its_centres(tmp_p
     assert [p.parent.name for p in scene.valid] == ["valid"] * 3
 
 
+def test_scannets_sample_of_frames_has_its_intrinsics_in_no_folder(tmp_path):
+    export = open_scene(made.scannet(tmp_path))
+    for sensor in ("color", "depth"):
+        (tmp_path / f"intrinsic/intrinsic_{sensor}.txt").rename(tmp_path / f"intrinsics_{sensor}.txt")
+    (tmp_path / "intrinsic").rmdir()
+    assert open_scene(tmp_path) == export
+    (tmp_path / "intrinsics_color.txt").unlink()
+    with pytest.raises(InputError, match=r"intrinsic/intrinsic_color\.txt is missing"):
+        open_scene(tmp_path)
+
+
 def test_nerfstudio_cameras_look_the_other_way(tmp_path):
     scene = open_scene(made.nerfstudio(tmp_path))
     assert scene.kind == "nerfstudio" and scene.metric
@@ -43,6 +54,24 @@ def test_instant_ngps_word_for_a_fisheye_means_the_same_as_nerfstudios(tmp_path)
     told = open_scene(made.nerfstudio(tmp_path / "told", is_fisheye=True, **bent))
     assert told.lenses == named.lenses and told.lenses[0].fisheye
     assert not open_scene(made.nerfstudio(tmp_path / "plain", is_fisheye=False)).lenses[0].fisheye
+
+
+def test_depth_is_read_under_instant_ngps_names_too_in_the_unit_that_belongs_to_them(tmp_path):
+    made.nerfstudio(tmp_path, integer_depth_scale=10 / 65535, depth_unit_scale_factor=0.5)
+    text = (tmp_path / "transforms.json").read_text()
+    nerfstudios = open_scene(tmp_path)
+    assert nerfstudios.depth_scale == 0.5
+    (tmp_path / "transforms.json").write_text(text.replace("depth_file_path", "depth_path"))
+    ngps = open_scene(tmp_path)
+    assert ngps.depths == nerfstudios.depths and ngps.metric and ngps.depth_scale == 10 / 65535
+
+
+def test_text_of_two_bytes_a_letter_as_windows_shell_writes_it_is_read(tmp_path):
+    for layout, text in (("nerfstudio", "transforms.json"), ("tum", "groundtruth.txt"), ("stray", "odometry.csv")):
+        file = getattr(made, layout)(tmp_path / layout) / text
+        before = open_scene(tmp_path / layout)
+        file.write_bytes(file.read_text().replace("\n", "\r\n").encode("utf-16"))
+        assert open_scene(tmp_path / layout) == before
 
 
 def test_nerfstudio_without_depth_is_not_metric_and_may_be_named_by_its_file(tmp_path):
@@ -203,3 +232,30 @@ def test_a_transforms_json_brings_what_lies_beside_it_as_its_folder_does(tmp_pat
     folder, file = open_scene(tmp_path), open_scene(tmp_path / "transforms.json")
     assert file.ready_masks and file.ground_truth and all(file.valid) and not file.zero_is_void
     assert replace(file, opened=tmp_path) == folder
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_colmaps_photos_may_be_listed_with_windows_backslashes(tmp_path, binary):
+    made.colmap(tmp_path, binary=binary)
+    straight = open_scene(tmp_path)
+    for file in tmp_path.glob("sparse/*/images.*"):
+        data = file.read_bytes()
+        for name in made.NAMES:
+            before = b" " if not binary else b"\x07\0\0\0"
+            data = data.replace(before + f"{name}.png".encode(), before + f"near\\{name}.png".encode())
+        file.write_bytes(data)
+    (tmp_path / "images").rename(tmp_path / "near")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "near").rename(tmp_path / "images/near")
+    scene = open_scene(tmp_path)
+    assert scene.names == straight.names and scene.poses == straight.poses and scene.skipped == ()
+    assert scene.photos == tuple(tmp_path / "images/near" / photo.name for photo in straight.photos)
+
+
+def test_one_of_colmaps_models_may_be_named_and_finds_its_photos_above(tmp_path):
+    made.colmap(tmp_path)
+    whole, smaller = open_scene(tmp_path), open_scene(tmp_path / "sparse/0")
+    assert len(whole.names) == 3 and smaller.names == ("2",) and smaller.skipped == ("10", "11")
+    assert smaller.photos[0].samefile(whole.photos[0]) and smaller.poses == whole.poses[:1]
+    shutil.copytree(tmp_path / "images", tmp_path / "sparse/0", dirs_exist_ok=True)
+    assert open_scene(tmp_path / "sparse/0").photos == (tmp_path / "sparse/0/2.png",)

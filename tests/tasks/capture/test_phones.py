@@ -8,9 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
+from ss_flow.cache.store import Store
 from ss_flow.errors import InputError
+from ss_flow.flows import settings
+from ss_flow.flows.cli.context import file_digests
+from ss_flow.flows.cli.prepare import RunOptions, prepare
+from ss_flow.flows.params import Params
 from ss_flow.tasks.capture.ingest import black_border, cameras, frames
-from ss_flow.tasks.capture.layout_stray import steadiest
 from ss_flow.tasks.capture.recordings import recorded_frames
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.capture.sensor_depth import depth
@@ -100,6 +104,19 @@ def test_depth_of_the_lowest_confidence_is_unknown(tmp_path):
     assert measured[0].depth[0, 0] > 2.9 and measured[1].depth[0, 0] == 0
 
 
+def test_corrected_cameras_of_newer_versions_tell_no_size_and_it_is_that_of_their_photos(tmp_path):
+    scene = open_made("polycam", tmp_path, turns=1)
+    for file in tmp_path.glob("keyframes/corrected_cameras/*.json"):
+        values = json.loads(file.read_text())
+        del values["width"], values["height"]
+        file.write_text(json.dumps(values))
+    again = open_scene(tmp_path)
+    assert again.lenses == scene.lenses and scene.lenses[0].width == made.HEIGHT
+    edit(tmp_path, width=made.WIDTH)
+    with pytest.raises(InputError, match="has no number `height`"):
+        open_scene(tmp_path)
+
+
 def test_a_view_of_polycams_that_is_not_whole_is_left_out(tmp_path):
     scene = open_made("polycam", tmp_path)
     scene.depths[1].unlink()
@@ -175,31 +192,33 @@ def test_strays_frames_without_depth_and_rows_beyond_the_video_are_left_out(tmp_
     assert left.skipped == (scene.names[0], "frame-000004")
 
 
-def test_of_each_stretch_of_a_recording_the_frame_is_taken_at_which_the_phone_moved_least(tmp_path):
-    scene = open_made("stray", tmp_path, frames=10)
-    rows = (tmp_path / "odometry.csv").read_text().splitlines()
-    places = [0, 1, 2, 2.1, 2.2, 3, 4, 4.1, 4.2, 5]
-    for i, place in enumerate(places):
-        words = rows[i + 1].split(", ")
-        rows[i + 1] = ", ".join([*words[:2], str(place), *words[3:]])
-    (tmp_path / "odometry.csv").write_text("\n".join(rows))
-    moved = open_scene(tmp_path)
-    chosen = steadiest(moved, 5, 120)
-    assert chosen.entries == (3, 7) and chosen.names == ("frame-000003", "frame-000007") == chosen.all_names
-    assert [file.stem for file in chosen.depths] == ["000003", "000007"]
-    assert len(steadiest(scene, 0, 3).names) == 3  # four frames each, and what is left
-    assert steadiest(scene, 1, 120).names == scene.names
-    assert len(steadiest(scene, 0, 120, every=5).names) == 2 and len(steadiest(scene, 0, 5, every=2).names) == 3
+@pytest.mark.parametrize("layout", ["polycam", "stray"])
+def test_depth_that_is_not_read_is_not_passed_over(layout, tmp_path):
+    scene = open_made(layout, tmp_path)
+    for file in scene.depths:
+        file.rename(file.with_suffix(".npy"))
+    with pytest.raises(InputError, match=r"depth holds no depth map that is read, but \d+\.npy, for one; PNG of 16"):
+        open_scene(tmp_path)
+    for file in scene.depths:
+        file.with_suffix(".npy").unlink()
+    (scene.depths[0].parent / ".DS_Store").write_bytes(b"")
+    assert open_scene(tmp_path).depths is None
 
 
-def test_a_turn_on_the_spot_counts_as_motion_too(tmp_path):
-    scene = open_made("stray", tmp_path, frames=6)
-    poses = []
-    for degrees in (0, 10, 20, 20.5, 21, 31):
-        turn = np.eye(4)
-        turn[:3, :3] = cv2.Rodrigues(np.array([0, np.radians(degrees), 0]))[0]
-        poses.append(tuple(turn.ravel().tolist()))
-    assert steadiest(replace(scene, poses=tuple(poses)), 6, 120).entries == (3,)
+def test_a_long_recording_gives_frames_as_a_video_does(tmp_path):
+    scene = open_made("stray", tmp_path, frames=30)
+    digests = file_digests(Store(tmp_path / "store"))
+
+    def used(*texts):
+        params = settings.apply(Params(), [f"capture.{text}" for text in texts])
+        return prepare(scene, params, RunOptions(), digests).scene
+
+    assert used().names == scene.names == used("max_views=5").names
+    few = used("video.max_frames=5")
+    assert len(few.names) == 5 and "--set capture.video.max_frames=30 uses all" in few.remarks[0]
+    assert [file.stem for file in few.depths] == [f"{entry:06d}" for entry in few.entries]
+    assert len(used("video.max_frames=8", "stride=2").names) == 4
+    assert used("video.stride=3").entries == tuple(range(0, 30, 3)) == used("stride=3").entries
 
 
 @pytest.mark.parametrize(

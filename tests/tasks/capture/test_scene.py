@@ -8,6 +8,7 @@ import capture_folders as made
 import numpy as np
 import pytest
 
+from ss_flow.errors import InputError
 from ss_flow.tasks.capture import ingest
 from ss_flow.tasks.capture.scene import open_scene
 
@@ -45,7 +46,39 @@ def test_pgm_and_its_kin_are_photos_unless_they_lie_beside_other_formats(tmp_pat
         assert [(view.width, view.height) for view in views] == [(32, 24)] * 3
     made.photos(tmp_path / "rgbd")
     made.write(tmp_path / "rgbd/2.depth.pgm", made.depth_image())
-    assert open_scene(tmp_path / "rgbd").names == ("2", "10", "11")
+    scene = open_scene(tmp_path / "rgbd")
+    assert scene.names == ("2", "10", "11")
+    assert scene.remarks[0].startswith(
+        f"{tmp_path / 'rgbd/2.depth.pgm'} is not used, nor what else of PGM and its kin (1)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("layout", "part"),
+    [("stray", "rgb.mp4"), ("scannet", "color"), ("colmap", "images"), ("polycam", "keyframes/images")],
+)
+def test_where_photos_or_the_video_of_a_posed_capture_are_named_alone_the_run_says_what_it_does_without(
+    layout, part, tmp_path
+):
+    place = getattr(made, layout)(tmp_path / "kitchen") / part
+    (said,) = open_scene(place).remarks
+    assert said.startswith(f"{place} is used without the poses or the depth that lie beside it; give {place.parent} to")
+    assert open_scene(tmp_path / "kitchen").remarks == ()
+
+
+@pytest.mark.parametrize("layout", ["scannet", "tum", "replica", "polycam", "stray"])
+def test_a_capture_in_the_only_folder_of_what_is_named_is_told(layout, tmp_path):
+    getattr(made, layout)(tmp_path / "kitchen")
+    (tmp_path / "__MACOSX").mkdir()
+    with pytest.raises(InputError, match=r"its folder kitchen/ is a capture with poses or depth, so give that\.$"):
+        open_scene(tmp_path)
+
+
+def test_what_record3d_exports_is_told_how_to_be_read(tmp_path):
+    made.photos(tmp_path / "rgb")
+    (tmp_path / "metadata.json").write_text("{}")
+    with pytest.raises(InputError, match=r"Record3D's exports are read once nerfstudio has made a transforms\.json"):
+        open_scene(tmp_path)
 
 
 def test_a_video_is_known_by_its_name_alone(tmp_path):
@@ -87,6 +120,15 @@ def test_folders_of_images_beside_photos_that_are_not_used_are_told(tmp_path, ph
     made.write(tmp_path / "depth/2.png", made.depth_image())
     (said,) = open_scene(tmp_path, masks=masks).remarks
     assert said.startswith(f"{tmp_path} holds images that are not used, in day2/ (3), depth/ (1): ")
+
+
+def test_a_recording_beside_photos_is_told_unless_it_belongs_to_one_of_them(tmp_path):
+    made.photos(tmp_path)
+    (tmp_path / "2.MOV").write_bytes(b"")
+    assert open_scene(tmp_path).remarks == ()
+    (tmp_path / "walk.mp4").write_bytes(b"")
+    said = f"{tmp_path / 'walk.mp4'} is not used, as photos lie beside it; give its own path to use it."
+    assert open_scene(tmp_path).remarks == (said,)
 
 
 def test_opening_is_light_and_quick(tmp_path):
