@@ -64,9 +64,8 @@ class Loading:
             changed |= self._changed[part]
             pending += self._called[part] - seen
             seen |= self._called[part]
-        told = {
-            self._libraries[name] for name in changed & self._libraries.keys()
-        }  # its state is that of all its parts
+        # The state of a library is that of all its parts.
+        told = {self._libraries[name] for name in changed & self._libraries.keys()}
         return changed.union(name for name, library in self._libraries.items() if library in told)
 
     def _changed_by(self, part: ast.AST) -> set[str]:

@@ -17,7 +17,6 @@ _FEWEST = 20
 """Views that are taken in any case, be it without motion."""
 _STRAIGHT = 0.01
 """A way is at least so wide, for its length: along a line nothing tells how far off is what the camera sees."""
-
 _DIGITS = 6
 """Of motion; what differs by the rounding of a processor is equal, and the first view is taken."""
 
