@@ -218,7 +218,11 @@ def _read(name: str) -> Source | None:
     if spec.origin is None or not spec.has_location:
         return None
     path = Path(spec.origin)
-    content = getattr(spec.loader, "get_data", lambda _: path.read_bytes())(spec.origin)  # it may be in a ZIP archive
+    try:
+        content = path.read_bytes()
+    except NotADirectoryError:  # it is in a ZIP archive
+        loader: Any = spec.loader
+        content = loader.get_data(spec.origin)
     text = importlib.util.decode_source(content) if path.suffix == ".py" else blake3(content).hexdigest()
     return Source(path, folders is not None, text)
 
