@@ -45,15 +45,23 @@ class Loading:
         self._called: dict[ast.AST, set[ast.AST]] = {}
         """The functions that are called in a piece of code."""
         parts = [*itertools.chain(*self._parts.values())]
-        for part in parts:
-            self._note_aliases(part)
-        while parts:
-            if (part := parts.pop(0)) not in self._called:
-                if isinstance(part, FUNCTIONS):
-                    self._note_aliases(part)
-                self._called[part] = set(self._calls_in(part))
-                parts += self._called[part]
+        known = -1
+        # A call may give a name that makes another call one of a function here: until there is none left, so that what
+        # is found does not depend on the order in which sets are gone through.
+        while known < (known := sum(map(len, self._aliases.values()))):
+            self._called = self._calls_from(parts)
         self._changed = {part: self._changed_by(part) for part in self._called}
+
+    def _calls_from(self, parts: Iterable[ast.AST]) -> dict[ast.AST, set[ast.AST]]:
+        """The functions that are called in pieces of code, and in these functions, by what names stand for so far."""
+        pending, called = [*parts], dict[ast.AST, set[ast.AST]]()
+        while pending:
+            if (part := pending.pop()) not in called:
+                if part not in self._called:
+                    self._note_aliases(part)
+                called[part] = set(self._calls_in(part))
+                pending += called[part]
+        return called
 
     def changed(self, statement: ast.stmt) -> set[str]:
         """The names whose objects a statement changes, and those that functions which it calls declare global."""

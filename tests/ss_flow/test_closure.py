@@ -173,6 +173,14 @@ def test_the_statements_that_fill_a_table_belong_to_it(package, filling):
     assert found["probe.step.TABLE"] != edited["probe.step.TABLE"]
 
 
+def test_a_call_whose_function_another_one_chose_belongs_to_the_table_that_it_fills(package):
+    step = "TWO = 2\nTABLE = {}\n\ndef put():\n    TABLE[0] = TWO\n\nchosen = None\n\n"
+    step += "def use():\n    return chosen and chosen()\n\ndef choose():\n    global chosen\n    chosen = put\n\n"
+    step += "first = use()\nchoose()\nsecond = use()\n\ndef run(x):\n    return TABLE\n"
+    found = package(step=step)
+    assert {"probe.step.TWO", "probe.step.put"} <= found.keys()
+
+
 def test_a_function_of_a_script_is_refused_since_its_code_cannot_be_followed():
     exec("def run(x):\n    return x\n", namespace := {"__name__": "__main__"})
     with pytest.raises(TypeError, match=r"code of __main__\.run cannot be followed"):
