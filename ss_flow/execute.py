@@ -68,8 +68,7 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
     warned: list[str] = []
     cores = max(1, invocation.resources.cores)
     surroundings = Surroundings(listener, cores, checkpoint, warned, invocation.alone)
-    # Whether a file was another one only in between, its stamp tells, and no later look at its content; its last part
-    # does not, which the link of a backup changes, too.
+    # Whether a file was another one only in between, its stamp tells, and no later look at its content.
     stamps = {ref: ref.stamp_now() for ref in files_in(invocation.parameters)}
     _refuse([ref for ref in stamps if ref.has_changed()], invocation.label)
     started = time.monotonic()
@@ -77,9 +76,7 @@ def execute(invocation: Invocation, store: Store, listener: Listener) -> Action:
         result = task.run(arguments, {name: own_copy(name, value) for name, value in invocation.parameters.items()})
     seconds = time.monotonic() - started
     check()  # a module that the task itself loaded may have been edited since its key was made
-    _refuse(
-        [r for r, before in stamps.items() if r.stamp_now()[:-1] != before[:-1] or r.has_changed()], invocation.label
-    )
+    _refuse([ref for ref, before in stamps.items() if ref.was_written(before)], invocation.label)
     if task.returns_list and not isinstance(result, tuple | list):  # of a generator, nothing has run yet
         raise TypeError(f"the task {task.name} declares a list and returned a {type(result).__name__}; return a tuple")
     items = result if task.returns_list else (result,)

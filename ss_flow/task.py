@@ -72,6 +72,11 @@ class FileRef:
         except OSError:
             return ()
 
+    def was_written(self, before: tuple[int, ...]) -> bool:
+        """Whether the file was another one at any time since its stamp was this. Of the time of the inode's change,
+        which the link of a backup changes, too, the content decides."""
+        return self.stamp_now()[:-1] != before[:-1] or self.has_changed()
+
     def has_changed(self) -> bool:
         """Whether the file holds anything else than when this was made; it is read only where its stamp differs."""
         now = self.stamp_now()

@@ -65,8 +65,7 @@ def open_colmap(root: Path) -> SceneFiles:
     """The largest model of a COLMAP workspace, by registered images.
 
     Photos lie in `images/`, or beside the model; of a model in `sparse/` that is named itself, in the workspace above.
-    Those that the model lacks are skipped. World units are arbitrary
-    (`metric` is False).
+    Those that the model lacks are skipped. World units are arbitrary (`metric` is False).
     Raises InputError when a file is damaged, a photo missing, or a lens unknown.
     """
     models = [(folder, *_read_model(folder)) for folder in _models(root)]

@@ -33,6 +33,11 @@ def plane_through(points: Float64) -> Plane:
     return centre, np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
 
 
+def axes_in(normal: Float64) -> Float64:
+    """[2, 3] two directions of length 1 in the planes with this normal [3], across each other."""
+    return np.linalg.svd(normal[None])[2][1:]
+
+
 def on_plane(points: Float64, plane: Plane, thickness: float) -> Bool:
     """[N] which points [N, 3] lie on a plane, at most so far from it."""
     centre, normal = plane

@@ -14,7 +14,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import Plane, box_diagonal, middle_of, refitted, thinned, towards
+from ss_flow.tasks.geometry.shape import Plane, axes_in, box_diagonal, middle_of, refitted, thinned, towards
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.touching import TouchingParams
@@ -129,7 +129,7 @@ class _Relief:
         self.low: Bool = height <= thickness
         self.rise = float(np.median(height[~self.low])) - thickness
         self._over = height - thickness
-        self._flat = (places - centre) @ np.linalg.svd(normal[None])[2][1:].T
+        self._flat = (places - centre) @ axes_in(normal).T
 
     def around(self, foot: float) -> float:
         """Share of the directions in which low points lie beyond the outline of a foot, as `_outline` takes it."""

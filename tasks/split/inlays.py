@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float64, Int32
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import Plane, middle_of, on_plane, plane_of_most, thinned, towards
+from ss_flow.tasks.geometry.shape import Plane, axes_in, middle_of, on_plane, plane_of_most, thinned, towards
 from ss_flow.tasks.split.looks import Looks
 
 _FEW = 100
@@ -98,7 +98,7 @@ def _beside(points: Float64, plane: Plane, cell: float) -> Float64:
     from scipy.ndimage import binary_dilation
 
     centre, normal = plane
-    axes = np.linalg.svd(normal[None])[2][1:]
+    axes = axes_in(normal)
     flat = (points - centre) @ axes.T
     near, far = _BESIDE
     cell = max(cell, float(np.ptp(flat, axis=0).max()) / _SQUARES)

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from ss_flow.tasks.artifacts import Cameras, Float64, PointCloud, PointLabels
 from ss_flow.tasks.geometry.cameras import up_of
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import Plane, box_diagonal, middle_of, on_plane, plane_of_most, thinned, towards
+from ss_flow.tasks.geometry.shape import (
+    Plane,
+    axes_in,
+    box_diagonal,
+    middle_of,
+    on_plane,
+    plane_of_most,
+    thinned,
+    towards,
+)
 
 _FEW = 20
 """Points below which nothing has a shape."""
@@ -95,7 +104,7 @@ class Supports:
         low, high = np.quantile(height, (0.1, 0.9))
         if high < max(self.height * extent, _RISES * self.points.spacing) or low < -self._thickness:
             return False
-        along = np.linalg.svd(normal[None])[2][1:]  # two directions in the plane
+        along = axes_in(normal)
         lies, ground = (own - centre) @ along.T, (self._places(level) - centre) @ along.T
         if _spread(lies) >= _SMALL * _spread(ground):
             return False

@@ -21,6 +21,8 @@ _LOST = 0.6, 0.015
 _DEVIATION, _DISPARITY = 1.425e-3, 2.85e-3
 """Of a structured-light camera, times the squared depth in metres: the standard deviation, and how far two depths lie
 apart that it tells from each other (Khoshelham and Elberink, Sensors 12(2), 2012)."""
+_NEAR = 0.0025
+"""Standard deviation near by, as a share of the depth."""
 _RANGE = 0.5, 5.0
 """Depths that it measures, metres."""
 
@@ -40,6 +42,11 @@ def with_holes(measured: Float64, depth: Float32, rng: np.random.Generator) -> F
     edge = maximum_filter(depth, 3) - minimum_filter(depth, 3) > _STEP * depth
     lost = edge & (rng.random(depth.shape) < _LOST[0])
     return np.where(lost | (rng.random(depth.shape) < _LOST[1]), 0, measured)
+
+
+def seen_near(depth: Float32, rng: np.random.Generator) -> Float32:
+    """What a depth camera measures of a map [H, W] of near things; 0 where nothing."""
+    return with_holes(noisy(depth, _NEAR, rng), depth, rng).astype(np.float32)
 
 
 def structured_light(depth: Float32, rng: np.random.Generator) -> Float32:

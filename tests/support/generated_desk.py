@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from depth_sensor import noisy, with_holes
+from depth_sensor import seen_near
 from household import sized
 
 from ss_flow.flows.generated.composite_room import TABLE, in_a_row, structure, table
@@ -26,8 +26,6 @@ from ss_flow.tasks.geometry.cameras import camera_of
 _PAGE = 0.21, 0.297
 _FOCAL_RATIO = 526 / 585
 """Focal length of the depth over that of the photos, as of a sensor's two lenses taken for one."""
-_NOISE = 0.0025
-"""Standard deviation of the depth, as a share of it."""
 _LATTICE = 9
 """Every so many rows and columns are without depth, as a warped depth map leaves them."""
 
@@ -106,7 +104,7 @@ def _poses(views: int, rng: np.random.Generator) -> Float64:
 
 def _as_measured(depth: Float32, rng: np.random.Generator) -> Float32:
     """What a sensor measures of a depth map [H, W]; 0 where nothing."""
-    measured = with_holes(noisy(depth, _NOISE, rng), depth, rng)
+    measured = seen_near(depth, rng)
     measured[4::_LATTICE] = 0
     measured[:, 4::_LATTICE] = 0
-    return measured.astype(np.float32)
+    return measured

@@ -18,6 +18,7 @@ from household import (
     knife_block,
     microwave,
     plant,
+    room_of,
     round_table,
     sized,
     toaster,
@@ -27,8 +28,7 @@ from household import (
 from ss_flow.flows.generated.composites import Composite, Piece, book, cup, paint
 from ss_flow.flows.generated.layout import CEILING, COLORS, HALF_WIDTH
 from ss_flow.flows.generated.prints import rectangle, sheet
-from ss_flow.flows.generated.render import Renderer
-from ss_flow.flows.generated.room import Room, RoomParams, furnished_room, looking_at, photographed
+from ss_flow.flows.generated.room import Room, looking_at
 from ss_flow.flows.generated.shapes import box, joined
 from ss_flow.tasks.artifacts import Float64
 
@@ -49,12 +49,7 @@ def generate_kitchen(seed: int, views: int = _VIEWS, width: int = 480, height: i
     """
     rng = np.random.default_rng(5000 + seed)
     things, table = _furnish(rng)
-    pieces = tuple(piece for number, thing in enumerate(things) for piece in thing.things(number))
-    renderer = Renderer(pieces, seed)
-    params = RoomParams(composite=True, views=views, width=width, height=height, seed=seed, held_out=0)
-    seen = photographed(renderer, _poses(views, table, rng), params, rng)
-    nothing = photographed(renderer, np.zeros((0, 4, 4)), params, rng)
-    return sensed(furnished_room(seen, nothing, pieces), seed)
+    return sensed(room_of(things, _poses(views, table, rng), seed, (width, height), rng), seed)
 
 
 def _furnish(rng: np.random.Generator) -> tuple[list[Composite], tuple[float, float]]:

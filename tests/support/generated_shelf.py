@@ -6,24 +6,21 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from depth_sensor import noisy, with_holes
-from household import bag, bottle, carton, duck, pencils, sized
+from depth_sensor import seen_near
+from household import bag, bottle, carton, duck, pencils, room_of, sized
 
 from ss_flow.flows.generated.composites import Composite, Piece, book, brick, paint, printed_box, stood_up
 from ss_flow.flows.generated.layout import CEILING, COLORS
 from ss_flow.flows.generated.prints import rectangle, sheet
-from ss_flow.flows.generated.render import Renderer
-from ss_flow.flows.generated.room import Room, RoomParams, furnished_room, looking_at, photographed
+from ss_flow.flows.generated.room import Room, looking_at
 from ss_flow.flows.generated.shapes import box, joined
-from ss_flow.tasks.artifacts import Float32, Float64
+from ss_flow.tasks.artifacts import Float64
 
 _VIEWS = 15
 _WIDTH, _DEPTH, _HEIGHT, _BOARD = 0.62, 0.4, 0.3, 0.018
 """Inner width and depth, height of a compartment and thickness of a board, metres."""
 _MIDDLE = 0.9
 """Height of the middle board."""
-_NOISE = 0.0025
-"""Standard deviation of the depth, as a share of it."""
 
 
 def generate_shelf(seed: int, views: int = _VIEWS, width: int = 640, height: int = 480) -> Room:
@@ -33,13 +30,9 @@ def generate_shelf(seed: int, views: int = _VIEWS, width: int = 640, height: int
     the shelf and the room. None is held out. Depth is 0 where it is unknown.
     """
     rng = np.random.default_rng(7000 + seed)
-    pieces = tuple(piece for number, thing in enumerate(_furnish(rng)) for piece in thing.things(number))
-    renderer = Renderer(pieces, seed)
-    params = RoomParams(composite=True, views=views, width=width, height=height, seed=seed, held_out=0)
-    seen = photographed(renderer, _poses(views, rng), params, rng)
-    depth = np.stack([_as_measured(of_view, rng) for of_view in seen.depth])
-    nothing = photographed(renderer, np.zeros((0, 4, 4)), params, rng)
-    return replace(furnished_room(seen, nothing, pieces), depth=depth)
+    things = _furnish(rng)
+    room = room_of(things, _poses(views, rng), seed, (width, height), rng)
+    return replace(room, depth=np.stack([seen_near(of_view, rng) for of_view in room.depth]))
 
 
 def _furnish(rng: np.random.Generator) -> list[Composite]:
@@ -120,8 +113,3 @@ def _poses(views: int, rng: np.random.Generator) -> Float64:
         eye = np.array([x, y, _MIDDLE + 0.2 + 0.5 * v + rng.uniform(-0.03, 0.03)])
         poses.append(looking_at(eye, np.array([0.15 * u, 0.15, _MIDDLE + 0.14 + 0.25 * v])))
     return np.stack(poses)
-
-
-def _as_measured(depth: Float32, rng: np.random.Generator) -> Float32:
-    """What a sensor measures of a depth map [H, W]; 0 where nothing."""
-    return with_holes(noisy(depth, _NOISE, rng), depth, rng).astype(np.float32)

@@ -1,5 +1,7 @@
-"""Things of a kitchen and of a shop's shelf, each one instance of several parts; metres, standing on z = 0, front to
--y."""
+"""Things of a kitchen and of a shop's shelf, each one instance of several parts, and the photos of a room of them.
+
+Lengths are metres. Every thing stands on z = 0 with its front towards -y.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,24 @@ import numpy as np
 
 from ss_flow.flows.generated.composites import Composite, Piece, paint, stretched, tube
 from ss_flow.flows.generated.prints import LIFT, ellipse, lines_of_text, on_face, rectangle, sheet
+from ss_flow.flows.generated.render import Renderer
+from ss_flow.flows.generated.room import Room, RoomParams, furnished_room, photographed
 from ss_flow.flows.generated.shapes import Mesh, ball, bowl, box, can, joined, turned_profile
+from ss_flow.tasks.artifacts import Float64
+
+
+def room_of(
+    things: Sequence[Composite], poses: Float64, seed: int, size: tuple[int, int], rng: np.random.Generator
+) -> Room:
+    """The photos of things, of which the first is the room itself (id 0), with exact depth; none is held out.
+
+    poses: [K, 4, 4] world to camera. size: width and height of the photos.
+    """
+    pieces = tuple(piece for number, thing in enumerate(things) for piece in thing.things(number))
+    renderer, (width, height) = Renderer(pieces, seed), size
+    params = RoomParams(composite=True, views=len(poses), width=width, height=height, seed=seed, held_out=0)
+    seen = photographed(renderer, poses, params, rng)
+    return furnished_room(seen, photographed(renderer, np.zeros((0, 4, 4)), params, rng), pieces)
 
 
 def sized(thing: Composite, factor: float) -> Composite:
