@@ -132,8 +132,9 @@ def test_what_a_device_has_no_memory_for_is_trained_on_the_cpu_in_the_last_try(m
 def test_what_a_device_has_no_memory_for_is_drawn_on_the_cpu(monkeypatch):
     made = initialise(np.array([[0, 0, 2.0]]), np.full((1, 3), 200, np.uint8), 1, 1.0)
     camera = Camera(32, 24, 30, 30, 16, 12, np.eye(4))
-    expected = render(made, camera)
     drawing = sys.modules[render.__module__]
+    monkeypatch.setattr(drawing, "_device", lambda gaussians: "cpu")
+    expected = render(made, camera)
     monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))
     by_torch = sys.modules["ss_flow.tasks.gaussians.torch_render"]
     monkeypatch.setattr(by_torch, "_drawn", no_memory)
