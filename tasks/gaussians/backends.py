@@ -6,7 +6,9 @@ torch share by name (`Backend.xp`); what they do not share, it asks of the backe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import functools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import ModuleType
@@ -16,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Float32
-from ss_flow.tasks.gaussians.library import Workspace, address, library
+from ss_flow.tasks.gaussians.library import Learnt, Workspace, address, library
 from ss_flow.tasks.gaussians.losses import gradients_of
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.objective import Target, Targets, Weights
@@ -88,10 +90,11 @@ class Backend(Protocol):
 
     def towards_parts(
         self, values: Values, parts: Sequence[tuple[slice, Any]], weight: float
-    ) -> Iterator[tuple[slice, Values]]:
+    ) -> Iterable[tuple[slice, Values]]:
         """For the rows of each part, the gradients of `weight` times the error of the alpha of these rows alone.
 
-        parts: rows, and a target whose alpha alone counts.
+        parts: rows, and a target whose alpha alone counts. They may be found while a `descent` is that is called before
+        they are looked at; until then, values must stay.
         """
 
     def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
@@ -110,6 +113,7 @@ class NativeBackend:
         self._threads = threads
         self._workspace = Workspace()
         self._gradients: dict[str, Float32] | None = None
+        self._beside = ThreadPoolExecutor(1, "parts")  # its thread starts when there is something to do
 
     def stream(self) -> AbstractContextManager[None]:
         return nullcontext()
@@ -141,30 +145,44 @@ class NativeBackend:
 
     def towards_parts(
         self, values: Values, parts: Sequence[tuple[slice, Target]], weight: float
-    ) -> Iterator[tuple[slice, Values]]:
+    ) -> Iterable[tuple[slice, Values]]:
+        if self._threads == 1 or not parts:
+            return self._towards_parts(values, parts, weight)
+        # A view of one thing is too small to be shared by threads, and so drawn beside that of the whole scene.
+        return _once_there(self._beside.submit(self._towards_parts, values, parts, weight))
+
+    def _towards_parts(
+        self, values: Values, parts: Sequence[tuple[slice, Target]], weight: float
+    ) -> list[tuple[slice, Values]]:
         settings = Settings((0.0, 0.0, 0.0), 0, 0, winners=False)
         weights = Weights(ssim=0.0, alpha=1.0, depth=0.0, mask=0.0)
+        towards = []
         for rows, target in parts:
             own = {name: value[rows] for name, value in values.items()}
-            found = self.descent(own, None, target, settings, weights)
+            found = self._alone.descent(own, None, target, settings, weights)
             # The product is a copy, too: the next descent writes where this one did.
-            yield rows, {name: weight * found.gradients[name] for name in own}
+            towards.append((rows, {name: weight * found.gradients[name] for name in own}))
+        return towards
+
+    @functools.cached_property
+    def _alone(self) -> NativeBackend:
+        """For the views of parts."""
+        return NativeBackend(1)
 
     def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
-        before = values["means"].copy()
+        paces = np.ascontiguousarray(step.rates["means"], np.float32)
+        learnt = []
         for name, value in values.items():
             width, head = value[:1].size, 0
-            active, rate = width, 1.0 if name == "means" else step.rates[name]
+            active, rate = width, 0.0 if name == "means" else step.rates[name]
             if name == "sh":
                 active, head = 3 * (step.sh_degree + 1) ** 2, 3
-            library().ss_adam(
-                len(value), width, active, head, address(value), address(gradients[name]), address(first[name]),
-                address(second[name]), rate, step.rates["sh_rest"] if name == "sh" else rate, step.number, EPSILON,
-                self._threads,
-            )  # fmt: skip
-        # A step of Adam is as long as its rate: those of the means, taken with rate 1, are cut to size here.
-        means = values["means"]
-        means[:] = before + step.rates["means"][:, None] * (means - before)
+            arrays = (value, gradients[name], first[name], second[name], paces if name == "means" else None)
+            of_rest = step.rates["sh_rest"] if name == "sh" else rate
+            learnt.append(Learnt(*(address(a) for a in arrays), width, active, head, rate, of_rest))
+        rows = len(values["means"])
+        if library().ss_adam(rows, len(learnt), (Learnt * len(learnt))(*learnt), step.number, EPSILON, self._threads):
+            raise MemoryError("not enough memory for a step of Adam")
 
     def strongest(self, values: Values, target: Target) -> Float32:
         settings = Settings((0.0, 0.0, 0.0), 0, 0, winners=True)
@@ -173,6 +191,10 @@ class NativeBackend:
         )
         assert rendered.strongest is not None
         return rendered.strongest
+
+
+def _once_there(found: Future[list[tuple[slice, Values]]]) -> Iterator[tuple[slice, Values]]:
+    yield from found.result()
 
 
 def _arrays(values: Values) -> tuple[Float32, Float32, Float32, Float32, Float32]:

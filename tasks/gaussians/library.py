@@ -67,6 +67,16 @@ class Gradients(ctypes.Structure):
     )
 
 
+class Learnt(ctypes.Structure):
+    """`Learnt` of native/scene.h."""
+
+    _fields_ = (
+        *((name, _POINTER) for name in ("value", "gradient", "first", "second", "paces")),
+        *((name, _INT64) for name in ("width", "active", "head")),
+        *((name, _DOUBLE) for name in ("head_rate", "rate")),
+    )
+
+
 class StereoPhoto(ctypes.Structure):
     """`StereoPhoto` of native/patchmatch.cpp."""
 
@@ -101,8 +111,8 @@ class VotingView(ctypes.Structure):
     )
 
 
-_SCENE, _IMAGES, _GRADIENTS, _PROBLEM, _VIEW = (
-    ctypes.POINTER(structure) for structure in (Scene, Images, Gradients, StereoProblem, VotingView)
+_SCENE, _IMAGES, _GRADIENTS, _LEARNT, _PROBLEM, _VIEW = (
+    ctypes.POINTER(structure) for structure in (Scene, Images, Gradients, Learnt, StereoProblem, VotingView)
 )
 _INTERFACE: dict[str, tuple[Any, list[Any]]] = {
     "ss_workspace": (_POINTER, []),
@@ -113,8 +123,8 @@ _INTERFACE: dict[str, tuple[Any, list[Any]]] = {
     "ss_shares": (_INT, [_POINTER, _SCENE, _POINTER, ctypes.POINTER(_INT64), _INT]),
     "ss_take_shares": (None, [*[_POINTER] * 4]),
     "ss_photometric": (_INT, [_POINTER, *[_INT] * 3, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER, _INT]),
-    "ss_surface_loss": (None, [_INT64, *[_POINTER] * 9, _FLOAT, _FLOAT, _INT, *[_POINTER] * 3]),
-    "ss_adam": (None, [*[_INT64] * 4, *[_POINTER] * 4, _DOUBLE, _DOUBLE, _INT64, _DOUBLE, _INT]),
+    "ss_surface_loss": (_INT, [_INT64, *[_POINTER] * 9, _FLOAT, _FLOAT, _INT, *[_POINTER] * 3, _INT]),
+    "ss_adam": (_INT, [_INT64, _INT, _LEARNT, _INT64, _DOUBLE, _INT]),
     "ss_patchmatch": (_INT, [_PROBLEM]),
     "ss_vote": (None, [_VIEW, _INT64, *[_POINTER] * 4]),
 }

@@ -63,7 +63,9 @@ class Surface(NamedTuple):
     """[H, W]."""
 
 
-def surface(alpha: Float32, depth: Float32, mismatch: Float32 | None, target: Target, weights: Weights) -> Surface:
+def surface(
+    alpha: Float32, depth: Float32, mismatch: Float32 | None, target: Target, weights: Weights, threads: int = 1
+) -> Surface:
     """Three absolute errors, sums over pixels with weights that the target gives; C-contiguous [H, W] arrays.
 
     Alpha: judged * |alpha - inside|. Depth: known * |depth / target depth - alpha|, a relative error, so that the scale
@@ -78,10 +80,12 @@ def surface(alpha: Float32, depth: Float32, mismatch: Float32 | None, target: Ta
     images = (alpha, depth, mismatch, *asked)
     if any(a is not None and a.shape != alpha.shape for a in images):
         raise ValueError(f"the images must all be {list(alpha.shape)}")
-    library().ss_surface_loss(
+    failed = library().ss_surface_loss(
         alpha.size, *(address(a) for a in images), weights.alpha, weights.depth, weights.inverse_depth,
-        address(towards_alpha), address(towards_depth), out.ctypes.data,
+        address(towards_alpha), address(towards_depth), out.ctypes.data, threads,
     )  # fmt: skip
+    if failed:
+        raise MemoryError("not enough memory for the losses of alpha, depth and labels")
     return Surface(float(out[0]), float(out[1]), float(out[2]), towards_alpha, towards_depth)
 
 
@@ -96,7 +100,7 @@ def gradients_of(
     color = photometric(
         rendered.rgb, target.image, target.counted, weights.ssim, workspace=workspace, threads=threads
     )  # fmt: skip
-    rest = surface(rendered.alpha, rendered.depth, rendered.mismatch, target, weights)
+    rest = surface(rendered.alpha, rendered.depth, rendered.mismatch, target, weights, threads)
     total = color.loss + weights.alpha * rest.alpha + weights.depth * rest.depth + weights.mask * rest.labels
     towards_mismatch = None if target.labelled is None else target.labelled * np.float32(weights.mask)
     return total, (color.gradient, rest.towards_alpha, rest.towards_depth, towards_mismatch)

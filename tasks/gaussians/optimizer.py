@@ -67,10 +67,10 @@ class Parameters:
         self._first["opacity_logits"][:] = 0
         self._second["opacity_logits"][:] = 0
 
-    def limit_scale(self, longest: Array) -> None:
-        """No standard deviation above these: [N] world units."""
-        xp, log_scales = self.backend.xp, self.values["log_scales"]
-        xp.minimum(log_scales, xp.log(longest)[:, None], out=log_scales)
+    def limit_scale(self, log_longest: Array) -> None:
+        """No standard deviation above these: [N] their logarithms, of world units."""
+        log_scales = self.values["log_scales"]
+        self.backend.xp.minimum(log_scales, log_longest[:, None], out=log_scales)
 
     def finite(self) -> bool:
         return all(bool(self.backend.xp.isfinite(a).all()) for a in self.values.values())

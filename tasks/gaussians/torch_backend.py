@@ -208,9 +208,9 @@ class TorchBackend:
 
     def towards_parts(
         self, values: Values, parts: Sequence[tuple[slice, _Target]], weight: float
-    ) -> Iterator[tuple[slice, Values]]:
+    ) -> list[tuple[slice, Values]]:
         if not parts:
-            return
+            return []
         leaves = [{name: value[rows].detach().requires_grad_() for name, value in values.items()} for rows, _ in parts]
         groups = [(GaussianTensors(**own), target.camera) for own, (_, target) in zip(leaves, parts, strict=True)]
         drawn = self._renderer.alphas(groups)
@@ -221,8 +221,7 @@ class TorchBackend:
             ]
         shaped = [name for name in values if name != "sh"]  # no colour is seen
         found = iter(torch.autograd.grad(drawn, [own[name] for own in leaves for name in shaped], towards))
-        for rows, _ in parts:
-            yield rows, {name: next(found) for name in shaped}
+        return [(rows, {name: next(found) for name in shaped}) for rows, _ in parts]
 
     def adam(self, values: Values, gradients: Values, first: Values, second: Values, step: AdamStep) -> None:
         # A step of Adam is as long as its rate, and rates differ by parameter and by row: what one call, all rates 1,

@@ -191,7 +191,7 @@ class _Training:
         self._channels = backend.put(channels_of(initial.instance_id, label_ids)) if num_labels else None
         # A few sparse points of a small thing must be let fill the space between them.
         longest = np.maximum(np.float32(params.max_scale) * extents, np.exp(initial.log_scales.max(axis=1)))
-        self._longest = backend.put(longest)
+        self._log_longest = backend.put(np.log(longest))
         self._control = _control(params, GradientRecord(len(initial), backend), float(extents.max()))
         self.step = 0
         # Of each view, those whose colour counts.
@@ -231,7 +231,7 @@ class _Training:
         settings = Settings(behind, self._num_labels, degree, winners=False)
         weights = params.objective.at(done_share, params.mask_weight)
         labels = None if self._channels is None else self._channels[parameters.origin]
-        towards_parts = list(self._backend.towards_parts(parameters.values, self._seen_alone(), params.part_weight))
+        towards_parts = self._backend.towards_parts(parameters.values, self._seen_alone(), params.part_weight)
         found = self._backend.descent(parameters.values, labels, self._there[view], settings, weights)
         for rows, towards in towards_parts:
             for name, gradient in towards.items():
@@ -240,7 +240,7 @@ class _Training:
         rates = params.rates.at(done_share).by_parameter(self._extents[parameters.origin])
         parameters.step(found.gradients, AdamStep(self.step, rates, degree))
         if params.max_scale:
-            parameters.limit_scale(self._longest[parameters.origin])
+            parameters.limit_scale(self._log_longest[parameters.origin])
         if self._control is not None:
             seen = Seen(found.gradients["centers"], found.radii, self._pixels[view])
             self._control.after(self.step, parameters, seen, self._generator)

@@ -71,6 +71,8 @@ struct Frame {
     int64_t chunks;
     Buffer<Splat> candidates;      // chunk c writes from c * kChunk
     Buffer<int32_t> chunk_count;
+    Buffer<int64_t> chunk_places;  // of the chunk's candidates in all bands; then where they begin in `places`
+    Buffer<int64_t> chunk_bands;   // [chunks, num_bands] how many of them reach a band; then where they begin there
     Buffer<Range> rows;            // of blocks, of each candidate
     Buffer<int64_t> place_first;   // of each candidate: places[place_first + band] is its splat there
     Buffer<int32_t> places;
@@ -92,6 +94,9 @@ inline V16 as_floats(const int32_t (&lane)[16]) {
 // Projects the rows of a chunk; what can be seen becomes candidates.
 inline void project_chunk(const Scene& s, const projection::View& view, int64_t chunk, float* radii, Frame& frame) {
     Splat* to = frame.candidates.data() + chunk * kChunk;
+    int64_t* in_band = frame.chunk_bands.data() + chunk * frame.num_bands;
+    std::fill_n(in_band, frame.num_bands, 0);
+    int64_t places = 0;
     const int64_t end = std::min(s.count, (chunk + 1) * kChunk);
     for (int64_t begin = chunk * kChunk; begin < end; begin += 16) {
         Rows rows;
@@ -128,42 +133,48 @@ inline void project_chunk(const Scene& s, const projection::View& view, int64_t 
         for (int k = 0; k < rows.count; ++k) {
             if (!(is_seen[k] > 0)) continue;
             lanes::store(reinterpret_cast<float*>(to), fields[k]);
-            frame.rows[to - frame.candidates.data()] = block_rows(frame, *to);
+            const Range reached = frame.rows[to - frame.candidates.data()] = block_rows(frame, *to);
+            const int first = reached.first / kBandRows, last = reached.last / kBandRows;
+            for (int b = first; b <= last; ++b) ++in_band[b];
+            places += last - first + 1;
             ++to;
         }
     }
     frame.chunk_count[chunk] = (int32_t)(to - (frame.candidates.data() + chunk * kChunk));
+    frame.chunk_places[chunk] = places;
 }
 
-template <class F>
-void each_candidate(const Frame& frame, F visit) {
-    for (int64_t chunk = 0; chunk < frame.chunks; ++chunk)
-        for (int64_t k = chunk * kChunk; k < chunk * kChunk + frame.chunk_count[chunk]; ++k) visit(k);
-}
-
-// Tells each band which candidates reach it.
-inline void distribute(Frame& frame) {
+// Makes room in each band for the candidates that reach it.
+inline void allot(Frame& frame) {
     int64_t places = 0;
-    for (int b = 0; b < frame.num_bands; ++b) frame.bands[b].count = 0;
-    each_candidate(frame, [&](int64_t k) {
+    for (int64_t c = 0; c < frame.chunks; ++c) {
+        const int64_t count = frame.chunk_places[c];
+        frame.chunk_places[c] = places, places += count;
+    }
+    frame.places.room(places);
+    for (int b = 0; b < frame.num_bands; ++b) {
+        Band& band = frame.bands[b];
+        band.count = 0;
+        for (int64_t c = 0; c < frame.chunks; ++c) {
+            int64_t& of_chunk = frame.chunk_bands[c * frame.num_bands + b];
+            const int64_t count = of_chunk;
+            of_chunk = band.count, band.count += count;
+        }
+        band.order.room(band.count);
+    }
+}
+
+// Tells each band which candidates of a chunk reach it.
+inline void distribute(int64_t chunk, Frame& frame) {
+    int64_t places = frame.chunk_places[chunk], *in_band = frame.chunk_bands.data() + chunk * frame.num_bands;
+    for (int64_t k = chunk * kChunk; k < chunk * kChunk + frame.chunk_count[chunk]; ++k) {
         const int first = frame.rows[k].first / kBandRows, last = frame.rows[k].last / kBandRows;
         frame.place_first[k] = places - first;
         places += last - first + 1;
-        for (int b = first; b <= last; ++b) ++frame.bands[b].count;
-    });
-    frame.places.room(places);
-    for (int b = 0; b < frame.num_bands; ++b) {
-        frame.bands[b].order.room(frame.bands[b].count);
-        frame.bands[b].count = 0;
-    }
-    each_candidate(frame, [&](int64_t k) {
         uint32_t depth;  // positive, so its bits are in its order
         std::memcpy(&depth, &frame.candidates[k].z, sizeof depth);
-        for (int b = frame.rows[k].first / kBandRows; b <= frame.rows[k].last / kBandRows; ++b) {
-            Band& band = frame.bands[b];
-            band.order[band.count++] = (uint64_t)depth << 32 | (uint64_t)k;
-        }
-    });
+        for (int b = first; b <= last; ++b) frame.bands[b].order[in_band[b]++] = (uint64_t)depth << 32 | (uint64_t)k;
+    }
 }
 
 // By depth, ties by row.
@@ -271,7 +282,9 @@ inline void prepare(const Scene& s, Frame& frame) {
     frame.rows.room(frame.chunks * kChunk);
     frame.place_first.room(frame.chunks * kChunk);
     frame.chunk_count.room(frame.chunks);
+    frame.chunk_places.room(frame.chunks);
     frame.num_bands = (frame.blocks_y + kBandRows - 1) / kBandRows;
+    frame.chunk_bands.room(frame.chunks * frame.num_bands);
     if ((int)frame.bands.size() < frame.num_bands) frame.bands.resize(frame.num_bands);
     for (int b = 0; b < frame.num_bands; ++b) {
         frame.bands[b].top = b * kBandRows;

@@ -111,6 +111,13 @@ struct Sum {  // of many floats: sixteen running sums, added at the end
     }
 };
 
+double sum_of(const float* values, int64_t n) {
+    double lane[kTogether] = {}, total = 0;
+    for (int64_t i = 0; i < n; ++i) lane[i % kTogether] += values[i];
+    for (double v : lane) total += v;
+    return total;
+}
+
 }  // namespace
 
 extern "C" {
@@ -129,8 +136,7 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
         float* product = loss.towards_product.room(wide);
         Part* counted = loss.counted.room(height);  // what of each row counts at most; SSIM is asked for nowhere else
         double* sums = loss.sums.room(2 * pieces);
-        double total = 0;
-        for (int64_t p = 0; p < (int64_t)width * height; ++p) total += weight[p];
+        const double total = sum_of(weight, (int64_t)width * height);
         if (!(total > 0)) {
             std::fill(gradient, gradient + size, 0.0f);
             out[0] = out[1] = 0, out[2] = 1;
@@ -221,72 +227,106 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
 // The losses of alpha, depth and labels over n pixels, and their gradients. out: {sum(judged |alpha - inside|),
 // sum(known |depth / target_depth - alpha|), sum(labelled (mismatch + 1 where the pixel has a label))}; the gradients of
 // the first two, times their weights, are written. inverse: the second is sum(known |alpha^2 / depth - 1 /
-// target_depth|), alpha / depth being 0 where nothing is. mismatch, labelled and ids are null without labels.
-void ss_surface_loss(int64_t n, const float* alpha, const float* depth, const float* mismatch, const float* inside,
-                     const float* judged, const float* target_depth, const float* known, const float* labelled,
-                     const int32_t* ids, float alpha_weight, float depth_weight, int inverse,
-                     float* towards_alpha, float* towards_depth, double* out) {
+// target_depth|), alpha / depth being 0 where nothing is. mismatch, labelled and ids are null without labels. 0 = done,
+// 1 = out of memory.
+int ss_surface_loss(int64_t n, const float* alpha, const float* depth, const float* mismatch, const float* inside,
+                    const float* judged, const float* target_depth, const float* known, const float* labelled,
+                    const int32_t* ids, float alpha_weight, float depth_weight, int inverse,
+                    float* towards_alpha, float* towards_depth, double* out, int threads) {
+    constexpr int64_t kPixels = 1 << 14;  // in one piece
     constexpr int kSome = 1024;
-    float terms[3][kSome] = {};
-    Sum sums[3];
-    for (int64_t begin = 0; begin < n; begin += kSome) {
-        const int count = (int)std::min<int64_t>(kSome, n - begin);
-        for (int k = 0; k < count; ++k) {
-            const int64_t i = begin + k;
-            const float a = alpha[i] - inside[i], r = depth[i] / target_depth[i] - alpha[i];
-            const float slope = depth_weight * known[i] * (float)((r > 0) - (r < 0));
-            terms[0][k] = judged[i] * std::fabs(a), terms[1][k] = known[i] * std::fabs(r);
-            towards_alpha[i] = alpha_weight * judged[i] * (float)((a > 0) - (a < 0)) - slope;
-            towards_depth[i] = slope / target_depth[i];
+    struct Sums {
+        double term[3];
+    };
+    return guarded([&] {
+        std::vector<Sums> sums((n + kPixels - 1) / kPixels);
+        parallel::each(threads, (int64_t)sums.size(), [&](int64_t piece) {
+            float terms[3][kSome] = {};
+            Sum sum[3];
+            const int64_t end = std::min(n, (piece + 1) * kPixels);
+            for (int64_t begin = piece * kPixels; begin < end; begin += kSome) {
+                const int count = (int)std::min<int64_t>(kSome, end - begin);
+                for (int k = 0; k < count; ++k) {
+                    const int64_t i = begin + k;
+                    const float a = alpha[i] - inside[i], r = depth[i] / target_depth[i] - alpha[i];
+                    const float slope = depth_weight * known[i] * (float)((r > 0) - (r < 0));
+                    terms[0][k] = judged[i] * std::fabs(a), terms[1][k] = known[i] * std::fabs(r);
+                    towards_alpha[i] = alpha_weight * judged[i] * (float)((a > 0) - (a < 0)) - slope;
+                    towards_depth[i] = slope / target_depth[i];
+                }
+                if (inverse)
+                    for (int k = 0; k < count; ++k) {
+                        const int64_t i = begin + k;
+                        const float a = alpha[i] - inside[i], near = depth[i] > 0 ? alpha[i] / depth[i] : 0.0f;
+                        const float r = alpha[i] * near - 1 / target_depth[i];
+                        const float slope = depth_weight * known[i] * (float)((r > 0) - (r < 0));
+                        terms[1][k] = known[i] * std::fabs(r);
+                        towards_alpha[i] = alpha_weight * judged[i] * (float)((a > 0) - (a < 0)) + 2 * slope * near;
+                        towards_depth[i] = -slope * near * near;
+                    }
+                if (labelled)
+                    for (int k = 0; k < count; ++k) {
+                        const int64_t i = begin + k;
+                        terms[2][k] = labelled[i] * (mismatch[i] + (ids[i] >= 0 ? 1.0f : 0.0f));
+                    }
+                for (int t = 0; t < 3; ++t) sum[t].add(terms[t], count);
+            }
+            for (int t = 0; t < 3; ++t) sums[piece].term[t] = sum[t].total;
+        });
+        for (int t = 0; t < 3; ++t) {
+            out[t] = 0;
+            for (const Sums& of_piece : sums) out[t] += of_piece.term[t];
         }
-        if (inverse)
-            for (int k = 0; k < count; ++k) {
-                const int64_t i = begin + k;
-                const float a = alpha[i] - inside[i], near = depth[i] > 0 ? alpha[i] / depth[i] : 0.0f;
-                const float r = alpha[i] * near - 1 / target_depth[i];
-                const float slope = depth_weight * known[i] * (float)((r > 0) - (r < 0));
-                terms[1][k] = known[i] * std::fabs(r);
-                towards_alpha[i] = alpha_weight * judged[i] * (float)((a > 0) - (a < 0)) + 2 * slope * near;
-                towards_depth[i] = -slope * near * near;
-            }
-        if (labelled)
-            for (int k = 0; k < count; ++k) {
-                const int64_t i = begin + k;
-                terms[2][k] = labelled[i] * (mismatch[i] + (ids[i] >= 0 ? 1.0f : 0.0f));
-            }
-        for (int t = 0; t < 3; ++t) sums[t].add(terms[t], count);
-    }
-    for (int t = 0; t < 3; ++t) out[t] = sums[t].total;
+    });
 }
 
-// One step of Adam (Kingma & Ba 2015, betas 0.9 and 0.999), in place, on the first `active` of each row's `width`
-// values; the first `head` of them have a rate of their own.
-void ss_adam(int64_t rows, int64_t width, int64_t active, int64_t head, float* value, const float* gradient,
-             float* first, float* second, double head_rate, double rate, int64_t step, double epsilon, int threads) {
-    constexpr int64_t kRows = 1 << 14;  // in one piece: fewer take less time than a thread to start
-    const float correct = (float)(1 / std::sqrt(1 - std::pow(0.999, (double)step)));
+// One step of Adam (Kingma & Ba 2015, betas 0.9 and 0.999), in place. 0 = done, 1 = out of memory.
+int ss_adam(int64_t rows, int count, const Learnt* parameters, int64_t step, double epsilon, int threads) {
+    constexpr int64_t kRows = 1 << 12;  // in one piece
+    constexpr int64_t kPaced = 256;     // of these, moved at paces of their own together
+    const float upright = (float)(1 / std::sqrt(1 - std::pow(0.999, (double)step))), small = (float)epsilon;
     const double debias = 1 / (1 - std::pow(0.9, (double)step));
     // By value: what is reached through a reference may change with every write, and no loop would become vector code.
-    const auto update = [=](int64_t begin, int64_t end, double of_these) {
-        const float scale = (float)(of_these * debias), small = (float)epsilon, upright = correct;
-        float *const v = value, *const m = first, *const n = second;
+    const auto update = [=](const Learnt p, int64_t begin, int64_t end, double rate) {
+        const float scale = (float)(rate * debias);
         for (int64_t i = begin; i < end; ++i) {
-            const float g = gradient[i];
-            m[i] = 0.9f * m[i] + 0.1f * g;
-            n[i] = 0.999f * n[i] + 0.001f * g * g;
-            v[i] -= scale * m[i] / (std::sqrt(n[i]) * upright + small);
+            const float g = p.gradient[i];
+            p.first[i] = 0.9f * p.first[i] + 0.1f * g;
+            p.second[i] = 0.999f * p.second[i] + 0.001f * g * g;
+            p.value[i] -= scale * p.first[i] / (std::sqrt(p.second[i]) * upright + small);
         }
     };
-    parallel::each(threads, (rows + kRows - 1) / kRows, [&](int64_t piece) {
-        const int64_t begin = piece * kRows, end = std::min(rows, begin + kRows);
-        if (active == width && (head == 0 || head == width)) {  // in one go: short loops do not become vector code
-            update(begin * width, end * width, head == 0 ? rate : head_rate);
-            return;
-        }
-        for (int64_t r = begin; r < end; ++r) {
-            update(r * width, r * width + head, head_rate);
-            update(r * width + head, r * width + active, rate);
-        }
+    // A step is as long as its rate: one of rate 1 is cut to the pace of each row.
+    const auto update_paced = [=](const Learnt p, int64_t begin, int64_t end, float* before) {
+        float* const v = p.value + begin * p.width;
+        const int64_t values = (end - begin) * p.width;
+        std::copy_n(v, values, before);
+        update(p, begin * p.width, end * p.width, 1);
+        for (int64_t i = 0; i < values; ++i) v[i] -= before[i];
+        for (int64_t r = begin; r < end; ++r)
+            for (int64_t i = 0; i < p.width; ++i) v[(r - begin) * p.width + i] *= p.paces[r];
+        for (int64_t i = 0; i < values; ++i) v[i] += before[i];
+    };
+    return guarded([&] {
+        parallel::each(threads, (rows + kRows - 1) / kRows, [&](int64_t piece) {
+            const int64_t begin = piece * kRows, end = std::min(rows, begin + kRows);
+            for (int k = 0; k < count; ++k) {
+                const Learnt& p = parameters[k];
+                if (p.paces) {
+                    std::vector<float> before(kPaced * p.width);
+                    for (int64_t r = begin; r < end; r += kPaced)
+                        update_paced(p, r, std::min(end, r + kPaced), before.data());
+                } else if (p.active == p.width && (p.head == 0 || p.head == p.width)) {
+                    // In one go: short loops do not become vector code.
+                    update(p, begin * p.width, end * p.width, p.head == 0 ? p.rate : p.head_rate);
+                } else {
+                    for (int64_t r = begin; r < end; ++r) {
+                        update(p, r * p.width, r * p.width + p.head, p.head_rate);
+                        update(p, r * p.width + p.head, r * p.width + p.active, p.rate);
+                    }
+                }
+            }
+        });
     });
 }
 }

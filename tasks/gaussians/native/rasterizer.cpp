@@ -86,7 +86,8 @@ int ss_rasterize(void* workspace, const Scene* scene, const Images* images, int 
         const projection::View view = projection::view_of(s);
         parallel::each(threads, frame.chunks,
                        [&](int64_t c) { binning::project_chunk(s, view, c, images->radii, frame); });
-        binning::distribute(frame);
+        binning::allot(frame);
+        parallel::each(threads, frame.chunks, [&](int64_t c) { binning::distribute(c, frame); });
         parallel::each(threads, frame.num_bands, [&](int64_t b) {
             binning::fill(frame.bands[b], frame);
             forward(s, frame, frame.bands[b], *images);

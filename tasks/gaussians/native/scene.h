@@ -47,4 +47,17 @@ struct Gradients {
     float* centers;     // [N, 2] towards the projected mean, pixels
     float* background;  // [3]
 };
+
+// A parameter as Adam moves it; arrays are [N, width].
+struct Learnt {
+    float* value;
+    const float* gradient;
+    float* first;               // moments
+    float* second;
+    const float* paces;         // [N] the rate of each row, of all its values; null: the two below
+    int64_t width;
+    int64_t active;             // the values of a row after these stay
+    int64_t head;               // how many of them have a rate of their own
+    double head_rate, rate;
+};
 }

@@ -178,7 +178,7 @@ def test_every_backend_remembers_the_same_gradients_and_limits_the_same_values(b
         for centers, radii in seen:
             record.add(one.put(centers), one.put(radii), 500)
         parameters.limit_opacity(0.05)
-        parameters.limit_scale(one.put(np.linspace(0.01, 1, 120, dtype=np.float32)))
+        parameters.limit_scale(one.put(np.log(np.linspace(0.01, 1, 120, dtype=np.float32))))
         parameters.keep(parameters.longest() > 0.05)
         found.append((one.host(record.mean()), parameters.to_gaussians(made), one.host(parameters.opacities())))
     (mean, gaussians, opacities), (their_mean, theirs, their_opacities) = found

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ss_flow.tasks.gaussians.library import Workspace, address, library
+from ss_flow.tasks.gaussians.library import Learnt, Workspace, address, library
 from ss_flow.tasks.gaussians.losses import photometric, surface
 from ss_flow.tasks.gaussians.objective import Target, Weights
 from ss_flow.tasks.geometry.cameras import Camera
@@ -131,6 +131,25 @@ def test_threads_and_a_workspace_change_no_byte_of_the_colour_loss():
             assert got.loss == alone.loss and got.gradient.tobytes() == alone.gradient.tobytes()
 
 
+def test_threads_change_no_byte_of_the_losses_of_alpha_depth_and_labels():
+    """More pixels than fit in one piece of a thread's work."""
+    rng = np.random.default_rng(4)
+    alpha, depth, mismatch, inside, judged, known, labelled = rng.random((7, 170, 250)).astype(np.float32)
+    ids = rng.integers(-1, 3, alpha.shape).astype(np.int32)
+    target = target_of(alpha.shape, inside, judged, 0.5 + depth, known, ids, labelled)
+    one, three = (surface(alpha, depth, mismatch, target, Weights(0.2, 0.5, 2.0, 0.7), threads=n) for n in (1, 3))
+    assert one[:3] == three[:3]
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(one[3:], three[3:], strict=True))
+
+
+def adam(value, gradient, first, second, rates, step, *, paces=None, active=None, head=0, threads=1):
+    """rates: of the head, and of the rest."""
+    width = value.shape[1]
+    arrays = (address(a) for a in (value, gradient, first, second, paces))
+    learnt = Learnt(*arrays, width, width if active is None else active, head, *rates)
+    assert library().ss_adam(len(value), 1, learnt, step, 1e-15, threads) == 0
+
+
 def test_adam_agrees_with_torch():
     rng = np.random.default_rng(3)
     value = rng.normal(size=(10, 6)).astype(np.float32)
@@ -141,26 +160,34 @@ def test_adam_agrees_with_torch():
         gradient = rng.normal(size=(10, 6)).astype(np.float32)
         parts[0].grad, parts[1].grad = torch.tensor(gradient[:, :2]), torch.tensor(gradient[:, 2:5])
         optimizer.step()
-        library().ss_adam(
-            10, 6, 5, 2, address(ours), address(gradient), address(first), address(second), 0.01, 0.1, step, 1e-15, 1
-        )
+        adam(ours, gradient, first, second, (0.01, 0.1), step, active=5, head=2)
     expected = np.concatenate([*(part.detach().numpy() for part in parts), value[:, 5:]], axis=1)
     assert np.allclose(ours, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("width", "active", "head"), [(3, 3, 0), (12, 6, 3)])
-def test_threads_change_no_byte_of_adam(width, active, head):
+@pytest.mark.parametrize(("width", "active", "head"), [(3, 3, 0), (3, 3, 3), (12, 6, 3)])
+@pytest.mark.parametrize("paced", [False, True])
+def test_threads_change_no_byte_of_adam(width, active, head, paced):
     """More rows than fit in one piece of a thread's work."""
     rng = np.random.default_rng(5)
     start, gradient = rng.normal(size=(2, 40_001, width)).astype(np.float32)
+    paces = rng.uniform(0.01, 0.1, len(start)).astype(np.float32) if paced else None
+    active = width if paced else active
     found = set()
     for threads in (1, 3):
         ours, first, second = start.copy(), np.zeros_like(start), np.zeros_like(start)
         for step in (1, 2):
-            library().ss_adam(
-                len(ours), width, active, head, address(ours), address(gradient), address(first), address(second),
-                0.01, 0.1, step, 1e-15, threads,
-            )  # fmt: skip
+            adam(ours, gradient, first, second, (0.01, 0.1), step,
+                 paces=paces, active=active, head=head, threads=threads)  # fmt: skip
         found.add(ours.tobytes())
     assert len(found) == 1
     assert (ours[:, :active] != start[:, :active]).all() and (ours[:, active:] == start[:, active:]).all()
+
+
+def test_rows_of_one_pace_go_as_far_as_at_that_rate():
+    rng = np.random.default_rng(6)
+    start, gradient = rng.normal(size=(2, 1000, 3)).astype(np.float32)
+    at_rate, paced = start.copy(), start.copy()
+    adam(at_rate, gradient, *np.zeros((2, 1000, 3), np.float32), (0, 0.05), 1)
+    adam(paced, gradient, *np.zeros((2, 1000, 3), np.float32), (0, 0), 1, paces=np.full(1000, 0.05, np.float32))
+    assert np.allclose(paced, at_rate, atol=1e-6)
