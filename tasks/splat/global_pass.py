@@ -44,7 +44,7 @@ def by_instance(gaussians: Gaussians) -> Gaussians:
 
 @task(
     name="splat.global_pass",
-    resources=Resources(cores=1, most_cores=8, memory_mb=4000, gpus=0.5),
+    resources=Resources(cores=1, most_cores=16, memory_mb=4000, gpus=0.5),
     environment=backend_identity,
 )
 def global_pass(

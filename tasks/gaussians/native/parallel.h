@@ -1,18 +1,98 @@
 // Work shared by a few threads, and memory that is kept from one call to the next.
 #pragma once
 
+#include <unistd.h>
+
 #include <algorithm>
 #include <atomic>
+#include <condition_variable>
 #include <cstddef>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <memory>
+#include <mutex>
 #include <new>
 #include <system_error>
 #include <thread>
 #include <vector>
 
 namespace parallel {
+
+// Threads that help one caller and sleep between its calls: to start one takes as long as a small piece of
+// work. One that wakes too late finds nothing to do, and nobody waits for it.
+class Crew {
+  public:
+    ~Crew() {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            ending_ = true;
+        }
+        wake_.notify_all();
+        for (std::thread& thread : threads_) thread.join();
+    }
+
+    // Calls `work` once, and so do as many of `helpers` others as are awake before it has returned. `work` throws nothing.
+    template <class F>
+    void share(int helpers, F& work) {
+        grow(helpers);
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            work_ = [&work] { work(); };
+            wanted_ = helpers, ++call_;
+        }
+        wake_.notify_all();
+        work();
+        std::unique_lock<std::mutex> lock(mutex_);
+        wanted_ = 0;
+        done_.wait(lock, [this] { return busy_ == 0; });
+    }
+
+  private:
+    void grow(int helpers) {
+        try {
+            while ((int)threads_.size() < helpers) threads_.emplace_back([this] { help(); });
+        } catch (const std::system_error&) {
+            // No more threads to be had: those that are there do the work.
+        }
+    }
+
+    void help() {
+        std::unique_lock<std::mutex> lock(mutex_);
+        for (int64_t seen = 0;;) {
+            wake_.wait(lock, [&] { return ending_ || (wanted_ > 0 && seen != call_); });
+            if (ending_) return;
+            seen = call_;
+            --wanted_, ++busy_;
+            lock.unlock();
+            work_();
+            lock.lock();
+            if (--busy_ == 0) done_.notify_one();
+        }
+    }
+
+    std::vector<std::thread> threads_;
+    std::mutex mutex_;  // of all below
+    std::condition_variable wake_, done_;
+    std::function<void()> work_;
+    int64_t call_ = 0;
+    int wanted_ = 0, busy_ = 0;  // helpers that may still begin, and those that work
+    bool ending_ = false;
+};
+
+// That of the calling thread. A process that was forked has none of its parent's threads: it leaves what it inherited
+// where it is, for even to end it would wait for them.
+inline Crew& crew() {
+    thread_local struct Own {
+        Crew* crew = nullptr;
+        pid_t process = 0;
+        ~Own() {
+            if (process == getpid()) delete crew;
+        }
+    } own;
+    if (own.process != getpid()) own.crew = new Crew, own.process = getpid();
+    return *own.crew;
+}
 
 // Calls work(0) ... work(count - 1), each once. Which thread does what is left to chance, so results must not depend
 // on it: `work` writes only what belongs to its index.
@@ -32,14 +112,7 @@ void each(int threads, int64_t count, F work) {
             failed = true;
         }
     };
-    std::vector<std::thread> others;
-    try {
-        for (int k = 1; k < threads; ++k) others.emplace_back(run);
-    } catch (const std::system_error&) {
-        // No more threads to be had: those that are there do the work.
-    }
-    run();
-    for (std::thread& t : others) t.join();
+    crew().share(threads - 1, run);
     if (failed) throw std::bad_alloc();
 }
 

@@ -30,13 +30,17 @@ def test_threads_beside_it_do_not_change_a_byte(native):
     assert found[2].gaussians.means.tobytes() != alone.gaussians.means.tobytes()
 
 
-def test_the_number_of_threads_changes_no_byte(native):
+@pytest.mark.parametrize("with_parts", [False, True])
+def test_the_number_of_threads_changes_no_byte(native, with_parts):
     params = TrainParams(iterations=240)
+    parts = [part_view(0, 300, 0.3), part_view(0, 150, 2.0), part_view(100, 300, 4.0)] if with_parts else []
+    if with_parts:
+        params = replace(params, densify="none", part_weight=0.5, parts_per_step=2, max_scale=0.05)
     trained = []
     for cores in (1, 2, 3):
         with running(Surroundings(cores=cores)):
-            trained.append(train(ball_points(), VIEWS, params=params, extent=1.6, seed=1))
-    assert len(trained[0].gaussians) != 300
+            trained.append(train(ball_points(), VIEWS, params=params, extent=1.6, seed=1, parts=parts))
+    assert with_parts or len(trained[0].gaussians) != 300
     for other in trained[1:]:
         assert all(
             getattr(other.gaussians, name).tobytes() == getattr(trained[0].gaussians, name).tobytes()
