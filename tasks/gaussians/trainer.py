@@ -30,8 +30,9 @@ CHECKPOINT_SECONDS = 60.0
 """How much work a kill may cost."""
 SMALL, SMALL_PER_CORE = 200 * 200, 13_000
 """Pixels of a view. A device takes three milliseconds a step whatever the size, to start its kernels, and no more steps
-a second for several trainings than for one (docs/device.md). Where views have fewer pixels in the mean, a training with
-several cores is faster on these, and those that have a core each are together."""
+a second for several trainings than for one (docs/device.md). Where views have fewer pixels in the mean than the first,
+or the second for each of its cores, a training with several is faster on these; and fewer than the second for each core
+of the machine, those that have a core each are together."""
 
 
 class TrainingDiverged(RuntimeError):
@@ -153,7 +154,7 @@ def train(
 def _device(views: Sequence[TrainView]) -> str:
     """Where a training of these views is fastest. One that has a single core is taken for one of many at once."""
     here = device_here()
-    small = SMALL if cores() > 1 else SMALL_PER_CORE * usable_cores()
+    small = max(SMALL, SMALL_PER_CORE * cores()) if cores() > 1 else SMALL_PER_CORE * usable_cores()
     return "cpu" if sum(view.camera.width * view.camera.height for view in views) < small * len(views) else here
 
 

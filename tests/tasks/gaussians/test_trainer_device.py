@@ -34,9 +34,12 @@ def test_small_views_are_trained_on_the_cpu_and_large_ones_on_the_device(monkeyp
 
 @pytest.mark.parametrize(
     ("machine", "own", "small"),
-    [(4, 4, 40_000), (16, 2, 40_000), (1, 1, 13_000), (4, 1, 52_000), (16, 1, 208_000)],
-)
-def test_the_more_trainings_are_at_once_the_larger_are_those_for_the_cpu(monkeypatch, machine, own, small):
+    [
+        (2, 2, 40_000), (16, 3, 40_000), (4, 4, 52_000), (16, 16, 208_000),
+        (1, 1, 13_000), (4, 1, 52_000), (16, 1, 208_000),
+    ],
+)  # fmt: skip
+def test_the_more_cores_or_trainings_at_once_the_larger_are_those_for_the_cpu(monkeypatch, machine, own, small):
     monkeypatch.setattr(trainer, "device_here", lambda: "cuda")
     monkeypatch.setattr(trainer, "usable_cores", lambda: machine)
 
