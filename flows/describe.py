@@ -54,11 +54,11 @@ def facts(value: Any) -> list[FieldFacts]:
 
 def size_in_words(count: float) -> str:
     """A number of bytes as a person says it."""
-    for unit in ("B", "kB", "MB"):
-        if count < 1000:
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 999.5:  # above, three digits would make it 1e+03
             return f"{count:.3g} {unit}"
         count /= 1000
-    return f"{count:.3g} GB"
+    return f"{count:.3g} TB"
 
 
 @dataclass(frozen=True)

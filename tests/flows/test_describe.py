@@ -30,6 +30,7 @@ def test_a_size_is_said_in_the_unit_that_fits():
     assert [size_in_words(n) for n in (0, 999, 1000, 12_345_678, 5_000_000_000)] == [
         *("0 B", "999 B", "1 kB", "12.3 MB", "5 GB")
     ]
+    assert [size_in_words(n) for n in (999_499, 999_500, 999_999_999_999)] == ["999 kB", "1 MB", "1 TB"]
 
 
 def test_every_field_is_told_with_its_schema():
