@@ -25,7 +25,7 @@ from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
-from ss_flow.tasks.geometry.shape import plane_through
+from ss_flow.tasks.geometry.shape import Plane, on_plane, refitted
 
 _NEARBY = 0.5
 """How far around the box of what has left the surfaces are looked for, as a share of its diagonal."""
@@ -96,7 +96,7 @@ def fill(
     solid = ~_seen_through(places, cameras, measured.depths, thickness)
     places, plane_of = places[solid], plane_of[solid]
     chosen = _one_a_cube(places, spacing)
-    chosen = chosen[_farther(places[chosen], after.means[after.filled > 0], spacing)]
+    chosen = chosen[~_within(places[chosen], after.means[after.filled > 0], spacing)]
     places, plane_of = places[chosen], plane_of[chosen]
     if not len(places):
         return after
@@ -177,26 +177,13 @@ def _planes(points: PointCloud, rows: Int32, thickness: float) -> list[_Plane]:
         if len(rest) < least:
             break
         own = places[rest]
-        sample = own[:: max(1, len(own) // _LARGEST_BLOCK)]
-        best, support = None, 0
-        for triple in rng.integers(0, len(own), (_TRIALS, 3)):
-            a, b, c = own[triple]
-            normal = np.cross(b - a, c - a)
-            length = float(np.linalg.norm(normal))
-            if length == 0:
-                continue
-            count = int((np.abs((sample - a) @ (normal / length)) <= thickness).sum())
-            if count > support:
-                best, support = (a, normal / length), count
+        best = _through_three(own, thickness, rng)
         if best is None:
             break
-        for _ in range(2):
-            near = np.abs((own - best[0]) @ best[1]) <= thickness
-            best = plane_through(own[near])
-        near = np.abs((own - best[0]) @ best[1]) <= thickness
+        centre, normal = refitted(own, best, thickness, 2)
+        near = on_plane(own, (centre, normal), thickness)
         if near.sum() < least:
             break
-        centre, normal = best
         axes = np.linalg.svd(own[near] - centre, full_matrices=False)[2][:2]
         flat = (own[near] - centre) @ axes.T
         together = _largest_piece(flat, spacing)
@@ -205,6 +192,23 @@ def _planes(points: PointCloud, rows: Int32, thickness: float) -> list[_Plane]:
             found.append(_Plane(centre, normal, axes, rows[rest[near][together]], piece))
         rest = rest[~near]
     return found
+
+
+def _through_three(places: Float64, thickness: float, rng: np.random.Generator) -> Plane | None:
+    """Of planes through three of some points [N, 3] the one that most points lie on; None where none has a normal."""
+    sample = places[:: max(1, len(places) // _LARGEST_BLOCK)]
+    best, support = None, 0
+    for triple in rng.integers(0, len(places), (_TRIALS, 3)):
+        a, b, c = places[triple]
+        normal = np.cross(b - a, c - a)
+        length = float(np.linalg.norm(normal))
+        if length == 0:
+            continue
+        plane = a, normal / length
+        count = int(on_plane(sample, plane, thickness).sum())
+        if count > support:
+            best, support = plane, count
+    return best
 
 
 def _largest_piece(flat: Float64, spacing: float) -> Bool:
@@ -284,40 +288,32 @@ def _came_to_light(
     of those that lie far from every measured point that remains, inside of what has left, say, all that are faint in
     all views.
     """
-    from scipy.spatial import cKDTree
-
     stays = ~np.isin(before.instance_id, instances) & np.isin(before.instance_id, after.instance_id)
     rest = select(before, stays)
     reach = _NEAR * measured.points.spacing
-
-    def within(of: Float32 | Float64) -> Bool:
-        near: Bool = cKDTree(of).query(rest.means, distance_upper_bound=reach, workers=1)[0] <= reach
-        return near
-
     with_it, without = np.zeros(len(before), np.float32), np.zeros(len(rest), np.float32)
     for view in views:
         np.maximum(with_it, render(before, view.camera).max_contribution, out=with_it)
         np.maximum(without, render(rest, view.camera).max_contribution, out=without)
     small = rest.log_scales.max(axis=1, initial=-np.inf) < np.log(reach)
     grown = without > 2 * with_it[stays]
-    alone = grown & ~within(measured.points.points[Remains.of(measured, gone).rows])
+    alone = grown & ~_within(rest.means, measured.points.points[Remains.of(measured, gone).rows], reach)
     if alone.any():
         for number in range(len(measured.cameras)):
             np.maximum(with_it, render(before, camera_of(measured.cameras, number)).max_contribution, out=with_it)
     came = np.zeros(len(after), bool)
     stayed = np.flatnonzero(~np.isin(after.instance_id, instances))[: len(rest)]  # what is new comes last
-    came[stayed] = (rest.filled == 0) & ((grown & small & within(places)) | (alone & (with_it[stays] < _FAINT)))
+    beside = grown & small & _within(rest.means, places, reach)
+    came[stayed] = (rest.filled == 0) & (beside | (alone & (with_it[stays] < _FAINT)))
     return came
 
 
-def _farther(places: Float64, others: Float32, distance: float) -> Bool:
-    """[M] which places [M, 3] are farther than a distance from all others."""
+def _within(places: Float32 | Float64, others: Float32 | Float64, distance: float) -> Bool:
+    """[M] which places [M, 3] are no farther than a distance from another one of these."""
     from scipy.spatial import cKDTree
 
-    if not len(others):
-        return np.ones(len(places), bool)
-    far: Bool = cKDTree(others).query(places, workers=1)[0] > distance
-    return far
+    near: Bool = cKDTree(others).query(places, distance_upper_bound=2 * distance, workers=1)[0] <= distance
+    return near
 
 
 def _one_a_cube(places: Float64, side: float) -> Int32:
