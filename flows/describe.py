@@ -13,6 +13,7 @@ import numpy as np
 from ss_flow.cache.store import Action, Store
 from ss_flow.runs import Run, latest_runs
 from ss_flow.tasks.deliver.statistics import statistics
+from ss_flow.tasks.words import size_in_words
 
 _LONGEST = 200
 """Characters of a plain value that are shown."""
@@ -50,15 +51,6 @@ def facts(value: Any) -> list[FieldFacts]:
             shown = text if len(text) < _LONGEST else f"{text[: _LONGEST - 3]}..."
             found.append(FieldFacts(item.name, shown, 0, ""))
     return found
-
-
-def size_in_words(count: float) -> str:
-    """A number of bytes as a person says it."""
-    for unit in ("B", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    return f"{count:.3g} GB"
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ from html import escape
 from typing import Any
 
 from ss_flow.cache.store import Store
-from ss_flow.flows.describe import as_html, provenance, size_in_words
+from ss_flow.flows.describe import as_html, provenance
 from ss_flow.flows.results import FinishedRun
 from ss_flow.flows.view.artifact import around_results, artifact_picture
 from ss_flow.flows.view.drawing import Around
 from ss_flow.tasks import artifacts
+from ss_flow.tasks.words import size_in_words
 
 
 def load_ipython_extension(shell: Any) -> None:

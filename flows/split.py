@@ -26,7 +26,7 @@ from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.appearances import appearances
 from ss_flow.tasks.split.boards import part_boards
-from ss_flow.tasks.split.correct import correct, part_masks
+from ss_flow.tasks.split.correct import correct, corrected_tree, part_masks
 from ss_flow.tasks.split.cut import cut, cut_parts
 from ss_flow.tasks.split.dense import dense
 from ss_flow.tasks.split.dense_splatting import dense_splatting
@@ -70,6 +70,7 @@ class Split:
     pieces: PointLabels
     """The labels that the views voted for (l_p): the leaves of the tree."""
     tree: Hierarchy
+    """What the pieces make up; with the instances that boards and corrections made of others."""
     labels: PointLabels
     """The instances, which the cut through the tree leaves, boards apart, and as the user corrected them (P_labeled;
     in the paper the pieces themselves)."""
@@ -118,7 +119,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     labels = _divided(capture, embeddings, points, seen, pieces, tree, things, segmenter, params)
     shown = masks
     if labels is not things:
-        contained = params.segment.contained
+        tree, contained = corrected_tree(tree, things, labels), params.segment.contained
         shown = each(
             seen,
             masks,

@@ -27,7 +27,7 @@ from ss_flow.flows.cli.telling import print_table
 from ss_flow.flows.deliver import STATUS_EXIT
 from ss_flow.runs import Run, latest_runs
 from ss_flow.sweep import scene_of
-from ss_flow.tasks.words import first_of
+from ss_flow.tasks.words import first_of, size_in_words
 from ss_flow.units import parse_bytes, parse_seconds
 
 T = TypeVar("T")
@@ -90,15 +90,15 @@ class CacheCollect:
             return
         out = console(json=False)
         print_table(_table("would go" if self.dry_run else "deleted", rows, {"total": total}), out)
-        out.print(f"{left.count} results stay, {size_text(left.bytes)}")
+        out.print(f"{left.count} results stay, {size_in_words(left.bytes)}")
         if losing:
             scenes = [f"{row['scene']} ({row['runs_that_lose']} of {row['runs']})" for row in losing]
             words = "would lose" if self.dry_run else "lost"
             out.print(escape(f"runs that {words} results: {first_of(scenes, SHOWN)}"))
         if over:
             out.print(
-                f"[yellow]{size_text(over)} more than --max-size {self.max_size}:[/] the rest is pinned, belongs to a "
-                "living run, or was used within the grace period"
+                f"[yellow]{size_in_words(over)} more than --max-size {self.max_size}:[/] the rest is pinned, belongs "
+                "to a living run, or was used within the grace period"
             )
 
 
@@ -202,7 +202,7 @@ class CacheUsage:
             ends = {"of none of them": usage.unreachable, "total": total}
             print_table(_table(name, usage.rows, ends), out)
             if usage.shared_bytes:
-                out.print(f"of the rows, {size_text(usage.shared_bytes)} are shared and counted more than once")
+                out.print(f"of the rows, {size_in_words(usage.shared_bytes)} are shared and counted more than once")
             out.print()
         tell_pins(pins)
         return 0
@@ -248,12 +248,6 @@ class CacheVerify:
         return STATUS_EXIT["degraded" if seen.damaged else "ok"]
 
 
-def size_text(size: int) -> str:
-    """A number of bytes for people: "12.3 MB"."""
-    power = min(4, int(math.log10(size) / 3)) if size else 0
-    return f"{size / 1000**power:.1f} {'kMGT'[power - 1]}B" if power else f"{size} B"
-
-
 def _sum(tallies: Iterable[Tally]) -> Tally:
     total = Tally()
     for tally in tallies:
@@ -266,7 +260,7 @@ def _table(what: str, rows: dict[str, Tally], ends: dict[str, Tally]) -> Table:
     table.add_column("number", justify="right")
     table.add_column("size", justify="right")
     for name, tally in [*rows.items(), *ends.items()]:
-        table.add_row(escape(name), str(tally.count), size_text(tally.bytes))
+        table.add_row(escape(name), str(tally.count), size_in_words(tally.bytes))
     return table
 
 

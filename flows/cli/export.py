@@ -26,6 +26,7 @@ from ss_flow.tasks.deliver.output import check_named
 from ss_flow.tasks.deliver.places import Written, check_outside, check_replaceable, replacing_own
 from ss_flow.tasks.deliver.undistorted import write_nerfstudio, write_undistorted
 from ss_flow.tasks.geometry.images import suffix_of
+from ss_flow.tasks.words import size_in_words
 
 MANIFEST = "export.json"
 EXPORT = Written(MANIFEST, "an earlier export")
@@ -189,8 +190,7 @@ class Export:
         words = console(json=False)
         for failure in failures:
             words.print(f"[red]failed[/] {escape(failure['label'])}: {escape(failure['error'])}")
-        size = sum(file["bytes"] for file in files)
-        told = f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.1f} kB"
+        told = size_in_words(sum(file["bytes"] for file in files))
         words.print(escape(f"{status}: {out} ({self.format}, {len(files)} file{'s' * (len(files) != 1)}, {told})"))
         return STATUS_EXIT[status]
 

@@ -24,6 +24,7 @@ from ss_flow.flows.cli.context import (
 from ss_flow.flows.cli.query import encoder_of, query_params
 from ss_flow.flows.results import FinishedRun, read_run, run_command, source_of
 from ss_flow.tasks.deliver.output import RUN_FILE, check_named
+from ss_flow.tasks.words import size_in_words
 
 if TYPE_CHECKING:
     from ss_flow.flows.view.search import Search
@@ -125,12 +126,12 @@ class View:
             from ss_flow.flows.view import rerun_file
 
             rerun_file.write_recording(self.rerun, open_run(folder, self.store, rerun_file.SHOWN))
-            out.print(escape(f"{self.rerun} ({self.rerun.stat().st_size / 1e6:.1f} MB)"))
+            out.print(escape(f"{self.rerun} ({size_in_words(self.rerun.stat().st_size)})"))
         if self.html:
             from ss_flow.flows.view import page
 
             page.write_page(self.html, open_run(folder, self.store, page.SHOWN))
-            out.print(escape(f"{self.html} ({self.html.stat().st_size / 1e6:.1f} MB)"))
+            out.print(escape(f"{self.html} ({size_in_words(self.html.stat().st_size)})"))
         return 0
 
     def _viewer(self, folder: Path) -> int:

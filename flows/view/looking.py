@@ -40,7 +40,8 @@ def start_view(cameras: Cameras, points: Float32) -> Viewpoint:
     shown = [pixels_in_view(some, camera)[3] for camera in cameras_by_view(cameras)]
     view = max(range(len(shown)), key=lambda k: len(shown[k]))
     camera = camera_of(cameras, view)
-    ahead = float(np.median(shown[view])) if len(shown[view]) else max(camera_extent([camera]), 1.0)
+    # Where nothing is seen, how far apart the cameras stand tells the scene's size.
+    ahead = float(np.median(shown[view])) if len(shown[view]) else camera_extent(cameras_by_view(cameras)) or 1.0
     forward = camera.world_to_camera[2, :3]
     fov = 2 * np.arctan(camera.height / 2 / camera.fy)
     return Viewpoint(camera.center, camera.center + ahead * forward, up_of(cameras.world_to_camera), float(fov))

@@ -35,7 +35,8 @@ def thinned(scene: SceneFiles, most: int, motion: float, parameter: str) -> Scen
     poses = scene.world_to_camera
     if poses is None or not 0 < most < len(poses):
         return scene
-    moves = _moves(scene, poses)
+    distance = _looked_at(scene, poses)
+    moves = _moves(scene, poses, distance)
     reach, nearest = np.full(len(poses), np.inf), np.zeros(len(poses), int)
 
     def take(view: int) -> None:
@@ -53,7 +54,7 @@ def thinned(scene: SceneFiles, most: int, motion: float, parameter: str) -> Scen
             if reach[farthest] < 0 or (reach[farthest] <= motion and len(taken) >= _FEWEST):
                 break
             take(farthest)
-    stir, near = _stir(poses), reach <= reach.max() / 2
+    stir, near = _stir(poses, distance), reach <= reach.max() / 2
     clicked = {hint.view for clicks in (scene.hints, scene.corrections) if clicks is not None for hint in clicks.hints}
     chosen = {view for view, name in enumerate(scene.names) if name in clicked}
     for view in taken:
@@ -76,18 +77,25 @@ def _only(scene: SceneFiles, chosen: list[int], reach: float, parameter: str) ->
     )
 
 
-def _moves(scene: SceneFiles, poses: Float64) -> Callable[[int], Float64]:
-    """How far the pictures of all views [K] are moved from that of a view, as a share of their diagonals: by the angle
-    between the two cameras, and by the step between them over the distance of what they see.
+def _looked_at(scene: SceneFiles, poses: Float64) -> float:
+    """How far off is what the cameras look at, world units.
 
     That is `_DISTANCE` where lengths are metres. Elsewhere the cameras tell: where they go round a thing, or about a
     room, it is about as far away as they are from their middle. Of a way that is longer than wide, the width counts;
     if that is too little, more views are taken than would be needed.
     """
-    assert scene.lenses is not None
+    if scene.metric:
+        return _DISTANCE
     centers = centers_of(poses)
     spread = np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False) / np.sqrt(len(centers) / 2)
-    distance = _DISTANCE if scene.metric else max(spread[1], _STRAIGHT * spread[0]) or 1.0
+    return float(max(spread[1], _STRAIGHT * spread[0])) or 1.0
+
+
+def _moves(scene: SceneFiles, poses: Float64, distance: float) -> Callable[[int], Float64]:
+    """How far the pictures of all views [K] are moved from that of a view, as a share of their diagonals: by the angle
+    between the two cameras, and by the step between them over the distance of what they see."""
+    assert scene.lenses is not None
+    centers = centers_of(poses)
     # A lens without a size has its principal point near the middle.
     sizes = [(lens.width or 2 * lens.cx, lens.height or 2 * lens.cy) for lens in scene.lenses]
     focal = np.array([lens.fx for lens in scene.lenses]) / np.maximum(np.hypot(*np.transpose(sizes)), 1)
@@ -99,9 +107,10 @@ def _moves(scene: SceneFiles, poses: Float64) -> Callable[[int], Float64]:
     return moves
 
 
-def _stir(poses: Float64) -> Float64:
-    """[K] how far what a camera sees moves across the picture, from the view before or to the view after: radians."""
-    steps = np.linalg.norm(np.diff(centers_of(poses), axis=0), axis=1) / _DISTANCE + _angles(poses[1:], poses[:-1])
+def _stir(poses: Float64, distance: float) -> Float64:
+    """[K] how far what a camera sees, at a distance, moves across the picture, from the view before or to the view
+    after: radians."""
+    steps = np.linalg.norm(np.diff(centers_of(poses), axis=0), axis=1) / distance + _angles(poses[1:], poses[:-1])
     padded = np.concatenate([steps[:1], steps, steps[-1:]])
     return np.round(np.maximum(padded[:-1], padded[1:]), _DIGITS)
 

@@ -28,8 +28,9 @@ _WIDER = 0.8
 def along(cameras: Cameras, *, frames: int) -> tuple[Camera, ...]:
     """Cameras on a smooth way through the input views in their order, which begins at the first and ends at the last.
 
-    Places lie on a cubic spline, rotations on one whose angular velocity is smooth; the intrinsics are those of the
-    nearest view, at the first one's size. frames: how many; 0 = the input views themselves.
+    Places lie on a cubic spline, rotations on one whose angular velocity is smooth; the lens is that of the nearest
+    view, fitted into the first one's size where its photo has another. frames: how many; 0 = the input views
+    themselves.
     """
     views = cameras_by_view(cameras)
     if not frames or len(views) < 2:
@@ -43,7 +44,7 @@ def along(cameras: Cameras, *, frames: int) -> tuple[Camera, ...]:
     turns = RotationSpline(at, Rotation.from_matrix(cameras.world_to_camera[:, :3, :3]))(times).as_matrix()
     found = []
     for time, center, turn in zip(times, centers, turns, strict=True):
-        lens = views[round(time)].scaled(first.width, first.height)
+        lens = views[round(time)].fitted(first.width, first.height)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turn, -turn @ center
         found.append(replace(lens, world_to_camera=pose))

@@ -45,7 +45,8 @@ def descriptor_picture(scene: Gaussians, dense: DenseDescriptors, cameras: Camer
     first = camera_of(cameras, int(chosen[0]))
     shrink = min(1.0, _MAX_WIDTH / first.width)
     size = max(1, round(first.width * shrink)), max(1, round(first.height * shrink))
-    views = [render(coloured, camera_of(cameras, int(view)).scaled(*size)).rgb for view in chosen]
+    shown = [camera_of(cameras, int(view)).fitted(first.width, first.height).scaled(*size) for view in chosen]
+    views = [render(coloured, camera).rgb for camera in shown]
     return np.asarray(np.clip(np.concatenate(views, axis=1), 0, 1) * 255 + 0.5, np.uint8)
 
 

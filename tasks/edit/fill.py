@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,13 +19,13 @@ from ss_flow.tasks.artifacts import (
     PointCloud,
     UInt8,
 )
+from ss_flow.tasks.edit.flat_surfaces import FlatSurface, flat_surfaces
 from ss_flow.tasks.edit.holes import Measured, Remains, Uncovered, uncovered
 from ss_flow.tasks.edit.operations import edited
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
-from ss_flow.tasks.geometry.shape import plane_through
 
 _NEARBY = 0.5
 """How far around the box of what has left the surfaces are looked for, as a share of its diagonal."""
@@ -45,19 +45,11 @@ _NEAR = 4.0
 """How far from filled places Gaussians may hide that no view has shaped, in spacings."""
 _FAINT = 0.1
 """Weight in every pixel up to which no view can have shaped a Gaussian."""
-_COVERED = 0.5
-"""Share of the convex hull of a plane's points that must hold points; what has less is no surface."""
 _DEPTH_ERROR = 0.02
 """Of a depth map, as a share of the depth."""
-_MOST_PLANES = 4
-"""Of each place that something left."""
-_TRIALS = 300
-_FEWEST = 30
-"""Points below which nothing is called a plane."""
 _LENDERS = 32
 """Points that lend a filled place their colour."""
 _OPACITY = 0.95
-_LARGEST_BLOCK = 20_000
 
 
 @task(name="edit.fill", resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=backend_identity)
@@ -91,12 +83,12 @@ def fill(
     arounds = [_around(remains, box) for box in _places_left(before, instances, _TOUCHING * spacing)]
     near = points.points[np.concatenate(arounds)].astype(np.float64)
     thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))
-    planes = [plane for around in arounds for plane in _planes(points, around, thickness)]
+    planes = [plane for around in arounds for plane in flat_surfaces(points, around, thickness)]
     places, plane_of = _behind(views, planes, spacing, thickness)
     solid = ~_seen_through(places, cameras, measured.depths, thickness)
     places, plane_of = places[solid], plane_of[solid]
     chosen = _one_a_cube(places, spacing)
-    chosen = chosen[_farther(places[chosen], after.means[after.filled > 0], spacing)]
+    chosen = chosen[~_within(places[chosen], after.means[after.filled > 0], spacing)]
     places, plane_of = places[chosen], plane_of[chosen]
     if not len(places):
         return after
@@ -109,22 +101,6 @@ def fill(
     stayed = np.isin(shaped.instance_id, before.instance_id) & ~np.isin(shaped.instance_id, instances)
     filling = _flat(places, colors, plane_of, planes, spacing)
     return concatenate([shaped, _with_ids_of(select(shaped, stayed), filling)])
-
-
-@dataclass(frozen=True)
-class _Plane:
-    centre: Float64
-    normal: Float64
-    axes: Float64
-    """[2, 3] unit, in the plane."""
-    rows: Int32
-    """[I] its points, as rows of the dense points."""
-    flat: Float64
-    """[I, 2] where these lie in the plane."""
-
-    def flattened(self, places: Float64) -> Float64:
-        """[M, 2] where points [M, 3] fall on the plane."""
-        return (places - self.centre) @ self.axes.T
 
 
 def _places_left(before: EditedScene, instances: tuple[int, ...], reach: float) -> list[Float64]:
@@ -166,68 +142,9 @@ def _roughness(places: Float64, reach: float) -> float:
     return float(np.median(off)) if off else 0.0
 
 
-def _planes(points: PointCloud, rows: Int32, thickness: float) -> list[_Plane]:
-    """The planes that some of the dense points lie on, the largest first; each point on one of them at most."""
-    places, spacing = points.points[rows].astype(np.float64), points.spacing
-    rng = np.random.default_rng(0)
-    rest = np.arange(len(places), dtype=np.int32)
-    least = max(_FEWEST, len(places) // 20)
-    found: list[_Plane] = []
-    for _ in range(_MOST_PLANES):
-        if len(rest) < least:
-            break
-        own = places[rest]
-        sample = own[:: max(1, len(own) // _LARGEST_BLOCK)]
-        best, support = None, 0
-        for triple in rng.integers(0, len(own), (_TRIALS, 3)):
-            a, b, c = own[triple]
-            normal = np.cross(b - a, c - a)
-            length = float(np.linalg.norm(normal))
-            if length == 0:
-                continue
-            count = int((np.abs((sample - a) @ (normal / length)) <= thickness).sum())
-            if count > support:
-                best, support = (a, normal / length), count
-        if best is None:
-            break
-        for _ in range(2):
-            near = np.abs((own - best[0]) @ best[1]) <= thickness
-            best = plane_through(own[near])
-        near = np.abs((own - best[0]) @ best[1]) <= thickness
-        if near.sum() < least:
-            break
-        centre, normal = best
-        axes = np.linalg.svd(own[near] - centre, full_matrices=False)[2][:2]
-        flat = (own[near] - centre) @ axes.T
-        together = _largest_piece(flat, spacing)
-        piece = flat[together]
-        if piece[:, 1].std() > thickness and _coverage(piece, spacing) >= _COVERED:
-            found.append(_Plane(centre, normal, axes, rows[rest[near][together]], piece))
-        rest = rest[~near]
-    return found
-
-
-def _largest_piece(flat: Float64, spacing: float) -> Bool:
-    """[I] which points [I, 2] lie on the largest connected piece: a plane also cuts other surfaces far away."""
-    from scipy.ndimage import label
-
-    cells = np.floor(flat / (2 * spacing)).astype(np.int64)
-    cells -= cells.min(axis=0)
-    held = np.zeros(cells.max(axis=0) + 1, bool)
-    held[tuple(cells.T)] = True
-    piece = label(held, np.ones((3, 3)))[0][tuple(cells.T)]
-    return piece == np.bincount(piece).argmax()
-
-
-def _coverage(flat: Float64, spacing: float) -> float:
-    """The share of the convex hull of points [I, 2] that is less than about two spacings from one."""
-    from scipy.spatial import ConvexHull
-
-    cells = np.unique(np.floor(flat / (2 * spacing)), axis=0)
-    return len(cells) * (2 * spacing) ** 2 / float(ConvexHull(flat).volume)
-
-
-def _behind(views: list[Uncovered], planes: list[_Plane], spacing: float, thickness: float) -> tuple[Float64, Int32]:
+def _behind(
+    views: list[Uncovered], planes: list[FlatSurface], spacing: float, thickness: float
+) -> tuple[Float64, Int32]:
     """Where the rays of pixels first meet a plane behind what was there, and it was not seen: [M, 3] world, and [M]
     which plane; one of the places of each view in each cube of the spacing."""
     from scipy.spatial import Delaunay, cKDTree
@@ -284,40 +201,32 @@ def _came_to_light(
     of those that lie far from every measured point that remains, inside of what has left, say, all that are faint in
     all views.
     """
-    from scipy.spatial import cKDTree
-
     stays = ~np.isin(before.instance_id, instances) & np.isin(before.instance_id, after.instance_id)
     rest = select(before, stays)
     reach = _NEAR * measured.points.spacing
-
-    def within(of: Float32 | Float64) -> Bool:
-        near: Bool = cKDTree(of).query(rest.means, distance_upper_bound=reach, workers=1)[0] <= reach
-        return near
-
     with_it, without = np.zeros(len(before), np.float32), np.zeros(len(rest), np.float32)
     for view in views:
         np.maximum(with_it, render(before, view.camera).max_contribution, out=with_it)
         np.maximum(without, render(rest, view.camera).max_contribution, out=without)
     small = rest.log_scales.max(axis=1, initial=-np.inf) < np.log(reach)
     grown = without > 2 * with_it[stays]
-    alone = grown & ~within(measured.points.points[Remains.of(measured, gone).rows])
+    alone = grown & ~_within(rest.means, measured.points.points[Remains.of(measured, gone).rows], reach)
     if alone.any():
         for number in range(len(measured.cameras)):
             np.maximum(with_it, render(before, camera_of(measured.cameras, number)).max_contribution, out=with_it)
     came = np.zeros(len(after), bool)
     stayed = np.flatnonzero(~np.isin(after.instance_id, instances))[: len(rest)]  # what is new comes last
-    came[stayed] = (rest.filled == 0) & ((grown & small & within(places)) | (alone & (with_it[stays] < _FAINT)))
+    beside = grown & small & _within(rest.means, places, reach)
+    came[stayed] = (rest.filled == 0) & (beside | (alone & (with_it[stays] < _FAINT)))
     return came
 
 
-def _farther(places: Float64, others: Float32, distance: float) -> Bool:
-    """[M] which places [M, 3] are farther than a distance from all others."""
+def _within(places: Float32 | Float64, others: Float32 | Float64, distance: float) -> Bool:
+    """[M] which places [M, 3] are no farther than a distance from another one of these."""
     from scipy.spatial import cKDTree
 
-    if not len(others):
-        return np.ones(len(places), bool)
-    far: Bool = cKDTree(others).query(places, workers=1)[0] > distance
-    return far
+    near: Bool = cKDTree(others).query(places, distance_upper_bound=2 * distance, workers=1)[0] <= distance
+    return near
 
 
 def _one_a_cube(places: Float64, side: float) -> Int32:
@@ -334,7 +243,7 @@ def _colors(places: Float64, points: PointCloud, rows: Int32) -> UInt8:
     return np.median(points.colors[rows[near]], axis=1).astype(np.uint8)
 
 
-def _flat(places: Float64, colors: UInt8, plane_of: Int32, planes: list[_Plane], spacing: float) -> EditedScene:
+def _flat(places: Float64, colors: UInt8, plane_of: Int32, planes: list[FlatSurface], spacing: float) -> EditedScene:
     """Gaussians that lie in their planes: a spacing wide (one standard deviation), a fifth of it thick."""
     from scipy.spatial.transform import Rotation
 

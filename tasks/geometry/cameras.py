@@ -53,6 +53,21 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def fitted(self, width: int, height: int) -> Camera:
+        """The same camera with an image of another shape, which nothing stretches: what it showed lies in the middle,
+        as large as it fits, and beside it, or above and below, there is more to be seen."""
+        scale = min(width / self.width, height / self.height)
+        left, top = (width - scale * self.width) / 2, (height - scale * self.height) / 2
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=scale * self.fx,
+            fy=scale * self.fy,
+            cx=scale * self.cx + left,
+            cy=scale * self.cy + top,
+        )
+
     def cropped(self, x0: int, y0: int, x1: int, y1: int) -> Camera:
         """The same camera with only the pixels x0 <= u < x1, y0 <= v < y1; the principal point may fall outside."""
         return replace(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64
+from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32
 from ss_flow.tasks.geometry.cameras import centers_of
 
 Plane = tuple[Float64, Float64]
@@ -36,6 +36,12 @@ def plane_through(points: Float64) -> Plane:
 def axes_in(normal: Float64) -> Float64:
     """[2, 3] two directions of length 1 in the planes with this normal [3], across each other."""
     return np.linalg.svd(normal[None])[2][1:]
+
+
+def sector_of(flat: Float64, count: int) -> Int32:
+    """[N] in which of so many equal directions round the origin points [N, 2] lie, from the first axis on."""
+    turn = np.arctan2(flat[:, 1], flat[:, 0]) / (2 * np.pi) % 1
+    return (turn * count).astype(np.int32) % count
 
 
 def on_plane(points: Float64, plane: Plane, thickness: float) -> Bool:

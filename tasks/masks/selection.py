@@ -85,28 +85,32 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     fits[:, labels == 0] = 0
     rank = np.round(fits * pool.quality[order, None], 9)
 
-    chosen: dict[int, Bool] = {}
     shown: dict[int, Bool] = {}
     pairs = sorted(
         zip(*np.nonzero((fits > 0) & (fits >= params.min_iou)), strict=True), key=lambda p: (-rank[p], p[::-1])
     )
     free = np.ones(len(dense), bool)
     for row, column in pairs:
-        if free[row] and column not in chosen:
+        if free[row] and int(labels[column]) not in shown:
             free[row] = False
-            chosen[column], shown[int(labels[column])] = dense[row].ravel()[painted.pixel], dense[row]
+            shown[int(labels[column])] = dense[row]
 
     # An occluder may cut an object in two: what is left joins where it fits.
-    for column in sorted(chosen):
-        mine, label = index == column, int(labels[column])
-        for row in np.flatnonzero(free & (count.argmax(axis=1) == column)):
-            both = chosen[column] | dense[row].ravel()[painted.pixel]
-            added = dense[row] & ~shown[label]
-            backed = (mine & both & ~chosen[column]).sum() / max(1, added.sum())
-            dense_enough = backed >= _BACKED * (mine & chosen[column]).sum() / shown[label].sum()
-            before, after = (weighted_iou(one, mine, painted.area) for one in (chosen[column], both))
-            if dense_enough and after > before:
+    most = labels[count.argmax(axis=1)]
+    for label in sorted(shown):
+        for row in np.flatnonzero(free & (most == label)):
+            both = shown[label] | dense[row]
+            if _is_better(painted, label, both, shown[label]):
                 free[row] = False
-                chosen[column] = both
-                shown[label] = shown[label] | dense[row]
+                shown[label] = both
     return shown
+
+
+def _is_better(painted: PaintedView, label: int, mask: Bool, part: Bool) -> bool:
+    """Whether a mask [H, W] shows a label better than a part of it does, and what it adds is backed by points."""
+    mine = painted.label == label
+    after, before = (one.ravel()[painted.pixel] for one in (mask, part))
+    backed = (mine & after & ~before).sum() / max(1, (mask & ~part).sum())
+    if backed < _BACKED * (mine & before).sum() / part.sum():
+        return False
+    return weighted_iou(after, mine, painted.area) > weighted_iou(before, mine, painted.area)

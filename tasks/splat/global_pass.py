@@ -12,7 +12,7 @@ import numpy as np
 
 from ss_flow.running import counted, nothing_kept
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Gaussians, Int32, LabelMap
+from ss_flow.tasks.artifacts import Float32, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.trainer import PartView, TrainParams, train
@@ -60,7 +60,8 @@ def global_pass(
     scene: as `assemble` gives it. masks: exclusive label maps of all views. visibility: how far depths of one surface
     may differ. Opacities are kept and nothing is split or cloned. The loss is that of a pair (Eq. 5, 6), here
     `global_objective` and `global_mask_weight` times the mask loss, and `side_weight` times what an instance covers
-    beside its surface (`side_views`); the guard of `merge_pair` holds here too.
+    beside its surface (`side_views`); the guard of `merge_pair` holds here too. A scene of which no
+    mask shows anything comes back as it is.
 
     After `relabel_after` steps the scene shows what belongs to what better than the masks do. So a Gaussian whose place
     shows another instance in most views becomes that one's, and only then is each instance looked at from the side. In
@@ -71,9 +72,31 @@ def global_pass(
     ids = np.unique(scene.instance_id)
     compared = views.compared(visibility)
     seen = _whole_views(compared, masks, ids, params.crop.max_side)
+    if not seen:
+        return scene
     first = params.relabel_after if params.relabel_after < params.global_iterations else 0
-    settings = TrainParams(
-        iterations=params.global_iterations - first,
+    settings = _settings(params, params.global_iterations - first)
+    surface, begun, shown = scene, scene, masks
+    if first:
+        with nothing_kept(), counted(0, params.global_iterations):
+            begun = _trained(scene, seen, ids, _opening(settings, first), params, extent(scene, seen, params))
+        shown = tuple(shown_masks(views, begun, masks))
+        surface = relabelled(compared, scene, shown)
+        labels = {name: getattr(surface, name) for name in ("instance_id", "instance_conf", "part_id")}
+        surface, begun = by_instance(surface), by_instance(replace(begun, **labels))
+    parts: list[PartView] = []
+    if params.side_weight:
+        parts = side_views(compared, surface, shown, params.side_views, params.global_iterations)
+    with counted(first, params.global_iterations):
+        finished = _trained(begun, seen, ids, settings, params, extent(surface, seen, params), parts)
+    if first:
+        finished = by_instance(without_strays(views.cameras, finished, shown))
+    return guarded(scene, finished, seen, ids, params)
+
+
+def _settings(params: MergeParams, steps: int) -> TrainParams:
+    return TrainParams(
+        iterations=steps,
         sh_degree=params.sh_degree,
         sh_every=params.sh_every,
         objective=params.global_objective,
@@ -87,34 +110,6 @@ def global_pass(
         rates=params.rates,
     )
 
-    def trained(begun: Gaussians, settings: TrainParams, parts: Sequence[PartView] = ()) -> Gaussians:
-        return train(
-            begun,
-            seen,
-            params=settings,
-            extent=extent(surface, seen, params),
-            seed=params.seed << 32,
-            label_ids=ids.tolist(),
-            parts=parts,
-        ).gaussians
-
-    surface, begun, shown = scene, scene, masks
-    if first:
-        with nothing_kept(), counted(0, params.global_iterations):
-            begun = trained(scene, _opening(settings, first))
-        shown = tuple(shown_masks(views, begun, masks))
-        surface = relabelled(compared, scene, shown)
-        labels = {name: getattr(surface, name) for name in ("instance_id", "instance_conf", "part_id")}
-        surface, begun = by_instance(surface), by_instance(replace(begun, **labels))
-    parts: list[PartView] = []
-    if params.side_weight:
-        parts = side_views(compared, surface, shown, params.side_views, params.global_iterations)
-    with counted(first, params.global_iterations):
-        finished = trained(begun, settings, parts)
-    if first:
-        finished = by_instance(without_strays(views.cameras, finished, shown))
-    return guarded(scene, finished, seen, ids, params)
-
 
 def _opening(settings: TrainParams, steps: int) -> TrainParams:
     """For the steps before labels are given anew: nothing falls, and every Gaussian stays."""
@@ -126,6 +121,20 @@ def _opening(settings: TrainParams, steps: int) -> TrainParams:
         prune_opacity=0.0,
         prune_contribution=0.0,
     )
+
+
+def _trained(
+    begun: Gaussians,
+    seen: Sequence[TrainView],
+    ids: Int32,
+    settings: TrainParams,
+    params: MergeParams,
+    extent: float | Float32,
+    parts: Sequence[PartView] = (),
+) -> Gaussians:
+    """extent, parts: as `train` takes them."""
+    seed, labels = params.seed << 32, ids.tolist()
+    return train(begun, seen, params=settings, extent=extent, seed=seed, label_ids=labels, parts=parts).gaussians
 
 
 def _whole_views(scene: SceneViews, masks: Sequence[LabelMap], ids: Int32, max_side: int) -> list[TrainView]:

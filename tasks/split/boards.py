@@ -14,7 +14,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import Plane, axes_in, box_diagonal, middle_of, refitted, thinned, towards
+from ss_flow.tasks.geometry.shape import Plane, axes_in, box_diagonal, middle_of, refitted, sector_of, thinned, towards
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.touching import TouchingParams
@@ -149,8 +149,7 @@ class _Relief:
         within = np.flatnonzero(~self.low & (self._over <= self._over[~self.low].min() + foot * self.rise))
         off = self._flat - np.median(self._flat[within], axis=0)
         distance = np.hypot(*off.T)
-        turn = np.arctan2(off[:, 1], off[:, 0]) / (2 * np.pi) % 1
-        sector = (turn * _SECTORS).astype(np.int32) % _SECTORS
+        sector = sector_of(off, _SECTORS)
         reach = [distance[within[sector[within] == one]] for one in range(_SECTORS)]
         return sector, distance, np.array([np.quantile(far, _OUTLINE) if len(far) else 0.0 for far in reach])
 

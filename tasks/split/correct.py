@@ -9,7 +9,17 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, Clicks, Float64, Int32, MaskSet, PointCloud, PointLabels, Visibility
+from ss_flow.tasks.artifacts import (
+    Bool,
+    Clicks,
+    Float64,
+    Hierarchy,
+    Int32,
+    MaskSet,
+    PointCloud,
+    PointLabels,
+    Visibility,
+)
 from ss_flow.tasks.geometry.images import at_diagonal
 from ss_flow.tasks.masks.painting import PaintedView, nearest_labels, paint_labels
 from ss_flow.tasks.masks.pool import canonical_order, mask_tree
@@ -134,6 +144,30 @@ def part_masks(
         stability=masks.stability[rows],
         grid=masks.grid[rows],
         parent=mask_tree(found[order], contained),
+    )
+
+
+@task(name="split.corrected_tree")
+def corrected_tree(tree: Hierarchy, before: PointLabels, after: PointLabels) -> Hierarchy:
+    """The tree with the instances that `correct` or `part_boards` made of others, as nodes without children.
+
+    before, after: the instances before and since. A new one is stuff where more than half of its points were, and part
+    of the group that all it is made of were part of. Where there is no new one the tree comes back as it is.
+    """
+    row_of, names = tree.row_of(), np.setdiff1d(after.label, np.append(tree.node, 0)).astype(np.int32)
+    made_of = [np.unique(before.label[after.label == name], return_counts=True) for name in names]
+    rows = [np.array([row_of[old] for old in olds.tolist()]) for olds, _ in made_of]
+    parents = [tree.parent[own] for own in rows]
+    parent = [int(of[0]) if (of == of[0]).all() else 0 for of in parents]
+    stuff = [
+        bool(2 * (tree.stuff[own] * size).sum() > size.sum()) for own, (_, size) in zip(rows, made_of, strict=True)
+    ]
+    leaves = int((~np.isin(tree.node, tree.parent)).sum())  # which come first
+    return Hierarchy(
+        np.insert(tree.node, leaves, names),
+        np.insert(tree.parent, leaves, parent),
+        np.insert(tree.agreement, leaves, np.ones(len(names))),
+        np.insert(tree.stuff, leaves, stuff),
     )
 
 

@@ -36,8 +36,9 @@ def cut(labels: PointLabels, tree: Hierarchy, *, granularity: float) -> PointLab
 def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) -> PointParts:
     """The parts of the instances: the labels that each is made of, and the parts of those.
 
-    labels: the leaves; parts: theirs; instances: the same points after the cut. Numbered from the largest part on in
-    each instance. An instance that is a single label keeps its parts as they are.
+    labels: the leaves; parts: theirs; instances: the same points after the cut, and as boards and corrections divided
+    them. Numbered from the largest part on in each instance. An instance that is a single label keeps its parts as they
+    are; one that is a piece of a single label has of its parts those that it holds.
     """
     pair = np.stack([instances.label, labels.label, parts.part], axis=1)
     found, row, size = np.unique(pair, axis=0, return_inverse=True, return_counts=True)
@@ -45,6 +46,8 @@ def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) ->
     number = np.where(alone, found[:, 2], 0)
     for instance in np.unique(found[~alone, 0]):
         rows = np.flatnonzero(found[:, 0] == instance)
+        if (found[rows, 1] == found[rows[0], 1]).all():  # what is no part of the label is none of its piece
+            rows = rows[found[rows, 2] > 0]
         number[rows[np.argsort(-size[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
     return PointParts(number[row].astype(np.int32))
 

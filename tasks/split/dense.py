@@ -118,14 +118,15 @@ def _one_of_few(side: float, to_integer: np.ufunc) -> float:
 
 
 def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
-    """Median side, in world units, of the surface patch that a depth pixel covers when it is looked at head-on."""
+    """Median side, in world units, of the surface patch that a depth pixel covers when it is looked at head-on;
+    infinite where no depth is known."""
     sides = []
     for view, depth in enumerate(depths):
         known = depth.depth[depth.depth > 0]
         if known.size:
             height, width = depth.depth.shape
             sides.append(float(np.median(known)) / camera_of(cameras, view).scaled(width, height).fx)
-    return float(np.median(sides))
+    return float(np.median(sides)) if sides else np.inf
 
 
 def depth_samples(frame: Frame, cameras: Cameras, view: int, depth: DepthMap) -> VoxelSums:

@@ -21,6 +21,7 @@ from ss_flow.tasks.geometry.shape import (
     middle_of,
     on_plane,
     plane_of_most,
+    sector_of,
     thinned,
     towards,
 )
@@ -111,9 +112,8 @@ class Supports:
         foot = lies[height <= np.quantile(height, _FOOT)]
         middle = foot.mean(axis=0)
         reach = np.quantile(np.linalg.norm(foot - middle, axis=1), 0.9) + extent / 2
-        x, y = (ground[np.linalg.norm(ground - middle, axis=1) <= reach] - middle).T
-        sector = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS) % _SECTORS
-        return len(np.unique(sector)) >= _ROUND * _SECTORS
+        beside = ground[np.linalg.norm(ground - middle, axis=1) <= reach] - middle
+        return len(np.unique(sector_of(beside, _SECTORS))) >= _ROUND * _SECTORS
 
     @property
     def _thickness(self) -> float:

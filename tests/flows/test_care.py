@@ -18,10 +18,11 @@ from tiny_runs import bytes_of, run_tiny, ss_flow
 from ss_flow.cache.collect import collect
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
-from ss_flow.flows.cli.care import Wanted, size_text
+from ss_flow.flows.cli.care import Wanted
 from ss_flow.graph import stored
 from ss_flow.runs import latest_runs
 from ss_flow.sweep import grid, sweep
+from ss_flow.tasks.words import size_in_words
 
 
 def gc(store, *options):
@@ -287,16 +288,8 @@ def test_room_by_step_and_by_scene_adds_up_to_what_the_files_take(warm):
     assert document["by_scene"]["unreachable"] == {"count": 0, "bytes": 0}
     assert [pin["what"] for pin in document["pins"]] == ["propagate"]
     words = ss_flow("cache", "du", "--by", "step", "--cache", warm.store).out
-    assert (
-        "split.visibility" in words and size_text(files) in words and f"{warm.scene} " not in words.split("pinned")[0]
-    )
-
-
-@pytest.mark.parametrize(
-    ("size", "text"), [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (2_340_000, "2.3 MB"), (10**15, "1000.0 TB")]
-)
-def test_sizes_are_told_in_powers_of_a_thousand(size, text):
-    assert size_text(size) == text
+    assert "split.visibility" in words and size_in_words(files) in words
+    assert f"{warm.scene} " not in words.split("pinned")[0]
 
 
 def test_damage_is_taken_out_and_made_again(warm):

@@ -7,7 +7,7 @@ import pytest
 from tiny_runs import ss_flow
 
 from ss_flow.cache.store import Store
-from ss_flow.flows.describe import as_html, facts, provenance, size_in_words, statistics
+from ss_flow.flows.describe import as_html, facts, provenance, statistics
 from ss_flow.tasks.artifacts import Metrics, PointLabels
 
 
@@ -24,12 +24,6 @@ from ss_flow.tasks.artifacts import Metrics, PointLabels
 )
 def test_statistics_are_of_what_is_finite_and_name_what_is_not(values, said):
     assert statistics(values) == said
-
-
-def test_a_size_is_said_in_the_unit_that_fits():
-    assert [size_in_words(n) for n in (0, 999, 1000, 12_345_678, 5_000_000_000)] == [
-        *("0 B", "999 B", "1 kB", "12.3 MB", "5 GB")
-    ]
 
 
 def test_every_field_is_told_with_its_schema():

@@ -189,7 +189,7 @@ def test_without_a_place_chosen_instances_have_their_ids_in_the_name_and_leave_t
 def test_a_small_file_is_told_in_thousands_of_bytes(tiny, tmp_path):
     told = export(tiny, "--format", "ply", "--instance", str(ids_of(tiny)[0]), "--out", tmp_path / "a.ply").out
     size = (tmp_path / "a.ply").stat().st_size
-    assert size < 1e6 and f"1 file, {size / 1e3:.1f} kB)" in told
+    assert size < 1e6 and f"1 file, {size / 1e3:.3g} kB)" in told
 
 
 def test_a_glb_is_not_written_under_the_name_of_gltfs_other_form(tiny, tmp_path):

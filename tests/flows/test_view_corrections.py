@@ -122,6 +122,8 @@ def test_a_joined_pair_is_parted_and_a_broken_thing_joined_and_only_what_depends
     kept = {e["id"] for e in run.instances["instances"]} & {e["id"] for e in corrected.instances["instances"]}
     assert 0 < computed["splat.reconstruct"] < len(corrected.instances["instances"])
     assert len(kept) == len(run.instances["instances"]) - 3  # the pair, and both halves
+    known = corrected.results.one("hierarchy").node.tolist()
+    assert {e["id"] for e in corrected.instances["instances"]} <= {*known}  # so that kinds and groups are told of all
 
     gone_on = Corrections(corrected, hints)
     assert not gone_on.unsaved and gone_on.told() == [] and gone_on.thing == 4

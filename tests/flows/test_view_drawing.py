@@ -26,7 +26,7 @@ from ss_flow.tasks.artifacts import Metrics
 from ss_flow.tasks.gaussians.densification import rotations
 from ss_flow.tasks.gaussians.initialise import initialise
 from ss_flow.tasks.gaussians.native_pass import NEAR_PLANE
-from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
+from ss_flow.tasks.geometry.cameras import camera_extent, camera_of, cameras_by_view, pixels_in_view
 
 viser = pytest.importorskip("viser", reason="needs the extra `view`")
 
@@ -111,6 +111,16 @@ def test_the_first_view_is_the_photo_that_shows_most(around):
     ahead = first.look_at - first.position
     np.testing.assert_allclose(ahead / np.linalg.norm(ahead), best.world_to_camera[2, :3], atol=1e-6)
     assert first.up @ -best.world_to_camera[1, :3] > 0.7
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1, 1e3])
+def test_where_no_photo_shows_anything_the_first_view_looks_as_far_as_the_cameras_stand_apart(around, unit):
+    poses = around.cameras.world_to_camera.copy()
+    poses[:, :3, 3] *= unit
+    cameras = replace(around.cameras, world_to_camera=poses)
+    first = start_view(cameras, np.zeros((0, 3), np.float32))
+    ahead = np.linalg.norm(first.look_at - first.position)
+    assert ahead == pytest.approx(camera_extent(cameras_by_view(cameras)), rel=1e-5)
 
 
 def test_an_object_is_looked_at_whole_from_the_side_that_a_photo_saw(results, around):

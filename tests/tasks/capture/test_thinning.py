@@ -136,6 +136,22 @@ def test_where_lengths_are_no_metres_the_cameras_tell_how_far_off_things_are(sca
     assert len(taken(round_a_thing(scale, False))) == pytest.approx(len(taken(round_a_thing(1.5, True))), abs=1)
 
 
+@pytest.mark.parametrize("scale", [2.0**-10, 2.0**10])
+def test_where_lengths_are_no_metres_the_same_views_are_taken_whatever_the_unit(scale):
+    # It turns in jerks and walks in jerks, at other times: which of both counts more tells where it is steadiest.
+    rng = np.random.default_rng(0)
+    turns, steps = np.cumsum(rng.exponential(0.01, (2, 500)) ** 2 * 40, axis=1)
+    scene = recording(turns, np.zeros(500), metric=False)
+    places = np.stack([steps, np.sqrt(steps), 0 * steps], axis=1)
+
+    def taken_at(size):
+        poses = scene.world_to_camera.copy()
+        poses[:, :3, 3] = -np.einsum("kij,kj->ki", poses[:, :3, :3], size * places)
+        return taken(replace(scene, poses=tuple(tuple(pose.ravel().tolist()) for pose in poses)))
+
+    assert taken_at(scale) == taken_at(1.0)
+
+
 @pytest.mark.parametrize("preset, count", [("default", 20), ("fast", 20), ("paper", 301), ("reference", 301)])
 def test_a_run_takes_all_of_300_views_and_thins_more_unless_its_preset_is_the_papers(preset, count, tmp_path):
     root = made.nerfstudio(tmp_path / "capture")

@@ -36,6 +36,22 @@ def test_a_path_goes_through_the_input_views_and_is_smooth_between():
     assert turns.max() < 0.2 * np.linalg.norm(steps, axis=1).mean()
 
 
+def test_photos_of_another_shape_are_fitted_into_the_film_and_not_stretched():
+    upright = CIRCLE.sizes.copy()
+    upright[:] = 96, 54
+    upright[3] = 54, 96
+    middles = CIRCLE.intrinsics.copy()
+    middles[:, 2:] = upright / 2
+    path = along(replace(CIRCLE, sizes=upright, intrinsics=middles), frames=len(CIRCLE))
+    assert {(camera.width, camera.height) for camera in path} == {(96, 54)}
+    assert all(camera.fx == camera.fy for camera in path)
+    # All that the upright photo shows is in the picture: it is 96 rows high, which 54 rows now show.
+    assert path[3].fy == pytest.approx(CIRCLE.intrinsics[3, 1] * 54 / 96) and (path[3].cx, path[3].cy) == (48, 27)
+    assert [camera.fx for camera in path if camera is not path[3]] == CIRCLE.intrinsics[
+        [0, 1, 2, 4, 5, 6, 7], 0
+    ].tolist()
+
+
 def test_a_single_view_is_its_own_path():
     one = made_cameras(((0, -3, 0),))
     assert len(along(one, frames=30)) == 1

@@ -9,7 +9,8 @@ import numpy as np
 from made_gaussians import made_cameras, made_gaussians
 
 from ss_flow.tasks.artifacts import FROM_PICTURES, NO_VECTOR, DenseDescriptors
-from ss_flow.tasks.deliver.descriptors import principal_colours, write_descriptors
+from ss_flow.tasks.deliver.descriptors import descriptor_picture, principal_colours, write_descriptors
+from ss_flow.tasks.gaussians.initialise import select
 
 
 def made(count: int, seed: int = 0) -> DenseDescriptors:
@@ -37,6 +38,22 @@ def test_the_same_vectors_give_the_same_bytes(tmp_path):
         write_descriptors(tmp_path / name, made_gaussians(300, 0), made(300), made_cameras())
     for file in ("descriptors.npz", "descriptors.png"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+
+
+def test_views_of_another_shape_are_not_stretched():
+    ball = select(made_gaussians(3, 0), np.arange(1))
+    ball = replace(
+        ball, means=0 * ball.means, log_scales=0 * ball.log_scales - 1.5, opacity_logits=0 * ball.means[:, 0] + 5
+    )
+    cameras = made_cameras()
+    cameras = replace(cameras, sizes=np.array([[96, 60], [60, 96]], np.int32))
+    cameras = replace(cameras, intrinsics=np.concatenate([cameras.intrinsics[:, :2], cameras.sizes / 2], axis=1))
+    dense = DenseDescriptors(ball.instance_id, np.zeros((1, 5), np.float32), np.zeros(1, np.uint8), "made")
+    picture = descriptor_picture(ball, dense, cameras)
+    assert picture.shape == (60, 2 * 96, 3)
+    for shown in (picture[:, :96], picture[:, 96:]):
+        wide, high = (np.count_nonzero(shown.max(axis=(axis, 2)) > 40) for axis in (0, 1))
+        assert wide == high > 8
 
 
 def test_colours_are_the_directions_in_which_the_vectors_differ_most():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ss_flow.tasks.geometry.shape import plane_of_most, plane_through
+from ss_flow.tasks.geometry.shape import plane_of_most, plane_through, sector_of
 
 
 @pytest.mark.parametrize("away", [5, -5])
@@ -27,3 +27,10 @@ def test_few_points_lie_on_the_plane_through_them(count):
     points = np.array([(0.0, 0, 2), (1, 0, 2), (0, 3, 2), (5, 1, 2)])[:count]
     centre, normal = plane_through(points)
     assert np.allclose((points - centre) @ normal, 0) and np.isclose(np.linalg.norm(normal), 1)
+
+
+def test_directions_are_told_from_the_first_axis_on_all_round():
+    angle = np.radians([0, 44, 46, 134, 136, 179, 181, 226, 314, 316, 359, -1, -179])
+    places = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.linspace(0.1, 9, len(angle))[:, None]
+    assert sector_of(places, 4).tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 3, 3, 3, 3, 2]
+    assert sector_of(np.array([[1.0, -1e-300]]), 24).tolist() == [0]  # a turn short of a whole one by nothing

@@ -38,6 +38,11 @@ def test_a_last_pass_of_no_steps_and_of_nothing_changes_nothing(built):
     assert len(global_pass(built.views, NO_GAUSSIANS, built.scene.maps, params=MERGE)) == 0
 
 
+def test_what_no_mask_shows_comes_back_as_it_is(built):
+    empty = tuple(replace(one, ids=np.zeros_like(one.ids)) for one in built.scene.maps)
+    assert global_pass(built.views, built.ball, empty, params=MERGE) is built.ball
+
+
 def test_the_last_pass_gives_gaussians_to_the_instance_that_photos_show_there(built):
     ball = replace(built.ball, instance_id=np.where(np.arange(len(built.ball)) % 6, 2, 1).astype(np.int32))
     scene = assemble((built.background, built.box, ball))

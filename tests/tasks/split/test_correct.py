@@ -10,9 +10,9 @@ from box_scene import row_of_points
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ss_flow.tasks.artifacts import Clicks, PointCloud, PointLabels, Visibility
+from ss_flow.tasks.artifacts import Clicks, Hierarchy, PointCloud, PointLabels, Visibility
 from ss_flow.tasks.masks.pool import mask_set
-from ss_flow.tasks.split.correct import clicked_points, correct, part_masks
+from ss_flow.tasks.split.correct import clicked_points, correct, corrected_tree, part_masks
 
 SIDE = 12
 NAMES = ("mug", "box", "cup", "jug")
@@ -148,6 +148,37 @@ WHOLE = mask_set("0", np.ones((1, SIDE, SIDE), bool), np.ones(1, np.float32), "s
 """A mask over the whole sheet."""
 HALVES = labelled(np.where(left(), 10, 11), num_labels=11)
 """The sheet divided, of which `ONE` is the instance."""
+
+
+# 5 = {1, 2} is a thing, 6 = {5, 3} a group; 4 and 7 are walls of one stuff, 8 = {4, 7}.
+TREE = Hierarchy(
+    np.array([1, 2, 3, 4, 7, 5, 6, 8], np.int32),
+    np.array([5, 5, 6, 8, 8, 6, 0, 0], np.int32),
+    np.array([1, 1, 1, 1, 1, 0.8, 0.4, 0.3], np.float32),
+    np.array([0, 0, 0, 1, 1, 0, 0, 1], bool),
+)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "parents", "stuff"),
+    [
+        ([5, 5, 3, 4, 4], [9, 10, 3, 4, 4], [6, 6], [False, False]),  # divided: both are of the group still
+        ([5, 5, 3, 4, 7], [5, 5, 3, 9, 9], [8], [True]),  # walls united are a wall
+        ([5, 5, 3, 4, 4], [9, 9, 9, 4, 4], [6], [False]),  # of one group, which they make up
+        ([5, 5, 3, 4, 4], [5, 5, 9, 9, 4], [0], [False]),  # of two groups; half of it a wall
+        ([5, 5, 3, 4, 0], [5, 5, 3, 4, 0], [], []),
+    ],
+)
+def test_corrected_instances_are_stuff_and_of_the_groups_that_they_were_made_of(before, after, parents, stuff):
+    found = corrected_tree(TREE, labelled(np.array(before)), labelled(np.array(after)))
+    new = np.isin(found.node, TREE.node, invert=True)
+    assert found.node[new].tolist() == sorted({*after} - {*before})
+    assert found.parent[new].tolist() == parents and found.stuff[new].tolist() == stuff
+    for name, values in vars(TREE).items():
+        kept = getattr(found, name)[~new]
+        assert kept.tolist() == values.tolist() and kept.dtype == values.dtype
+    row = found.row_of()
+    assert all(row[int(above)] > own for own, above in enumerate(found.parent) if above)  # children come first
 
 
 def test_a_mask_over_both_halves_of_a_divided_sheet_becomes_two():

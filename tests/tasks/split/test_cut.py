@@ -55,6 +55,14 @@ def test_labels_left_as_they_are_keep_their_parts():
     assert cut_parts(LABELS, parts, cut(LABELS, TREE, granularity=1.0)).part.tolist() == parts.part.tolist()
 
 
+def test_a_piece_of_one_label_is_no_part_of_itself_and_has_the_parts_of_the_label_that_it_holds():
+    parts = PointParts(np.array([0, 0, 2, 1, 2, 0, 0, 0], np.int32))
+    label = np.array([1, 1, 1, 1, 1, 1, 2, 0], np.int32)
+    divided = np.array([8, 8, 9, 9, 9, 9, 2, 0], np.int32)  # label 1, as a board and what hangs on it, or by clicks
+    found = cut_parts(replace(LABELS, label=label), parts, replace(LABELS, label=divided, num_labels=9))
+    assert found.part.tolist() == [0, 0, 1, 2, 1, 0, 0, 0]
+
+
 def test_an_instance_of_most_labelled_points_is_warned_of_and_a_background_or_a_wall_of_most_is_not(recwarn):
     most = replace(LABELS, label=np.array([0, 0, 0, 0, 0, 1, 1, 4], np.int32))
     cut(replace(LABELS, label=np.array([0, 0, 0, 0, 0, 1, 2, 4], np.int32)), TREE, granularity=1.0)

@@ -93,6 +93,14 @@ def test_depth_that_is_unknown_everywhere_is_bad_input():
         unit(box_scene.cameras(), blind)
 
 
+def test_depth_of_no_view_gives_no_points_and_says_no_more_than_that(recwarn):
+    # As where a given splat shows nothing, and sparse points alone tell the unit.
+    blind = tuple(DepthMap(d.name, np.zeros_like(d.depth), "rendered") for d in box_scene.depths())
+    with pytest.raises(InputError, match="agree in no point"):
+        dense(box_scene.frames(), box_scene.cameras(), blind, SceneUnit(1.0), params=DenseParams())
+    assert not recwarn.list
+
+
 def test_depth_that_never_agrees_is_bad_input():
     # Two cameras face each other, 10 m apart, and each looks through what the other measures.
     away = np.diag([-1.0, 1.0, -1.0, 1.0])
