@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from flat_patches import BROWN, GREY, RED, SHADE, STEP, WHITE, Patch, patch, scene
+from flat_patches import BROWN, GREY, RED, SHADE, WHITE, Patch, patch, scene
 
 from ss_flow.tasks.artifacts import PointLabels, Tally
 from ss_flow.tasks.split.casts import find_casts
@@ -37,10 +37,11 @@ def test_what_has_another_colour_or_hardly_another_or_is_black_is_none(color):
     assert casts(WALL, patch(color, 0.5, 0, width=0.2), THING) == []
 
 
-def test_what_lies_before_the_wall_is_none():
-    shade = WHITE * SHADE
-    assert casts(WALL, patch(shade, 0.5, 0, 0.5 * STEP, width=0.2)) == [2]
-    assert casts(WALL, patch(shade, 0.5, 0, 3 * STEP, width=0.2)) == []
+def test_what_leaves_the_wall_is_none():
+    places, colors = patch(WHITE * SHADE, 0.5, 0, width=0.2)
+    for slope, found in ((0.0, [2]), (0.1, [2]), (0.6, [])):
+        rising = places + np.array([0.0, 0, slope]) * (places[:, :1] - 0.5)
+        assert casts(WALL, (rising, colors), patch(RED, 0.7, 0, 0.1)) == found
 
 
 def test_what_touches_the_wall_along_a_small_part_of_its_border_is_none():
