@@ -11,6 +11,8 @@ Plane = tuple[Float64, Float64]
 """A point of it [3], and its unit normal [3]."""
 _FEW = 10
 """Points that a plane is not fitted to."""
+_PATCHES = 50
+"""Places of some points at which a plane is fitted to those round it."""
 
 
 def box_diagonal(points: Float32 | Float64, trim: float = 0.005) -> float:
@@ -72,6 +74,15 @@ def plane_of_most(points: Float64, thickness: float, rounds: int) -> Plane:
         distance = np.abs((points - centre) @ normal)
         near = distance <= max(thickness, float(np.median(distance)))
     return centre, normal
+
+
+def planes_of_patches(points: Float64) -> list[Plane]:
+    """Planes through small patches of points [N, 3]: at some 50 places, each with a 50th of the points round it."""
+    from scipy.spatial import cKDTree
+
+    count = max(len(points) // _PATCHES, min(_FEW, len(points)))
+    _, near = cKDTree(points).query(points[:: max(1, len(points) // _PATCHES)], k=count)
+    return [plane_through(points[rows]) for rows in np.reshape(near, (-1, count))]
 
 
 def middle_of(cameras: Cameras) -> Float64:

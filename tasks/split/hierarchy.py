@@ -32,6 +32,7 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
 from ss_flow.tasks.split.agreement import View, agreement_of, views_of
+from ss_flow.tasks.split.casts import find_casts
 from ss_flow.tasks.split.contact import Contact, find_contact
 from ss_flow.tasks.split.edges import convex_edges
 from ss_flow.tasks.split.inlays import Inlays, find_inlays
@@ -122,7 +123,8 @@ def hierarchy(
     looks = Looks(points, cameras, visibility)
     surface = lit_surfaces(looks, labels.label, ends, params.shadows)
     _, surface_of = np.unique(surface[leaves], return_inverse=True)
-    is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)[surface_of]
+    is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)
+    is_stuff = (is_stuff | find_casts(points, labels.label, surface, ends, is_stuff))[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)
     contact = find_contact(ends, labels.label)
     sheets = find_sheets(points, labels, ends, flush=params.flush, height=params.bulge)

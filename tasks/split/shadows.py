@@ -202,12 +202,17 @@ def _step(change: Float64, color: Float64, first: Bool, normal: Float64) -> Step
     lit = first
     if step.mean() > 0:
         step, change, lit = -step, -change, ~first
-    depth = -float(step.mean())
-    if not _DEPTH[0] <= depth <= _DEPTH[1] or np.ptp(step) > _TINT * depth or not lit.any():
+    if not may_shade(step) or not lit.any():
         return None
     if (np.median(np.abs(change - step), axis=0) > _UNEVEN).any():
         return None
     return Step(step, np.median(color[lit], axis=0), normal)
+
+
+def may_shade(change: Float64) -> bool:
+    """Whether a change of colour [3], natural logarithms of R, G and B in linear light, may be one into a shadow."""
+    depth = -float(change.mean())
+    return _DEPTH[0] <= depth <= _DEPTH[1] and bool(np.ptp(change) <= _TINT * depth)
 
 
 def _shaded(change: Float64, step: Float64) -> Bool:

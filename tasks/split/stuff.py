@@ -14,7 +14,7 @@ from ss_flow.tasks.geometry.shape import (
     middle_of,
     on_plane,
     plane_of_most,
-    plane_through,
+    planes_of_patches,
     refitted,
     thinned,
     towards,
@@ -29,8 +29,6 @@ _FEW = 10
 """Points below which a label has no plane."""
 _ENOUGH = 4000
 """At least so many points of a label, ten times as many of the scene, and less than twice of either, tell."""
-_PATCHES = 50
-"""So many places of a label are looked at for a plane, each with as large a share of the points round it."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +88,5 @@ def _planes(places: Float64, thickness: float, params: StuffParams) -> list[Plan
 
 def _largest_plane(places: Float64, thickness: float) -> Plane:
     """The plane, of those through small patches of some points [N, 3], that most of the points lie on."""
-    from scipy.spatial import cKDTree
-
-    count = max(len(places) // _PATCHES, min(_FEW, len(places)))
-    _, near = cKDTree(places).query(places[:: max(1, len(places) // _PATCHES)], k=count)
-    patches = [plane_through(places[rows]) for rows in np.reshape(near, (-1, count))]
-    best = max(patches, key=lambda plane: on_plane(places, plane, thickness).sum())
+    best = max(planes_of_patches(places), key=lambda plane: on_plane(places, plane, thickness).sum())
     return refitted(places, best, thickness, _ROUNDS)

@@ -21,6 +21,8 @@ from ss_flow.tasks.geometry.shape import (
     middle_of,
     on_plane,
     plane_of_most,
+    planes_of_patches,
+    refitted,
     sector_of,
     thinned,
     towards,
@@ -34,6 +36,15 @@ _THICKNESS = 2.0
 """Distance from a plane up to which a point lies on it, in multiples of the cloud's spacing."""
 _FLAT = 0.7
 """Share of its points that must lie on one plane: the rest is the edge of a table top, or noise."""
+_TOP = 0.15
+"""Or else, share of its points that lie on its top: those of a chest are mostly its sides."""
+_ABOVE = 0.1
+"""Share of its points that may lie above its top: of a chair of one piece more do."""
+_AMID = 1.2
+"""So many standard deviations from the middle of a top its points are not yet its sides, which are 1.7 away. There,
+`_FLAT` of all points must lie on it: between the crests of a crumpled cloth they do not."""
+_ROUNDS = 3
+"""How often a plane is fitted to the points on it."""
 _LEVEL = 0.5
 """Least cosine between the plane's normal and upwards: a handle does not stand on its door. Where cameras look down,
 what is up in photos leans away from them, and from such a door."""
@@ -72,28 +83,49 @@ class Supports:
     """What was found so far: many sets share their pieces."""
 
     def levels(self, labels: Labels) -> list[Labels]:
-        """Which of these labels lie in a level plane: all together, or single ones."""
+        """Which of these labels lie in a level plane, or have a level top: all together, or single ones."""
         together = [labels] if len(labels) > 1 else []
         return [level for level in (*together, *((row,) for row in labels)) if self._plane_of(level)]
 
     def hold(self, level: Labels, labels: Labels) -> bool:
-        """Whether labels, taken together, stand on others that lie in a level plane."""
+        """Whether labels, taken together, stand on others that `levels` names."""
         if (level, labels) not in self._answers:
             plane = self._plane_of(level)
             self._answers[level, labels] = plane is not None and self._stands(plane, level, labels)
         return self._answers[level, labels]
 
     def _plane_of(self, labels: Labels) -> Plane | None:
-        """The level plane, its normal upwards, in which labels lie; None where they do not lie in one."""
+        """The level plane, its normal upwards, in which labels lie, or their top; None where there is neither."""
         if labels not in self._planes:
             self._planes[labels] = None
             places = self._places(labels)
             if len(places) >= _FEW:
-                plane = plane_of_most(places, self._thickness, 3)
-                normal = towards(plane[1], plane[0], self.eye)
-                if normal @ self.up >= _LEVEL and on_plane(places, plane, self._thickness).mean() >= _FLAT:
-                    self._planes[labels] = plane[0], normal
+                plane = plane_of_most(places, self._thickness, _ROUNDS)
+                if self._level(plane) and on_plane(places, plane, self._thickness).mean() >= _FLAT:
+                    self._planes[labels] = plane[0], towards(plane[1], plane[0], self.eye)
+                else:
+                    self._planes[labels] = self._top_of(places)
         return self._planes[labels]
+
+    def _top_of(self, places: Float64) -> Plane | None:
+        """The level plane on which most points [N, 3] lie, if it is a top: with hardly any above it, and no others amid
+        it, as the sides of a chest are not."""
+        level = [plane for plane in planes_of_patches(places) if self._level(plane)]
+        if not level:
+            return None
+        best = max(level, key=lambda plane: on_plane(places, plane, self._thickness).sum())
+        centre, normal = refitted(places, best, self._thickness, _ROUNDS)
+        normal = towards(normal, centre, self.eye)
+        height, along = (places - centre) @ normal, (places - centre) @ axes_in(normal).T
+        on = np.abs(height) <= self._thickness
+        if normal @ self.up < _LEVEL or on.mean() < _TOP or (height > self._thickness).mean() > _ABOVE:
+            return None
+        spread = np.linalg.pinv(np.cov(along[on].T))
+        amid = np.einsum("ni,ij,nj->n", along, spread, along) <= _AMID**2
+        return (centre, normal) if on[amid].mean() >= _FLAT else None
+
+    def _level(self, plane: Plane) -> bool:
+        return bool(towards(plane[1], plane[0], self.eye) @ self.up >= _LEVEL)
 
     def _stands(self, plane: Plane, level: Labels, labels: Labels) -> bool:
         """Whether labels rise from the plane of others, which go on round their foot."""
@@ -106,7 +138,9 @@ class Supports:
         if high < max(self.height * extent, _RISES * self.points.spacing) or low < -self._thickness:
             return False
         along = axes_in(normal)
-        lies, ground = (own - centre) @ along.T, (self._places(level) - centre) @ along.T
+        ground = self._places(level)
+        ground = ground[on_plane(ground, plane, self._thickness)]
+        lies, ground = (own - centre) @ along.T, (ground - centre) @ along.T
         if _spread(lies) >= _SMALL * _spread(ground):
             return False
         foot = lies[height <= np.quantile(height, _FOOT)]

@@ -1,7 +1,7 @@
 """How many things are exactly one instance: Split with a segmenter's masks on generated rooms of composite things.
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
-                                          [--gripper | --sensor | --desk | --kitchen | --shelf] [--lying]
+                                          [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf] [--lying]
                                           [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
@@ -10,8 +10,9 @@ a tenth), mIoU, PQ, over- and under-segmentation, in per cent; the predicted ids
 each thing its best IoU, and of how many predicted ids each covers at least a tenth of it. With --store, rooms and
 results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
 shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
-of small things on a table, in few near views of a depth sensor; with --kitchen, a kitchen, with --shelf, a shelf of
-goods instead (`tests/support/generated_*.py`). With --lying, photos lie on their side, as a phone stores them.
+of small things on a table, in few near views of a depth sensor; with --bedroom, a bedroom, with --kitchen, a kitchen,
+with --shelf, a shelf of goods instead (`tests/support/generated_*.py`). With --lying, photos lie on their side, as a
+phone stores them.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from depth_sensor import sensed
+from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
 from generated_kitchen import generate_kitchen
 from generated_shelf import generate_shelf
@@ -52,7 +54,7 @@ from ss_flow.tasks.evaluate.panoptic import pieces, whole
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 
 ROOM = RoomParams(composite=True, views=24, width=480, height=360, held_out=0)
-OTHERS = {"desk": generate_desk, "kitchen": generate_kitchen, "shelf": generate_shelf}
+OTHERS = {"bedroom": generate_bedroom, "desk": generate_desk, "kitchen": generate_kitchen, "shelf": generate_shelf}
 COLUMNS = ("whole", "miou", "pq", "over_segmentation", "under_segmentation")
 COUNTS = ("num_predicted", "num_truth")
 STEPS = "ingest", "masks_split"
@@ -78,7 +80,7 @@ def folder_of(room: RoomParams, place: Path, sensor: bool = False) -> Path:
 
 
 def other_of(kind: str, seed: int, place: Path) -> Path:
-    """The capture of a desk, a kitchen or a shelf, likewise."""
+    """The capture of a bedroom, a desk, a kitchen or a shelf, likewise."""
     folder = place / f"{kind}-{seed}"
     if not folder.exists():
         write_scene(OTHERS[kind](seed), folder)

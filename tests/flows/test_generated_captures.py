@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
 from generated_kitchen import generate_kitchen
 from generated_shelf import generate_shelf
@@ -53,8 +54,15 @@ def shelf() -> Room:
     return generate_shelf(3, width=160, height=120)
 
 
-@pytest.mark.parametrize(("kind", "generate"), [("kitchen", generate_kitchen), ("shelf", generate_shelf)])
-def test_a_kitchen_and_a_shelf_are_the_same_each_time(kind, generate, request):
+@pytest.fixture(scope="module")
+def bedroom() -> Room:
+    return generate_bedroom(3, views=6, width=160, height=120)
+
+
+@pytest.mark.parametrize(
+    ("kind", "generate"), [("bedroom", generate_bedroom), ("kitchen", generate_kitchen), ("shelf", generate_shelf)]
+)
+def test_bedrooms_kitchens_and_shelves_are_the_same_each_time(kind, generate, request):
     first = request.getfixturevalue(kind)
     again = generate(3, views=len(first), width=160, height=120)
     assert np.array_equal(first.rgb, again.rgb)
@@ -74,6 +82,17 @@ def test_a_kitchen_has_things_on_its_counter_and_its_table_and_every_view_shows_
         low = 0.735 if name.split()[-1] in ("mug", "book") else 0.9 if name.split()[-1] in on_counter else 0.0
         assert len(heights) and low - 0.03 < heights.min()
     assert all(len(np.unique(ids)) > 2 for ids in kitchen.ids)
+
+
+def test_a_bedroom_has_things_on_its_bed_on_its_chest_and_on_its_walls(bedroom):
+    kinds = [thing.name.split()[-1] for thing in bedroom.objects]
+    assert kinds[0] == "bed" and kinds.count("picture") == kinds.count("curtain") == kinds.count("chest") == 2
+    lowest = {"pillow": 0.4, "lamp": 0.4, "jar": 0.75, "plant": 0.75, "picture": 1.2, "curtain": 0.15}
+    for thing, kind in zip(bedroom.objects, kinds, strict=True):
+        places = bedroom.points[bedroom.point_ids == thing.instance_id]
+        assert len(places) and places[:, 2].min() > lowest.get(kind, 0) - 0.03
+        assert (np.abs(places[:, :2]) < 2.05).all()
+    assert all(len(np.unique(ids)) > 2 for ids in bedroom.ids)
 
 
 def test_a_shelf_has_nine_things_on_three_boards(shelf):

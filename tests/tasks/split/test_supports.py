@@ -100,6 +100,38 @@ def test_a_crumpled_cloth_is_nothing_to_stand_on():
     assert supports.levels((0,)) == []
 
 
+CHEST = block(0.8, 0.5, 0.7)
+
+
+def on_chest(piece: np.ndarray) -> np.ndarray:
+    return piece + np.array([0.1, 0, 0.7])
+
+
+@pytest.mark.parametrize("turn", [0.0, -0.3])
+def test_a_mug_stands_on_a_chest_whose_top_is_one_piece_with_its_sides(turn):
+    supports = find_supports(*scene([CHEST, *map(on_chest, mug())], turn), height=0.09)
+    assert supports.levels((0,)) == [(0,)]
+    assert supports.hold((0,), MUG) and not supports.hold((0,), (HANDLE,))
+
+
+def test_what_is_below_the_top_of_a_chest_or_ends_at_it_does_not_stand_on_it():
+    drawer = block(0.3, 0.1, 0.15) + np.array([0.0, -0.3, 0.4])
+    board = block(0.8, 0.03, 0.9) + np.array([0.0, 0.27, 0.0])
+    supports = find_supports(*scene([CHEST, drawer, board]), height=0.09)
+    assert supports.levels((0,)) == [(0,)]
+    assert not supports.hold((0,), (1,)) and not supports.hold((0,), (2,))
+
+
+SEAT = block(0.8, 0.5, 0.3)
+BACK = block(0.8, 0.04, 0.3) + np.array([0, 0.23, 0.3])
+
+
+@pytest.mark.parametrize("more", [[BACK], [lying(0.8, 0.5, 0.1)]], ids=["a back above it", "a board below it"])
+def test_a_chair_or_a_shelf_of_one_piece_is_nothing_to_stand_on(more):
+    assert find_supports(*scene([SEAT]), height=0.09).levels((0,)) == [(0,)]
+    assert find_supports(*scene([np.concatenate([SEAT, *more])]), height=0.09).levels((0,)) == []
+
+
 def tree(masks: list[set[int]], pieces: list[np.ndarray]) -> dict[frozenset[int], float]:
     """The agreement of each union of leaves, where four views see all pieces and have these masks, of labels."""
     cloud, cameras, labels = scene(pieces)
