@@ -34,6 +34,10 @@ CONNECTED = 3.0
 """Spacings from one point to the next of one surface."""
 LEAST_VIEWS = 4
 """Views whose masks hold a missing point, its own among them."""
+LEAST_VIEWS_APART = 3
+"""The same for a piece of surface that no point leads to: most are legs whose upper ends nobody sees."""
+LEAST_POINTS_APART = 10
+"""Points of such a piece, one for each cube of the spacing; what is smaller is mostly a rim that masks hold."""
 STRIDE = 2
 """Every second row and column of a mask is looked at for missing points."""
 TOGETHER = 50_000
@@ -78,15 +82,17 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     borders of the masks hide from the vote on labels.
 
     A point joins when the masks of at least four views hold it, and those of at least `share` of the views that see
-    it, and when other points lead from it to the labelled ones: what is apart is another thing. One joins for each cube
-    of the points' spacing, the first; its confidence is that share.
+    it, and when other points lead from it to the labelled ones. What is apart is another thing, unless it lies inside
+    the box around all of these, as a chair's leg does whose upper end the seat hides: a piece of at least ten points
+    there joins, and for that the masks of three views are enough. One point joins for each cube of the points' spacing,
+    the first; its confidence is that share.
     """
     from scipy.spatial import cKDTree
 
     if not (spacing := nearest_spacing(instance.points)):
         return instance
     tree = cKDTree(instance.points)
-    found: list[tuple[Float32, UInt8, Float32]] = []
+    found: list[tuple[Float32, UInt8, Float32, Bool]] = []
     views = _views(scene, instance)
 
     def missing(place: int) -> _Pixels:
@@ -97,25 +103,49 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
         return _Pixels(place, some.row[far], some.column[far], some.points[far])
 
     for some, votes, held in _votes(scene, instance, views, map(missing, range(len(views)))):
-        joins = (held + 1 >= LEAST_VIEWS) & (held + 1 >= share * (votes + 1))
+        joins = (held + 1 >= LEAST_VIEWS_APART) & (held + 1 >= share * (votes + 1))
         if joins.any():
             photo = shared_rgb(scene.frames[views[some.place]])
             colors = photo[some.row[joins], some.column[joins]]
-            found.append((some.points[joins], colors, ((held + 1) / (votes + 1))[joins].astype(np.float32)))
+            shares = ((held + 1) / (votes + 1))[joins].astype(np.float32)
+            found.append((some.points[joins], colors, shares, (held + 1 >= LEAST_VIEWS)[joins]))
     if not found:
         return instance
-    points, colors, confidence = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    first = first_of_each_cube(points, spacing)
-    together = dbscan(np.concatenate([instance.points, points[first]]), CONNECTED * spacing, 1)
-    own, added = np.split(together, [len(instance.points)])
-    first = first[np.isin(added, own)]
+    points, colors, confidence, widely = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    led_to = _led_to(instance.points, points, np.flatnonzero(widely), spacing)
+    rows = np.concatenate([led_to, _pieces_inside(instance.points, points, led_to, spacing)])
+    if not len(rows):
+        return instance
     return replace(
         instance,
-        points=np.concatenate([instance.points, points[first]]),
-        colors=np.concatenate([instance.colors, colors[first]]),
-        point_confidence=np.concatenate([instance.point_confidence, confidence[first]]),
-        point_part=np.concatenate([instance.point_part, np.zeros(len(first), np.int32)]),
+        points=np.concatenate([instance.points, points[rows]]),
+        colors=np.concatenate([instance.colors, colors[rows]]),
+        point_confidence=np.concatenate([instance.point_confidence, confidence[rows]]),
+        point_part=np.concatenate([instance.point_part, np.zeros(len(rows), np.int32)]),
     )
+
+
+def _led_to(own: Float32, points: Float32, rows: _Rows, spacing: float) -> _Rows:
+    """Those of some rows of `points`, one a cube, to which others lead from an instance's own points."""
+    if not len(rows):
+        return rows
+    first = rows[first_of_each_cube(points[rows], spacing)]
+    of_own, added = np.split(dbscan(np.concatenate([own, points[first]]), CONNECTED * spacing, 1), [len(own)])
+    return first[np.isin(added, of_own)]
+
+
+def _pieces_inside(own: Float32, points: Float32, led_to: _Rows, spacing: float) -> _Rows:
+    """Rows of `points`, one a cube, of the pieces inside the box of an instance's own to which no other point leads."""
+    own = np.concatenate([own, points[led_to]])
+    inside = np.flatnonzero(((points >= own.min(axis=0)) & (points <= own.max(axis=0))).all(axis=1))
+    if not len(inside):
+        return inside
+    first = inside[first_of_each_cube(points[inside], spacing)]
+    together = dbscan(np.concatenate([own, points[first]]), CONNECTED * spacing, 1)
+    of_own, piece = np.split(together, [len(own)])
+    joins = np.bincount(piece, minlength=together.max() + 1) >= LEAST_POINTS_APART
+    joins[of_own] = False
+    return first[joins[piece]]
 
 
 def _views(scene: SceneViews, instance: InstanceMasks) -> list[int]:

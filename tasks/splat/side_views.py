@@ -17,6 +17,7 @@ from ss_flow.tasks.gaussians.objective import Target
 from ss_flow.tasks.gaussians.trainer import PartView
 from ss_flow.tasks.gaussians.views import SceneViews
 from ss_flow.tasks.geometry.cameras import Camera, looking, pixels_in_view, surface_of_pixels
+from ss_flow.tasks.geometry.fusion import depth_at
 from ss_flow.tasks.geometry.images import at_diagonal, resampled
 from ss_flow.tasks.geometry.sampling import cube_of_each, sphere
 
@@ -26,7 +27,7 @@ MOST_PIXELS = 96
 """Side of a view, if its pixels need not be smaller than half a spacing."""
 GAP = 2.5
 """Spacings between points that still belong to one surface: narrower gaps are closed."""
-RIM = 0.5
+RIM = 0.2
 """Spacings by which the surface goes on beyond its last points."""
 TRIM = 0.05
 """Share of the points at either end of each axis that do not tell where an instance is: some carry a wrong label."""
@@ -41,6 +42,17 @@ LEAST_NEARBY = 0.95
 NEARBY = 2.0
 """Pixels of an image with a diagonal of 800 within which a known depth of the same instance makes up for an unknown
 one: sensors lose single pixels and strips along edges, beside which the surface has points."""
+EDGE = 4.0
+"""Pixels of an image with a diagonal of 800 behind an edge of the depth in which a pixel says nothing: masks are as
+coarse there, and what is far behind a thing is not its surface."""
+JUMP = 0.03
+"""Share of the depth by which the far side of such an edge is farther."""
+CLEAR = 0.3
+"""Spacings before a surface from which a place is empty."""
+CORE = 0.01
+"""Share of the points at either end of each axis that lie beyond the box in which places may be hidden."""
+MOST_PLACES = 50_000
+"""Places of an instance that are looked at: where there would be more, they are farther apart."""
 LEAST_SHARE = 1 / 3
 """Share of a cube's pixels that show an instance from which the cube may be its surface."""
 
@@ -51,7 +63,8 @@ def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], c
     Photos do not tell what they cannot see: Gaussians grow into the floor below a thing, or off its surface along the
     line of sight. But the surface is known, as points: the centres of the Gaussians that come from the labelled points,
     and the surface points of the pixels that show the instance. Alpha is to be 0 where no point is near; what lies
-    nearer than half a spacing, and gaps between points, count for nothing. Where the depth of an instance is unknown in
+    nearer than a fifth of a spacing, and gaps between points, count for nothing. Nor does what no photo sees through,
+    inside the box of the points: there the instance may go on. Where the depth of an instance is unknown in
     more than a tenth of its pixels, and in more than a twentieth around these too, points do not tell where it ends: it
     has no such views.
 
@@ -69,11 +82,28 @@ def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], c
     def around(instance: int) -> list[PartView]:
         start = int(np.searchsorted(scene.instance_id, instance))
         stop = start + len(own[instance])
-        points, spacing = np.concatenate([own[instance], surfaces[instance]]), spacings[instance]
+        spacing = spacings[instance]
+        points = np.concatenate([own[instance], surfaces[instance], hidden(views, own[instance], spacing)])
         cameras = cameras_around(points, spacing, min(count, -(-most // len(shaped))))
         return [PartView(start, stop, _target(camera, empty(camera, points, spacing))) for camera in cameras]
 
     return list(itertools.chain.from_iterable(in_threads(around, shaped)))
+
+
+def hidden(views: SceneViews, points: Float32, spacing: float) -> Float32:
+    """Places inside the box of an instance's points that no view sees through, [N, 3] world, on a grid at least a
+    spacing wide: inside of things, behind them, and between those that stand close together."""
+    low, high = np.quantile(points.astype(np.float64), (CORE, 1 - CORE), axis=0)
+    side = max(spacing, float((high - low).max()) / MOST_PLACES)  # centres may lie one upon the other
+    while np.prod(counts := np.maximum(np.ceil((high - low) / side), 1)) > MOST_PLACES:
+        side *= 1.1
+    axes = (a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts.astype(int), strict=True))
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    for camera, depth in zip(views.cameras, views.depths, strict=True):
+        rows, column, row, z = pixels_in_view(places, camera)
+        through = depth_at(depth, column, row, camera.width, camera.height) > z + CLEAR * spacing
+        places = np.delete(places, rows[through], axis=0)
+    return places.astype(np.float32)
 
 
 def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) -> dict[int, Float32]:
@@ -92,6 +122,7 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
         area += np.bincount(shown.ids.ravel(), minlength=len(area))
         known += np.bincount(shown.ids[z > 0], minlength=len(area))
         nearby += np.bincount(shown.ids[_known_nearby(z > 0, shown.ids)], minlength=len(area))
+        z = np.where(_behind_edges(z), 0, z)
         z, ids = z[::every, ::every], shown.ids[::every, ::every]
         row, column = np.nonzero(z > 0)
         surface = surface_of_pixels(every * column, every * row, z[row, column], camera)
@@ -108,6 +139,15 @@ def shown_surfaces(views: SceneViews, masks: Sequence[LabelMap], side: float) ->
     pair, first = pair[good] % most, first[good]
     shaped = (known >= LEAST_KNOWN * area) | (nearby >= LEAST_NEARBY * area)
     return {int(i): points[first[pair == i]] for i in np.unique(pair) if shaped[i]}
+
+
+def _behind_edges(z: Float32) -> Bool:
+    """[H, W] where a much nearer surface is beside the pixel."""
+    import cv2
+
+    reach = round(at_diagonal(EDGE, *z.shape))
+    near = np.where(z > 0, z, np.inf).astype(np.float32)
+    return np.asarray(z > (1 + JUMP) * cv2.erode(near, np.ones((2 * reach + 1,) * 2, np.uint8)))
 
 
 def _known_nearby(known: Bool, ids: NDArray[np.uint16]) -> Bool:

@@ -15,6 +15,7 @@ from view_masks import as_fields
 from ss_flow.tasks.artifacts import InstanceMasks
 from ss_flow.tasks.gaussians import library
 from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE
+from ss_flow.tasks.geometry.cameras import backproject
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.splat.consensus import Voter, agreed, completed
 
@@ -156,3 +157,48 @@ def test_surface_apart_from_the_labelled_points_is_another_thing(small):
     )
     assert len(completed(small.views.compared(VisibilityParams()), far, 0.7).points) == len(far.points)
     assert len(completed(small.views.compared(VisibilityParams()), both, 0.7).points) > len(both.points)
+
+
+PATCH = CENTRE + RADIUS / np.sqrt(3)
+"""The middle of a piece of the ball's surface, well inside the box around the ball."""
+
+
+def with_piece_apart(small: SmallScene, size: float, views: int, below: float = np.inf) -> InstanceMasks:
+    """The ball, which looks as if it were in two: no mask holds the ring about the piece of this size round PATCH, and
+    the piece has no points. As many views' masks hold it. below: height to which points and masks reach besides."""
+    whole = small.instance(BALL, every=4)
+
+    def rest(points: np.ndarray) -> np.ndarray:
+        return (np.linalg.norm(points - PATCH, axis=-1) > size + 0.08) & (points[..., 2] < below)
+
+    masks, holding = [], 0
+    for row, (camera, depth) in enumerate(zip(small.views.cameras, small.depths, strict=True)):
+        surface = backproject(depth.depth, camera).reshape(HEIGHT, WIDTH, 3)
+        piece = np.linalg.norm(surface - PATCH, axis=-1) < size
+        holding += (whole.mask(row) & piece).any()
+        masks.append(whole.mask(row) & (rest(surface) | (piece & (holding <= views))))
+    own = rest(whole.points)
+    fields = {name: getattr(whole, name)[own] for name in ("points", "colors", "point_confidence", "point_part")}
+    return replace(whole, **fields, **as_fields(np.array(masks)))
+
+
+def test_a_piece_apart_joins_inside_the_box_of_the_rest(small):
+    scene = small.views.compared(VisibilityParams())
+    for views in (3, 8):
+        instance = with_piece_apart(small, 0.1, views)
+        full = completed(scene, instance, 0.3)
+        added = full.points[len(instance.points) :]
+        assert len(added) >= 10
+        assert (np.linalg.norm(added - PATCH, axis=1) < 0.1 + 1e-4).all()
+        assert (np.abs(np.linalg.norm(added - CENTRE, axis=1) - RADIUS) < 0.005).all()
+        assert len(full.colors) == len(full.point_confidence) == len(full.point_part) == len(full.points)
+
+
+@pytest.mark.parametrize(
+    ("size", "views", "below"),
+    [(0.1, 2, np.inf), (0.04, 8, np.inf), (0.1, 8, 0.25)],
+    ids=["that two masks hold", "of few points", "outside of the box"],
+)
+def test_a_piece_apart_stays_another_thing(small, size, views, below):
+    instance = with_piece_apart(small, size, views, below)
+    assert completed(small.views.compared(VisibilityParams()), instance, 0.3) is instance

@@ -18,7 +18,17 @@ from ss_flow.tasks.gaussians.views import SceneViews
 from ss_flow.tasks.geometry.cameras import Camera, backproject, pixels_in_view, project
 from ss_flow.tasks.geometry.sampling import first_of_each_cube, sphere
 from ss_flow.tasks.geometry.visibility import VisibilityParams
-from ss_flow.tasks.splat.side_views import FEWEST, GAP, RIM, cameras_around, empty, shown_surfaces, side_views
+from ss_flow.tasks.splat.side_views import (
+    FEWEST,
+    GAP,
+    MOST_PLACES,
+    RIM,
+    cameras_around,
+    empty,
+    hidden,
+    shown_surfaces,
+    side_views,
+)
 
 BOX, BALL = 1, 2
 
@@ -104,6 +114,47 @@ def test_a_surface_is_what_a_good_part_of_the_pixels_there_shows(small):
 
 def test_a_cube_with_a_single_pixel_tells_nothing(small):
     assert shown_surfaces(compared(small), small.maps, 1e-5) == {}
+
+
+def test_what_is_far_behind_an_edge_is_no_surface_of_the_thing_in_front(small):
+    views = compared(small)
+    in_front = [view for view, ids in enumerate(small.ids) if (ids == BALL).sum() > 120]
+    assert len(in_front) >= 4
+    for view in in_front:
+        one = replace(views, cameras=views.cameras[view : view + 1], depths=views.depths[view : view + 1])
+        wide = np.pad(small.ids[view] == BALL, 1)
+        wide = wide[:-2, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :-2] | wide[1:-1, 2:] | wide[1:-1, 1:-1]
+        mask = replace(small.maps[view], ids=np.where(wide, BALL, 0).astype(np.uint16))
+        surface = shown_surfaces(one, [mask], 0.05)[BALL]
+        off = np.abs(np.linalg.norm(surface - CENTRE, axis=1) - RADIUS)
+        assert len(surface) > 10 and off.max() < 0.15  # the floor and the box where they touch it
+
+
+def test_what_no_view_sees_through_may_be_the_thing(small):
+    views, ball = compared(small), small.instance(BALL).points
+    ball = np.concatenate([ball, 2 * np.float32(CENTRE) - ball])  # with the underside, so that the box holds it all
+    places = hidden(views, ball, 0.02)
+    away = np.linalg.norm(places - CENTRE, axis=1)
+    inside = 0.02**3 * len(places[away < RADIUS - 0.02])
+    assert inside == pytest.approx(4 / 3 * np.pi * (RADIUS - 0.02) ** 3, rel=0.1)  # all of its inside
+    assert not (
+        (away > RADIUS + 0.02) & (places[:, 0] > CENTRE[0]) & (places[:, 2] > CENTRE[2])
+    ).any()  # but nothing in plain view
+    assert (np.abs(places - CENTRE) <= RADIUS + 1e-3).all()
+    unknown = [replace(depth, depth=np.zeros_like(depth.depth)) for depth in views.depths]
+    assert len(hidden(replace(views, depths=unknown), ball, 0.02)) > 1.5 * len(places)
+
+
+def test_large_things_have_no_more_hidden_places(small):
+    views, ball = compared(small), small.instance(BALL).points
+    unknown = [replace(depth, depth=np.zeros_like(depth.depth)) for depth in views.depths]
+    blind = replace(views, depths=unknown)
+    for spacing in (1e-3, 0.0):
+        places = hidden(blind, ball, spacing)
+        assert 0.7 * MOST_PLACES < len(places) <= MOST_PLACES
+        assert np.ptp(places, axis=0) == pytest.approx(
+            np.ptp(np.quantile(ball, (0.01, 0.99), axis=0), axis=0), rel=0.05
+        )
 
 
 def test_unknown_depth_shows_no_surface(small):
