@@ -147,7 +147,7 @@ def _behind_edges(z: Float32) -> Bool:
 
     reach = round(at_diagonal(EDGE, *z.shape))
     near = np.where(z > 0, z, np.inf).astype(np.float32)
-    return np.asarray(z > (1 + JUMP) * cv2.erode(near, np.ones((2 * reach + 1,) * 2, np.uint8)))
+    return np.asarray(z / (1 + JUMP) > cv2.erode(near, np.ones((2 * reach + 1,) * 2, np.uint8)))
 
 
 def _known_nearby(known: Bool, ids: NDArray[np.uint16]) -> Bool:

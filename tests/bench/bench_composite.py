@@ -1,8 +1,8 @@
 """How many things are exactly one instance: Split with a segmenter's masks on generated rooms of composite things.
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
-                                          [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf] [--lying]
-                                          [--store DIR] [--look DIR]
+                                          [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | --walk]
+                                          [--photos] [--lying] [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
 whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
@@ -11,8 +11,9 @@ each thing its best IoU, and of how many predicted ids each covers at least a te
 results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
 shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
 of small things on a table, in few near views of a depth sensor; with --bedroom, a bedroom, with --kitchen, a kitchen,
-with --shelf, a shelf of goods instead (`tests/support/generated_*.py`). With --lying, photos lie on their side, as a
-phone stores them.
+with --shelf, a shelf of goods, with --walk, a table in a garden instead (`tests/support/generated_*.py`). With
+--photos, from the photos alone: without depth and poses. With --lying, photos lie on their side, as a phone stores
+them.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
 from generated_kitchen import generate_kitchen
 from generated_shelf import generate_shelf
+from generated_walk import generate_walk
 
 from ss_flow.cache.store import Store
 from ss_flow.engine import run_flow
@@ -54,7 +56,13 @@ from ss_flow.tasks.evaluate.panoptic import pieces, whole
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 
 ROOM = RoomParams(composite=True, views=24, width=480, height=360, held_out=0)
-OTHERS = {"bedroom": generate_bedroom, "desk": generate_desk, "kitchen": generate_kitchen, "shelf": generate_shelf}
+OTHERS = {
+    "bedroom": generate_bedroom,
+    "desk": generate_desk,
+    "kitchen": generate_kitchen,
+    "shelf": generate_shelf,
+    "walk": generate_walk,
+}
 COLUMNS = ("whole", "miou", "pq", "over_segmentation", "under_segmentation")
 COUNTS = ("num_predicted", "num_truth")
 STEPS = "ingest", "masks_split"
@@ -80,7 +88,7 @@ def folder_of(room: RoomParams, place: Path, sensor: bool = False) -> Path:
 
 
 def other_of(kind: str, seed: int, place: Path) -> Path:
-    """The capture of a bedroom, a desk, a kitchen or a shelf, likewise."""
+    """The capture of a bedroom, a desk, a kitchen, a shelf or a garden, likewise."""
     folder = place / f"{kind}-{seed}"
     if not folder.exists():
         write_scene(OTHERS[kind](seed), folder)
@@ -109,9 +117,10 @@ def lying(upright: Path) -> Path:
     return folder
 
 
-def outcome(folder: Path, params: Params, store: Store) -> Outcome:
-    """Run Split on a capture and read what came of it."""
-    prepared = prepare(open_scene(folder), params, RunOptions(), file_digests(store))
+def outcome(folder: Path, params: Params, store: Store, photos: bool = False) -> Outcome:
+    """Run Split on a capture, or on its photos alone, and read what came of it."""
+    scene = open_scene(folder / "color" if photos else folder)
+    prepared = prepare(scene, params, RunOptions(), file_digests(store))
 
     def build() -> dict[str, Any]:
         return {name: node for name, node in prepared.build().items() if name in STEPS}
@@ -163,6 +172,7 @@ def main() -> None:
     scene.add_argument("--sensor", action="store_true", help="with the depth of a depth camera")
     for kind in OTHERS:
         scene.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=f"a {kind}, not a room")
+    parser.add_argument("--photos", action="store_true", help="from the photos alone")
     parser.add_argument("--lying", action="store_true", help="photos that lie on their side")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
@@ -173,7 +183,7 @@ def main() -> None:
             room = replace(ROOM, seed=seed, gripper=args.gripper)
             folder = other_of(args.kind, seed, Path(kept)) if args.kind else folder_of(room, Path(kept), args.sensor)
             folder = lying(folder) if args.lying else folder
-            found = outcome(folder, params, Store(Path(kept)))
+            found = outcome(folder, params, Store(Path(kept)), args.photos)
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]
             print(f"\n| seed | {' | '.join(COLUMNS + COUNTS)} | seconds |")

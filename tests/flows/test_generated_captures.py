@@ -6,6 +6,7 @@ from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
 from generated_kitchen import generate_kitchen
 from generated_shelf import generate_shelf
+from generated_walk import by_phone, generate_walk
 
 from ss_flow.flows.generated import Room, write_scene
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
@@ -59,10 +60,16 @@ def bedroom() -> Room:
     return generate_bedroom(3, views=6, width=160, height=120)
 
 
-@pytest.mark.parametrize(
-    ("kind", "generate"), [("bedroom", generate_bedroom), ("kitchen", generate_kitchen), ("shelf", generate_shelf)]
-)
-def test_bedrooms_kitchens_and_shelves_are_the_same_each_time(kind, generate, request):
+@pytest.fixture(scope="module")
+def walk() -> Room:
+    return generate_walk(3, views=6, width=160, height=120)
+
+
+KINDS = {"bedroom": generate_bedroom, "kitchen": generate_kitchen, "shelf": generate_shelf, "walk": generate_walk}
+
+
+@pytest.mark.parametrize(("kind", "generate"), KINDS.items())
+def test_each_kind_is_the_same_each_time(kind, generate, request):
     first = request.getfixturevalue(kind)
     again = generate(3, views=len(first), width=160, height=120)
     assert np.array_equal(first.rgb, again.rgb)
@@ -103,6 +110,29 @@ def test_a_shelf_has_nine_things_on_three_boards(shelf):
         places = shelf.points[shelf.point_ids == thing.instance_id]
         assert np.abs(places[:, 2].min() - boards).min() < 0.05 and (np.abs(places[:, 0]) < 0.34).all()
     assert 0.8 < (shelf.depth > 0).mean() < 0.999
+
+
+def test_seven_things_stand_on_the_table_of_a_walk_and_one_beside_it(walk):
+    table, *on_it, beside = walk.objects
+    lowest = {thing.name: walk.points[walk.point_ids == thing.instance_id, 2].min() for thing in walk.objects}
+    top = walk.points[walk.point_ids == table.instance_id, 2].max()
+    assert len(on_it) == 7 and all(lowest[thing.name] > top - 0.01 for thing in on_it)
+    assert lowest[beside.name] < 0.1
+    assert (walk.ids == 0).any(axis=(1, 2)).all()
+
+
+def test_a_walk_goes_round_twice(walk):
+    eyes = np.linalg.inv(walk.cameras.world_to_camera)[:, :3, 3]
+    angles = np.unwrap(np.arctan2(eyes[:, 1], eyes[:, 0]))
+    assert (np.diff(angles) > 0).all() and angles[-1] - angles[0] > 3 * np.pi
+
+
+def test_a_phone_exposes_and_balances_anew_and_darkens_corners():
+    taken = by_phone(np.full((12, 48, 64, 3), 128, np.uint8), np.random.default_rng(0)).astype(float)
+    middle, corner = taken[:, 20:28, 28:36].mean(axis=(1, 2)), taken[:, :4, :4].mean(axis=(1, 2))
+    assert (corner < 0.95 * middle).all() and (corner > 0.8 * middle).all()
+    exposure, balance = middle[:, 1], middle[:, 0] / middle[:, 2]
+    assert 5 < np.ptp(exposure) < 60 and 0.01 < np.ptp(balance) < 0.1
 
 
 def test_a_desk_is_written_as_a_capture(desk, tmp_path):
