@@ -15,7 +15,9 @@ from ss_flow.tasks.split.shadows import logarithms, may_shade
 from ss_flow.tasks.split.votes.touching import Borders
 
 _ALONG = 0.4
-"""Share of its border along which a shadow touches stuff. The rest is what casts it."""
+"""Share of its border along which a shadow touches stuff."""
+_BESIDE = 0.1
+"""Share along which it touches what casts it: a grey mat may lie alone on a floor."""
 _THICKNESS = 2.0
 """Distance from the plane of the stuff round it up to which its points lie in that, in spacings."""
 _FLAT = 0.7
@@ -34,9 +36,9 @@ def find_casts(points: PointCloud, label: Int32, surface: Int32, ends: Borders, 
     """[S] which surfaces, ascending, are shadows on stuff.
 
     label: [N] of the points, 0 = none; surface: [L + 1] of each label, 0 of 0; ends: the borders of the labels; stuff:
-    [S] which surfaces are known to be. A shadow touches stuff along its border, lies in the plane that the stuff has
-    there, and has its colour but for one step into a shadow. So has a grey rug on a white floor: it stays a label of
-    its own, which masks may unite with the floor, but with nothing that stands on it.
+    [S] which surfaces are known to be. A shadow touches stuff along its border, and what casts it; it lies in the plane
+    that the stuff has there, and has its colour but for one step into a shadow. So has a grey rug on a white floor with
+    a chair on it: it stays a label of its own, which masks may unite with the floor, but not with the chair.
     """
     of = surface[label]
     names = np.unique(of[of > 0])
@@ -48,7 +50,8 @@ def find_casts(points: PointCloud, label: Int32, surface: Int32, ends: Borders, 
     for name in np.unique(own[stuff[other] & ~stuff[own]]).tolist():
         mine = own == name
         on_stuff = mine & stuff[other]
-        if len(np.unique(point[on_stuff])) < _ALONG * len(np.unique(point[mine])):
+        border, along, beside = (len(np.unique(point[of])) for of in (mine, on_stuff, mine & ~on_stuff))
+        if along < _ALONG * border or beside < _BESIDE * border:
             continue
         rows, ground = rows_of[int(names[name])], rows_of[int(names[np.bincount(other[on_stuff]).argmax()])]
         places = points.points[rows].astype(np.float64)

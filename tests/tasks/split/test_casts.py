@@ -19,7 +19,7 @@ def casts(*patches: Patch, stuff: tuple[int, ...] = (1,), together: tuple[int, .
 
 
 WALL = patch(WHITE, 0, 0)
-THING = patch(RED, 0.7, 0, 0.1)
+THING = patch(RED, 0.7, 0)
 
 
 def test_a_shadow_that_lies_in_a_wall_is_one():
@@ -41,7 +41,7 @@ def test_what_leaves_the_wall_is_none():
     places, colors = patch(WHITE * SHADE, 0.5, 0, width=0.2)
     for slope, found in ((0.0, [2]), (0.1, [2]), (0.6, [])):
         rising = places + np.array([0.0, 0, slope]) * (places[:, :1] - 0.5)
-        assert casts(WALL, (rising, colors), patch(RED, 0.7, 0, 0.1)) == found
+        assert casts(WALL, (rising, colors), THING) == found
 
 
 def test_what_touches_the_wall_along_a_small_part_of_its_border_is_none():
@@ -54,7 +54,11 @@ def test_a_print_of_two_shades_is_none():
     dark, light = (patch(WHITE * SHADE * by, 0.5, 0, width=0.2) for by in (0.7, 1.4))
     places, colors = dark
     odd = np.arange(len(places)) % 2 == 1
-    assert casts(WALL, (places, np.where(odd[:, None], light[1], colors))) == []
+    assert casts(WALL, (places, np.where(odd[:, None], light[1], colors)), THING) == []
+
+
+def test_a_grey_mat_alone_on_a_floor_is_none():
+    assert casts(WALL, patch(WHITE * SHADE, 0.5, 0, width=0.2)) == []
 
 
 def test_pieces_of_one_surface_are_one_shadow():
@@ -69,7 +73,7 @@ def test_nothing_casts_nothing():
 
 @pytest.mark.parametrize(("color", "united"), [(WHITE * SHADE, set()), (BROWN, {4})])
 def test_a_thing_and_its_shadow_are_not_one_though_every_view_shows_them_so(color, united):
-    cloud, cameras, label = scene(patch(WHITE, 0, 0, width=2), patch(color, 2, 0, width=0.2), patch(RED, 2.2, 0, 0.1))
+    cloud, cameras, label = scene(patch(WHITE, 0, 0, width=2), patch(color, 2, 0, width=0.2), patch(RED, 2.2, 0))
     nothing, names = np.zeros(0, np.int32), np.arange(1, 4, dtype=np.int32)
     labels = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing)
     seen, held = np.full(3, 100, np.int32), np.array([[100, 0, 0], [0, 100, 100]], np.int32)
