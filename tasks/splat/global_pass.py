@@ -60,8 +60,8 @@ def global_pass(
     scene: as `assemble` gives it. masks: exclusive label maps of all views. visibility: how far depths of one surface
     may differ. Opacities are kept and nothing is split or cloned. The loss is that of a pair (Eq. 5, 6), here
     `global_objective` and `global_mask_weight` times the mask loss, and `side_weight` times what an instance covers
-    beside its surface (`side_views`); the guard of `merge_pair` holds here too. A scene of which no
-    mask shows anything comes back as it is.
+    beside its surface (`side_views`); the guard of `merge_pair` holds here too. A scene of which no mask shows
+    anything comes back as it is.
 
     After `relabel_after` steps the scene shows what belongs to what better than the masks do. So a Gaussian whose place
     shows another instance in most views becomes that one's, and only then is each instance looked at from the side. In

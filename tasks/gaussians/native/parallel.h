@@ -19,8 +19,8 @@
 
 namespace parallel {
 
-// Threads that help one caller and sleep between its calls: to start one takes as long as a small piece of
-// work. One that wakes too late finds nothing to do, and nobody waits for it.
+// Threads that help one caller and sleep between its calls: to start one takes as long as a small piece of work. One
+// that wakes too late finds nothing to do, and nobody waits for it.
 class Crew {
   public:
     ~Crew() {
