@@ -64,9 +64,9 @@ def side_views(views: SceneViews, scene: Gaussians, masks: Sequence[LabelMap], c
     line of sight. But the surface is known, as points: the centres of the Gaussians that come from the labelled points,
     and the surface points of the pixels that show the instance. Alpha is to be 0 where no point is near; what lies
     nearer than a fifth of a spacing, and gaps between points, count for nothing. Nor does what no photo sees through,
-    inside the box of the points: there the instance may go on. Where the depth of an instance is unknown in
-    more than a tenth of its pixels, and in more than a twentieth around these too, points do not tell where it ends: it
-    has no such views.
+    inside the box of the points: there the instance may go on. Where the depth of an instance is unknown in more than a
+    tenth of its pixels, and in more than a twentieth around these too, points do not tell where it ends: it has no such
+    views.
 
     scene: ordered by instance, not yet trained together. masks: exclusive label maps of all views. count: views of each
     instance; where these are more than `most` in all, an equal share of `most`, rounded up. Returns targets whose alpha

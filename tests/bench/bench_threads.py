@@ -15,6 +15,7 @@ from contextlib import suppress
 from typing import Any
 from unittest.mock import patch
 
+from ss_flow.control_groups import usable_cores
 from ss_flow.flows.cli.main import main
 from ss_flow.tasks.gaussians.backends import NativeBackend
 from ss_flow.tasks.gaussians.trainer import TrainResult, _Training, train
@@ -41,7 +42,7 @@ def milliseconds(threads: int, *given: Any, **settings: Any) -> float:
 def measured(*given: Any, **settings: Any) -> TrainResult:
     """Trains as asked, and prints the table first if parts are seen alone."""
     if settings["parts"]:
-        threads = [1 << k for k in range(os.cpu_count().bit_length())]
+        threads = [1 << k for k in range(usable_cores().bit_length())]
         turns = [[milliseconds(n, *given, **settings) for n in threads] for _ in range(2)]
         print(f"\n| threads | {' | '.join(map(str, threads))} |\n|---{'|---' * len(threads)}|")
         print(f"| ms a step | {' | '.join(f'{min(both):.1f}' for both in zip(*turns, strict=True))} |", flush=True)

@@ -111,13 +111,6 @@ struct Sum {  // of many floats: sixteen running sums, added at the end
     }
 };
 
-double sum_of(const float* values, int64_t n) {
-    double lane[kTogether] = {}, total = 0;
-    for (int64_t i = 0; i < n; ++i) lane[i % kTogether] += values[i];
-    for (double v : lane) total += v;
-    return total;
-}
-
 }  // namespace
 
 extern "C" {
@@ -136,13 +129,14 @@ int ss_photometric(void* workspace, int width, int height, int channels, const f
         float* product = loss.towards_product.room(wide);
         Part* counted = loss.counted.room(height);  // what of each row counts at most; SSIM is asked for nowhere else
         double* sums = loss.sums.room(2 * pieces);
-        const double total = sum_of(weight, (int64_t)width * height);
-        if (!(total > 0)) {
+        Sum weights;
+        for (int r = 0; r < height; ++r) weights.add(weight + (int64_t)r * width, width);
+        if (!(weights.total > 0)) {
             std::fill(gradient, gradient + size, 0.0f);
             out[0] = out[1] = 0, out[2] = 1;
             return;
         }
-        const float norm = (float)(1 / (total * channels));
+        const float norm = (float)(1 / (weights.total * channels));
         const auto rows = [&](int64_t piece, auto visit) {
             for (int r = (int)piece * kPiece; r < std::min(height, ((int)piece + 1) * kPiece); ++r) visit(r, (int64_t)r * n);
         };
