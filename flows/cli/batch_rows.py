@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.cache.files import write_atomically
+from ss_flow.cache.plain_json import read_json
 from ss_flow.engine import Report
 from ss_flow.errors import InputError
 from ss_flow.sweep import rows_of
@@ -46,7 +47,7 @@ def row_of(
 def earlier_rows(file: Path, *, needed: bool) -> dict[str, dict[str, Any]]:
     """The rows of earlier batches, by scene. Raises InputError when batch.json is damaged but needed."""
     try:
-        return {row["scene"]: row for row in json.loads(file.read_text(encoding="utf-8")) if row["status"] in COLOURS}
+        return {row["scene"]: row for row in read_json(file.read_text(encoding="utf-8")) if row["status"] in COLOURS}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, TypeError, KeyError) as error:

@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ss_flow.cache.files import write_atomically
+from ss_flow.cache.plain_json import read_json
 from ss_flow.flows.cli.telling import plan_in_words, print_table, would_run
 from ss_flow.flows.measures import HEADLINE
 from ss_flow.sweep import Row
@@ -102,7 +103,7 @@ def holds_other(folder: Path, asked: str) -> bool:
     asked: what a row has as "sweep".
     """
     try:
-        return any(row.get("sweep") != asked for row in json.loads((folder / "sweep.json").read_text(encoding="utf-8")))
+        return any(row.get("sweep") != asked for row in read_json((folder / "sweep.json").read_text(encoding="utf-8")))
     except FileNotFoundError:
         return any((folder / name).exists() for name in ("sweep.csv", "sweep.png"))
     except NotADirectoryError:

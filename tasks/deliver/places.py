@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -14,6 +13,7 @@ from typing import Any
 
 from ss_flow.cache.files import UNFINISHED
 from ss_flow.cache.location import is_url
+from ss_flow.cache.plain_json import read_json
 from ss_flow.errors import InputError
 from ss_flow.tasks.capture.names import spelt
 from ss_flow.tasks.deliver.output import OWN_FILES, OWN_FOLDERS, RUN_FILE, check_place, replacing
@@ -118,7 +118,7 @@ def _files(folder: Path) -> list[str]:
 def _read(file: Path) -> dict[str, Any]:
     """A JSON document; empty where there is none, or it is damaged."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
+        document = read_json(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return document if isinstance(document, dict) else {}

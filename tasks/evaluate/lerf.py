@@ -7,7 +7,6 @@ of the label files.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.cache.plain_json import read_json
 from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import FileRef, Resources, task
@@ -66,7 +66,7 @@ class Labels:
 def read_label(file: Path) -> LabelledFrame:
     """One label file. Raises InputError when it is none."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
+        document = read_json(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{file} cannot be read as JSON ({error}).") from None
     return labelled_frame(document, str(file))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
+from ss_flow.cache.plain_json import read_json
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef, task
 from ss_flow.tasks.evaluate.points import TruePoints, most_frequent
@@ -43,7 +43,7 @@ def replica_truth(*, mesh: FileRef, info: FileRef) -> TruePoints:
 def _names(info: Path) -> dict[int, str]:
     """The class of each annotated object by id."""
     try:
-        objects = json.loads(info.read_text(encoding="utf-8"))["objects"]
+        objects = read_json(info.read_text(encoding="utf-8"))["objects"]
         return {int(one["id"]): str(one["class_name"]) for one in objects if int(one["class_id"]) >= 0}
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(f"{info} cannot be read ({type(error).__name__}: {error}); objects are expected.") from None

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ss_flow.cache.plain_json import read_json
 from ss_flow.errors import InputError
 from ss_flow.running import warn
 from ss_flow.task import FileRef, task
@@ -93,6 +93,6 @@ def _instances(of_vertex: np.ndarray, groups: list[dict[str, Any]]) -> Int32:
 
 def _list(file: Path, name: str) -> list[Any]:
     try:
-        return list(json.loads(file.read_text(encoding="utf-8"))[name])
+        return list(read_json(file.read_text(encoding="utf-8"))[name])
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(f"{file} cannot be read ({type(error).__name__}: {error}); {name} is expected.") from None

@@ -12,13 +12,13 @@ from __future__ import annotations
 import functools
 import html
 import itertools
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ss_flow.cache.plain_json import read_json
 from ss_flow.errors import InputError
 
 CONTEXT_LENGTH = 77
@@ -68,7 +68,7 @@ class ClipTokenizer:
         for file in files:
             try:
                 text = file.read_text(encoding="utf-8")
-                document = json.loads(text) if text.lstrip().startswith("{") else None
+                document = read_json(text) if text.lstrip().startswith("{") else None
             except ValueError as error:
                 raise InputError(
                     f"{file.name} is not valid JSON or UTF-8 ({error}); fetch the model's files again."

@@ -163,9 +163,10 @@ def test_rendered_features_find_and_localise(tmp_path: Path) -> None:
     assert one["localised"] == one["macc25"] == 0.5, "a category without a text scores 0"
 
 
-def test_a_label_file_that_is_damaged_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", ["{", "[" * 100_000])
+def test_a_label_file_that_is_damaged_is_named(tmp_path: Path, content: str) -> None:
     labels = _labels(tmp_path, a=MUG_AND_BOX)
-    labels.files[0].path.write_text("{")
+    labels.files[0].path.write_text(content)
     with pytest.raises(InputError, match=r"a\.json cannot be read as JSON"):
         _strict(labels, "red mug")
 

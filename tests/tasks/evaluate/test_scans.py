@@ -116,9 +116,10 @@ def test_replicas_vertices_take_the_object_of_most_of_their_faces(tmp_path: Path
 def test_damaged_files_of_replica_are_named(tmp_path: Path) -> None:
     folder = _replica(tmp_path) / "habitat"
     files = {"mesh": _reference(folder / "mesh_semantic.ply"), "info": _reference(folder / "info_semantic.json")}
-    files["info"].path.write_text('{"objects": [{"id": 1}]}')
-    with pytest.raises(InputError, match=r"info_semantic\.json cannot be read"):
-        replica_truth(**files)
+    for content in ('{"objects": [{"id": 1}]}', "[" * 100_000):
+        files["info"].path.write_text(content)
+        with pytest.raises(InputError, match=r"info_semantic\.json cannot be read"):
+            replica_truth(**files)
     whole = files["mesh"].path.read_bytes()
     last = struct.pack("<6f3B", 3, 1, 0, 0, 0, 1, 9, 9, 9)
     files["mesh"].path.write_bytes(whole.replace(b"element vertex 8", b"element vertex 7").replace(last, b""))

@@ -148,6 +148,7 @@ def test_a_vocabulary_without_its_merges_is_refused(tmp_path: Path):
     ("content", "says"),
     [
         (b'{"model": {', r"tokenizer\.json is not valid JSON"),
+        (b'{"model":' * 100_000, r"tokenizer\.json is not valid JSON"),
         (b"\xff\xfe\x00", r"tokenizer\.json is not valid JSON or UTF-8"),
         (b'{"model": null}', r"tokenizer\.json: a tokenizer needs"),
         (b'{"model": {"vocab": [["a", 0.5]], "merges": ["a b"]}}', r"tokenizer\.json: a tokenizer needs"),
