@@ -118,6 +118,17 @@ def select(gaussians: G, rows: NDArray[np.bool_] | NDArray[np.integer]) -> G:
     return replace(gaussians, **{f.name: getattr(gaussians, f.name)[rows] for f in fields(gaussians)})
 
 
+def log_lengths(gaussians: Gaussians) -> Float32:
+    """[N] how long Gaussians are in the instance that each is part of: the median of the logarithm of their longest
+    standard deviations, which are in world units."""
+    longest = gaussians.log_scales.max(axis=1)
+    lengths = np.empty(len(gaussians), np.float32)
+    for instance_id in np.unique(gaussians.instance_id):
+        own = gaussians.instance_id == instance_id
+        lengths[own] = np.median(longest[own])
+    return lengths
+
+
 def extents(gaussians: Gaussians) -> Float32:
     """[N] the size of the instance that each Gaussian is part of, world units: the diagonal of its box."""
     sizes = np.zeros(len(gaussians), np.float32)

@@ -17,6 +17,7 @@ from ss_flow.running import cores, last_try, load_checkpoint, progress, save_che
 from ss_flow.tasks.artifacts import Float32, Gaussians
 from ss_flow.tasks.gaussians.backends import AdamStep, Backend, backend_for
 from ss_flow.tasks.gaussians.densification import AdaptiveControl, GradientRecord, Schedule, Seen
+from ss_flow.tasks.gaussians.initialise import log_lengths
 from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target, Targets
@@ -72,8 +73,8 @@ class TrainParams:
     prune_contribution: Fraction = 1 / 255
     """Gaussians with no larger weight in any view are dropped at the end; 0 keeps them."""
     max_scale: NonNegative = 0.0
-    """No standard deviation exceeds this share of the extent, or the largest it starts with where that is more; 0 = no
-    limit."""
+    """No standard deviation of an instance's Gaussians exceeds so many times the median of the longest with which they
+    start; those of the background (id 0) may. 0 = no limit."""
 
 
 @dataclass(frozen=True)
@@ -190,9 +191,7 @@ class _Training:
             raise ValueError("the initial Gaussians hold values that are not finite")
         self._extents = backend.put(extents)
         self._channels = backend.put(channels_of(initial.instance_id, label_ids)) if num_labels else None
-        # A few sparse points of a small thing must be let fill the space between them.
-        longest = np.maximum(np.float32(params.max_scale) * extents, np.exp(initial.log_scales.max(axis=1)))
-        self._log_longest = backend.put(np.log(longest))
+        self._log_longest = backend.put(_log_longest(initial, params.max_scale)) if params.max_scale else None
         self._control = _control(params, GradientRecord(len(initial), backend), float(extents.max()))
         self.step = 0
         # Of each view, those whose colour counts.
@@ -240,7 +239,7 @@ class _Training:
         self._losses[self.step - 1] = found.loss
         rates = params.rates.at(done_share).by_parameter(self._extents[parameters.origin])
         parameters.step(found.gradients, AdamStep(self.step, rates, degree))
-        if params.max_scale:
+        if self._log_longest is not None:
             parameters.limit_scale(self._log_longest[parameters.origin])
         if self._control is not None:
             seen = Seen(found.gradients["centers"], found.radii, self._pixels[view])
@@ -298,6 +297,12 @@ class _Training:
                 strongest = xp.maximum(strongest, self._backend.strongest(parameters.values, there))
             parameters.keep(strongest >= params.prune_contribution)
         return TrainResult(parameters.to_gaussians(self._initial), self.step, losses)
+
+
+def _log_longest(initial: Gaussians, max_scale: float) -> Float32:
+    """[N] the logarithm of the longest standard deviation that each Gaussian may have."""
+    longest = np.log(np.float32(max_scale)) + log_lengths(initial)
+    return np.where(initial.instance_id == 0, np.float32(np.inf), longest)
 
 
 def _control(params: TrainParams, record: GradientRecord, extent: float) -> AdaptiveControl | None:

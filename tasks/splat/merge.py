@@ -106,9 +106,9 @@ class MergeParams:
     extent: Literal["instance", "cameras"] = "instance"
     """What lengths are shares of, the rate of the means above all: "instance", the diagonal of each Gaussian's own
     instance; or "cameras", the radius of the cameras that see them, as in 3DGS (where that is 0, the diagonal)."""
-    max_scale: NonNegative = 0.05
-    """No Gaussian becomes longer (one standard deviation) than this share of the extent, or than it starts where that
-    is more; 0 = any."""
+    max_scale: NonNegative = 1.5
+    """No Gaussian becomes longer (one standard deviation) than so many times the median with which those of its
+    instance start; the background's may. 0 = any."""
     rates: LearningRates = LearningRates(
         position=6.4e-4,
         position_final=6.4e-6,

@@ -81,9 +81,9 @@ class ReconstructParams:
     extent: Literal["instance", "cameras"] = "instance"
     """What lengths are shares of, the rate of the means above all: "instance", the diagonal of the instance's box; or
     "cameras", the radius of the cameras that see it, as in 3DGS (where that is 0, the diagonal)."""
-    max_scale: NonNegative = 0.05
-    """No Gaussian becomes longer (one standard deviation) than this share of the extent, or than it starts where that
-    is more; 0 = any."""
+    max_scale: NonNegative = 1.5
+    """No Gaussian becomes longer (one standard deviation) than so many times the median with which those of its
+    instance start; the background's may. 0 = any."""
     rates: LearningRates = LearningRates(rotation=3e-4)
     """How fast each parameter is learnt; discs that turn fast come to stand on end."""
     dilation: Natural = 0
