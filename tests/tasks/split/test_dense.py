@@ -57,6 +57,22 @@ def test_one_view_less_leaves_the_cubes_where_they_are():
     assert sides[0] == sides[1]
 
 
+def moved(by):
+    """The scene's points after the whole world was moved, along one axis."""
+    cameras = box_scene.cameras()
+    poses = cameras.world_to_camera.copy()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ np.array([0.0, by, 0.0])
+    far = replace(cameras, world_to_camera=poses)
+    return dense(box_scene.frames(), far, box_scene.depths(), SceneUnit(1.0), params=DenseParams())
+
+
+def test_a_world_so_far_from_its_origin_that_things_fall_on_one_place_is_refused():
+    near, far = moved(0), moved(1_000_000)  # steps of 0.0625
+    assert abs(len(far.points) - len(near.points)) < 0.05 * len(near.points)
+    with pytest.raises(InputError, match=r"3,000,000 world units .* steps of 0\.25, .* subtract one offset"):
+        moved(3_000_000)
+
+
 def test_the_same_input_gives_the_same_bits():
     a, b = fuse(), fuse()
     assert a.points.tobytes() == b.points.tobytes()
