@@ -8,9 +8,11 @@ Of a generated room (room:N, or composite) every true object is rendered alone b
 the Gaussians of the instance that covers it best, if with an IoU of at least 0.5; eight views an object, of those at
 least half of whose pixels some training view saw. PSNR inside the union of both outlines, before white, and the IoU of
 the outlines: of what was seen (pixels of the true object that no training view saw count in neither), and of all; mean
-over objects, and worst. Beside it the same from the training views themselves, the share of needles, held-out PSNR, and
-the mIoU of masks after Split and in the end. A capture has no true objects: needles and held-out PSNR alone. --sensor
-gives rooms the depth of a camera as the first Kinect. --look draws every object from its best view and from 35 degrees
+over objects, and worst. Beside it the same from the training views themselves, the share of needles, fog, held-out
+PSNR, and the mIoU of masks after Split and in the end. Fog is what an object covers, from as far off, more than four
+spacings beside its labelled points, as a share of what these cover; mean over objects of 200 Gaussians and more, and
+worst. A capture has no true objects: needles, fog and held-out PSNR alone. --sensor gives rooms the depth of a camera
+as the first Kinect. --look draws every object from its best view and from 35 degrees
 off, before magenta.
 """
 
@@ -24,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 from bench_splat import MAGENTA, Outcome, cell, folder_of, outcome, room_of
+from scipy.ndimage import distance_transform_edt
 
 from ss_flow.cache.store import Store
 from ss_flow.flows import settings
@@ -38,6 +41,7 @@ from ss_flow.tasks.evaluate.objects import Likeness, cameras_beside, needles
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, pixels_in_view
+from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.images import decode_rgb, encode_png
 from ss_flow.tasks.geometry.shape import box_diagonal
 
@@ -45,6 +49,10 @@ LEAST_SEEN = 30
 """Pixels of a view from which it counts as seeing an object."""
 SAME_SURFACE = 0.01
 """Metres between two depths of one surface of a room, whose depth is exact."""
+LEAST_GAUSSIANS = 200
+"""Of an object whose fog is looked at."""
+BESIDE = 4
+"""Spacings of its points beside which an object's alpha is fog."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +138,28 @@ def needle_share(gaussians: Gaussians) -> float:
     return float(needles(gaussians)[solid].mean()) if solid.any() else 0.0
 
 
+def fog(found: Outcome, degrees: float) -> Iterator[float]:
+    """Of each object: alpha beside its points, as a share of the pixels near them."""
+    for instance in found.instances:
+        own = select(found.scene, found.scene.instance_id == instance.instance_id)
+        if not instance.instance_id or not instance.views or len(own) < LEAST_GAUSSIANS:
+            continue
+        cameras = [camera_of(found.cameras, found.cameras.names.index(name)) for name in instance.views]
+        beside = near = 0.0
+        for camera in cameras_beside(cameras, *sphere(instance.points), degrees=degrees):
+            _, column, row, z = pixels_in_view(instance.points, camera)
+            if not len(z):
+                continue
+            shown = np.zeros((camera.height, camera.width), bool)
+            shown[row, column] = True
+            reach = BESIDE * nearest_spacing(instance.points) * camera.fx / np.median(z)
+            close = distance_transform_edt(~shown) <= reach
+            beside += float(render(own, camera).alpha[~close].sum())
+            near += np.count_nonzero(close)
+        if near:
+            yield beside / near
+
+
 def look(found: Outcome, degrees: float) -> UInt8:
     """Every object: its best photo, and alone before magenta from there and from four of the views beside."""
     pictures, captions = [], []
@@ -168,9 +198,9 @@ def main() -> None:
     parser.add_argument("--look", type=Path)
     parser.add_argument("--store", type=Path)
     args = parser.parse_args()
-    print("| scene | objects | PSNR of seen, worst | IoU of seen, worst | PSNR, worst | IoU, worst |"
-          " PSNR, IoU training | needles % | held out | mIoU Split, final | Gaussians | Splat s |")  # fmt: skip
-    print("|---" * 12 + "|")
+    print("| scene | objects | PSNR of seen, worst | IoU of seen, worst | PSNR, worst | IoU, worst | PSNR, IoU training |"
+          " needles % | fog %, worst | held out | mIoU Split, final | Gaussians | Splat s |")  # fmt: skip
+    print("|---" * 13 + "|")
     with tempfile.TemporaryDirectory() as temporary:
         place = args.store or Path(temporary)
         for scene in args.scenes:
@@ -189,6 +219,7 @@ def measured(scene: str, place: Path, args: argparse.Namespace) -> None:
         objects = list(held(found, generate(of), renderer_of(of), args.degrees))
     ids = np.unique(found.scene.instance_id)
     shares = [needle_share(select(found.scene, found.scene.instance_id == i)) for i in ids if i]
+    fogs = list(fog(found, args.degrees)) or [0.0]
     columns = [f"{np.mean(v):.{d}f}, {min(v):.{d}f}" for v, d in (
         ([o.seen.psnr for o in objects] or [0], 2), ([o.seen.iou for o in objects] or [0], 3),
         ([o.all.psnr for o in objects] or [0], 2), ([o.all.iou for o in objects] or [0], 3),
@@ -197,7 +228,8 @@ def measured(scene: str, place: Path, args: argparse.Namespace) -> None:
     mean = np.mean(training, axis=0)
     print(
         f"| {folder.name} | {len(objects)} | {' | '.join(columns)} | {mean[0]:.2f}, {mean[1]:.3f} | "
-        f"{100 * np.mean(shares):.1f} | {cell(found.metrics, 'novel_view', 'psnr', 1, 2)} | "
+        f"{100 * np.mean(shares):.1f} | {100 * np.mean(fogs):.1f}, {100 * max(fogs):.1f} | "
+        f"{cell(found.metrics, 'novel_view', 'psnr', 1, 2)} | "
         f"{cell(found.metrics, 'metrics_split', 'miou')}, "
         f"{cell(found.metrics, 'metrics_splat', 'miou')} | {len(found.scene)} | {found.splat_seconds:.0f} |",
         flush=True,

@@ -35,6 +35,18 @@ def test_training_finds_colours_shape_and_depth_of_a_ball():
     assert np.allclose(np.linalg.norm(result.gaussians.quaternions, axis=1), 1, atol=1e-5)
 
 
+def test_each_instance_has_a_limit_of_its_own_to_how_long_gaussians_become_and_the_background_none():
+    ball = ball_points()
+    ids = np.arange(len(ball), dtype=np.int32) % 3
+    longer = ball.log_scales + np.log(np.array([1, 1, 4], np.float32))[ids][:, None]
+    longer[:6] += 1.5  # two of each
+    begun = replace(ball, instance_id=ids, log_scales=longer)
+    params = TrainParams(iterations=1, densify="none", max_scale=1.2, prune_contribution=0.0, prune_opacity=0.0)
+    ended = train(begun, VIEWS, params=params, extent=1.6, seed=1).gaussians
+    most = [ended.log_scales[ids == i].max() - np.median(longer[ids == i].max(axis=1)) for i in range(3)]
+    assert most[0] > 1 and np.allclose(most[1:], np.log(1.2), atol=1e-5)
+
+
 def test_the_mask_loss_gives_pixels_back_to_their_instance():
     half = ball_points()
     labels = np.where(half.means[:, 1] < 0, 4, 9).astype(np.int32)
