@@ -198,8 +198,9 @@ def main() -> None:
     parser.add_argument("--look", type=Path)
     parser.add_argument("--store", type=Path)
     args = parser.parse_args()
-    print("| scene | objects | PSNR of seen, worst | IoU of seen, worst | PSNR, worst | IoU, worst | PSNR, IoU training |"
-          " needles % | fog %, worst | held out | mIoU Split, final | Gaussians | Splat s |")  # fmt: skip
+    print("| scene | objects | PSNR of seen, worst | IoU of seen, worst | PSNR, worst | IoU, worst |"
+          " PSNR, IoU training | needles % | fog %, worst | held out |"
+          " mIoU Split, final | Gaussians | Splat s |")  # fmt: skip
     print("|---" * 13 + "|")
     with tempfile.TemporaryDirectory() as temporary:
         place = args.store or Path(temporary)
