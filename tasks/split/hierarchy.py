@@ -47,8 +47,10 @@ from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 Members = tuple[int, ...]
 """Some pieces, or labels, by their rows, ascending."""
 
-_ON_TOP = 0.5
-"""What is left of an agreement when one piece stands on the others: the views show a group."""
+_ON_TOP = 0.45
+"""What is left of an agreement when one piece stands on the others: the views show a group. The default of
+`split.granularity`, above which no such set then is: of a stool alone on a floor all views have one mask with what is
+on it."""
 _TOGETHER = 0.5
 """Share of the views which see two pieces that must hold them under one mask, whatever else it holds, so that a convex
 edge between them makes them faces of one thing."""

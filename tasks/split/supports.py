@@ -43,6 +43,9 @@ _ABOVE = 0.1
 _AMID = 1.2
 """So many standard deviations from the middle of a top its points are not yet its sides, which are 1.7 away. There,
 `_FLAT` of all points must lie on it: between the crests of a crumpled cloth they do not."""
+_WIDE = 2.0
+"""A plane's points spread along it, in its narrowest direction, by this many times that distance at least (standard
+deviation): of a pot that few points show, most lie near some plane through it."""
 _ROUNDS = 3
 """How often a plane is fitted to the points on it."""
 _LEVEL = 0.5
@@ -101,7 +104,8 @@ class Supports:
             places = self._places(labels)
             if len(places) >= _FEW:
                 plane = plane_of_most(places, self._thickness, _ROUNDS)
-                if self._level(plane) and on_plane(places, plane, self._thickness).mean() >= _FLAT:
+                on = on_plane(places, plane, self._thickness)
+                if self._level(plane) and on.mean() >= _FLAT and self._wide(places[on], plane):
                     self._planes[labels] = plane[0], towards(plane[1], plane[0], self.eye)
                 else:
                     self._planes[labels] = self._top_of(places)
@@ -120,12 +124,19 @@ class Supports:
         on = np.abs(height) <= self._thickness
         if normal @ self.up < _LEVEL or on.mean() < _TOP or (height > self._thickness).mean() > _ABOVE:
             return None
+        if not self._wide(places[on], (centre, normal)):
+            return None
         spread = np.linalg.pinv(np.cov(along[on].T))
         amid = np.einsum("ni,ij,nj->n", along, spread, along) <= _AMID**2
         return (centre, normal) if on[amid].mean() >= _FLAT else None
 
     def _level(self, plane: Plane) -> bool:
         return bool(towards(plane[1], plane[0], self.eye) @ self.up >= _LEVEL)
+
+    def _wide(self, places: Float64, plane: Plane) -> bool:
+        """Whether points [N, 3] on a plane show that it is one: they are spread farther along it than across."""
+        along = places @ axes_in(plane[1]).T
+        return bool(np.linalg.eigvalsh(np.cov(along.T))[0] >= (_WIDE * self._thickness) ** 2)
 
     def _stands(self, plane: Plane, level: Labels, labels: Labels) -> bool:
         """Whether labels rise from the plane of others, which go on round their foot."""

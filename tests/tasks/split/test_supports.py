@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,6 +100,20 @@ def test_a_crumpled_cloth_is_nothing_to_stand_on():
     cloth[:, 2] = 0.05 * np.sin(40 * cloth[:, 0])
     supports = find_supports(*scene([cloth, block(0.08, 0.08, 0.2)]), height=0.09)
     assert supports.levels((0,)) == []
+
+
+@pytest.mark.parametrize(
+    ("width", "spacing", "is_level"),
+    [
+        pytest.param(0.16, STEP, True, id="a closed pot"),
+        pytest.param(0.16, 2 * STEP, False, id="a pot that few points show, near the middle of which most lie"),
+        pytest.param(0.5, 2 * STEP, True, id="a cushion that few points show"),
+    ],
+)
+def test_what_lies_near_a_plane_but_no_wider_than_that_is_nothing_to_stand_on(width, spacing, is_level):
+    cloud, cameras, labels = scene([block(width, width, 0.1)])
+    supports = find_supports(replace(cloud, spacing=spacing), cameras, labels, height=0.09)
+    assert supports.levels((0,)) == ([(0,)] if is_level else [])
 
 
 CHEST = block(0.8, 0.5, 0.7)
