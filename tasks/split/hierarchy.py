@@ -300,12 +300,22 @@ class _Pieces:
         )
 
     def _on_level(self, members: Members) -> set[int]:
-        """Those of these pieces that, with those they touch, stand on a level one."""
+        """Those of these pieces that, with those they touch, stand on a level one and those that go on in its plane."""
         found: set[int] = set()
         for base in members:
-            levels = self.supports.levels(self.labels[base])
-            for part in self.contact.parted(tuple(piece for piece in members if piece != base)) if levels else []:
-                labels = tuple(row for piece in part for row in self.labels[piece])
-                if any(self.supports.hold(level, labels) for level in levels):
-                    found.update(part)
+            others = tuple(piece for piece in members if piece != base)
+            for level in self.supports.levels(self.labels[base]):
+                for part in self.contact.parted(others):
+                    if self.supports.hold(level, self._labels_of(part)):
+                        found.update(part)
+                        continue
+                    more = {piece for piece in part if self.supports.goes_on(level, self.labels[piece])}
+                    for rest in (
+                        self.contact.parted(tuple(piece for piece in part if piece not in more)) if more else []
+                    ):
+                        if self.supports.hold(level, self._labels_of(rest), self._labels_of(sorted(more))):
+                            found.update(rest)
         return found
+
+    def _labels_of(self, pieces: Sequence[int]) -> Members:
+        return tuple(row for piece in pieces for row in self.labels[piece])
