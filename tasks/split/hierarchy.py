@@ -47,8 +47,10 @@ from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 Members = tuple[int, ...]
 """Some pieces, or labels, by their rows, ascending."""
 
-_ON_TOP = 0.5
-"""What is left of an agreement when one piece stands on the others: the views show a group."""
+_ON_TOP = 0.45
+"""What is left of an agreement when one piece stands on the others: the views show a group. The default of
+`split.granularity`, above which no such set then is: of a stool alone on a floor all views have one mask with what is
+on it."""
 _TOGETHER = 0.5
 """Share of the views which see two pieces that must hold them under one mask, whatever else it holds, so that a convex
 edge between them makes them faces of one thing."""
@@ -298,12 +300,22 @@ class _Pieces:
         )
 
     def _on_level(self, members: Members) -> set[int]:
-        """Those of these pieces that, with those they touch, stand on a level one."""
+        """Those of these pieces that, with those they touch, stand on a level one and those that go on in its plane."""
         found: set[int] = set()
         for base in members:
-            levels = self.supports.levels(self.labels[base])
-            for part in self.contact.parted(tuple(piece for piece in members if piece != base)) if levels else []:
-                labels = tuple(row for piece in part for row in self.labels[piece])
-                if any(self.supports.hold(level, labels) for level in levels):
-                    found.update(part)
+            others = tuple(piece for piece in members if piece != base)
+            for level in self.supports.levels(self.labels[base]):
+                for part in self.contact.parted(others):
+                    if self.supports.hold(level, self._labels_of(part)):
+                        found.update(part)
+                        continue
+                    more = {piece for piece in part if self.supports.goes_on(level, self.labels[piece])}
+                    for rest in (
+                        self.contact.parted(tuple(piece for piece in part if piece not in more)) if more else []
+                    ):
+                        if self.supports.hold(level, self._labels_of(rest), self._labels_of(sorted(more))):
+                            found.update(rest)
         return found
+
+    def _labels_of(self, pieces: Sequence[int]) -> Members:
+        return tuple(row for piece in pieces for row in self.labels[piece])

@@ -26,6 +26,9 @@ _TRIM = 0.02
 """Share of the points, on every side, that an extent leaves out."""
 _ENOUGH = 2000
 """At least so many points of a label, and less than twice as many, tell."""
+_CLEAR = 2.0
+"""Standard deviations of the depth by which a label must rise at least: by the 1.3 above which a tenth of the points of
+something flat lie, so does a print on a wall."""
 _LEAST = 2 / 3
 """Share of the height that is asked for at least, however much the colours differ: what is printed on a far wall rises
 from it by half as much, in the noise of the depth."""
@@ -67,7 +70,8 @@ def find_mounds(
     plane of its foot (the points nearest to its neighbours) far enough, and it does not go on smoothly into its
     neighbours along half of its border, as a part of something round does. Far enough is the share `height` of its
     extent where its colours are half like those of its neighbours; twice as far where they are the same, since the arm
-    of a sofa rises from its seat too, and down to two thirds as far where they differ.
+    of a sofa rises from its seat too, and down to two thirds as far where they differ. In no case less than two
+    spacings of the cloud, or what the noise of the depth makes of something flat.
     """
     from scipy.spatial import cKDTree
 
@@ -93,7 +97,8 @@ def find_mounds(
         rise = np.quantile((own - centre) @ towards(normal, centre, eye), 0.9)
         alike = likeness(histogram(bins[inside], spread), histogram(bins[rest], spread))
         enough = height * max(2 * alike, _LEAST) * box_diagonal(own, _TRIM)
-        return bool(rise >= max(enough, 2 * points.spacing))
+        noise = points.noise * float(np.linalg.norm(centre - eye))
+        return bool(rise >= max(enough, 2 * points.spacing, _CLEAR * noise))
 
     asked = np.flatnonzero((size >= _FEW) & apart & (share > _BESIDE).any(axis=1)).tolist()
     bulges[asked] = list(in_threads(rises, asked))

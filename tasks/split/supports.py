@@ -43,6 +43,9 @@ _ABOVE = 0.1
 _AMID = 1.2
 """So many standard deviations from the middle of a top its points are not yet its sides, which are 1.7 away. There,
 `_FLAT` of all points must lie on it: between the crests of a crumpled cloth they do not."""
+_WIDE = 2.0
+"""A plane's points spread along it, in its narrowest direction, by this many times that distance at least (standard
+deviation): of a pot that few points show, most lie near some plane through it."""
 _ROUNDS = 3
 """How often a plane is fitted to the points on it."""
 _LEVEL = 0.5
@@ -79,7 +82,8 @@ class Supports:
     height: float
     """How far something must rise from a surface to stand on it, as a share of its extent."""
     _planes: dict[Labels, Plane | None] = field(default_factory=dict, init=False)
-    _answers: dict[tuple[Labels, Labels], bool] = field(default_factory=dict, init=False)
+    _answers: dict[tuple[Labels, Labels, Labels], bool] = field(default_factory=dict, init=False)
+    _shares: dict[tuple[Labels, Labels], float] = field(default_factory=dict, init=False)
     """What was found so far: many sets share their pieces."""
 
     def levels(self, labels: Labels) -> list[Labels]:
@@ -87,12 +91,22 @@ class Supports:
         together = [labels] if len(labels) > 1 else []
         return [level for level in (*together, *((row,) for row in labels)) if self._plane_of(level)]
 
-    def hold(self, level: Labels, labels: Labels) -> bool:
-        """Whether labels, taken together, stand on others that `levels` names."""
-        if (level, labels) not in self._answers:
+    def goes_on(self, level: Labels, labels: Labels) -> bool:
+        """Whether labels lie in the plane of others that `levels` names, as the pieces of a rug do."""
+        plane = self._plane_of(level)
+        if plane is None:
+            return False
+        if (level, labels) not in self._shares:
+            on = on_plane(self._places(labels), plane, self._thickness)
+            self._shares[level, labels] = float(on.mean())
+        return self._shares[level, labels] >= _FLAT
+
+    def hold(self, level: Labels, labels: Labels, more: Labels = ()) -> bool:
+        """Whether labels, taken together, stand on others that `levels` names. more: labels in which these go on."""
+        if (level, labels, more) not in self._answers:
             plane = self._plane_of(level)
-            self._answers[level, labels] = plane is not None and self._stands(plane, level, labels)
-        return self._answers[level, labels]
+            self._answers[level, labels, more] = plane is not None and self._stands(plane, (*level, *more), labels)
+        return self._answers[level, labels, more]
 
     def _plane_of(self, labels: Labels) -> Plane | None:
         """The level plane, its normal upwards, in which labels lie, or their top; None where there is neither."""
@@ -101,7 +115,8 @@ class Supports:
             places = self._places(labels)
             if len(places) >= _FEW:
                 plane = plane_of_most(places, self._thickness, _ROUNDS)
-                if self._level(plane) and on_plane(places, plane, self._thickness).mean() >= _FLAT:
+                on = on_plane(places, plane, self._thickness)
+                if self._level(plane) and on.mean() >= _FLAT and self._wide(places[on], plane):
                     self._planes[labels] = plane[0], towards(plane[1], plane[0], self.eye)
                 else:
                     self._planes[labels] = self._top_of(places)
@@ -120,12 +135,19 @@ class Supports:
         on = np.abs(height) <= self._thickness
         if normal @ self.up < _LEVEL or on.mean() < _TOP or (height > self._thickness).mean() > _ABOVE:
             return None
+        if not self._wide(places[on], (centre, normal)):
+            return None
         spread = np.linalg.pinv(np.cov(along[on].T))
         amid = np.einsum("ni,ij,nj->n", along, spread, along) <= _AMID**2
         return (centre, normal) if on[amid].mean() >= _FLAT else None
 
     def _level(self, plane: Plane) -> bool:
         return bool(towards(plane[1], plane[0], self.eye) @ self.up >= _LEVEL)
+
+    def _wide(self, places: Float64, plane: Plane) -> bool:
+        """Whether points [N, 3] on a plane show that it is one: they are spread farther along it than across."""
+        along = places @ axes_in(plane[1]).T
+        return bool(np.linalg.eigvalsh(np.cov(along.T))[0] >= (_WIDE * self._thickness) ** 2)
 
     def _stands(self, plane: Plane, level: Labels, labels: Labels) -> bool:
         """Whether labels rise from the plane of others, which go on round their foot."""

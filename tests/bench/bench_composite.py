@@ -37,7 +37,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from depth_sensor import sensed
 from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
+from generated_flat import generate_flat
 from generated_kitchen import generate_kitchen
+from generated_orbit import generate_orbit
 from generated_shelf import generate_shelf
 from generated_walk import generate_walk
 
@@ -59,7 +61,9 @@ ROOM = RoomParams(composite=True, views=24, width=480, height=360, held_out=0)
 OTHERS = {
     "bedroom": generate_bedroom,
     "desk": generate_desk,
+    "flat": generate_flat,
     "kitchen": generate_kitchen,
+    "orbit": generate_orbit,
     "shelf": generate_shelf,
     "walk": generate_walk,
 }

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
+from generated_flat import generate_flat
 from generated_kitchen import generate_kitchen
+from generated_orbit import generate_orbit
 from generated_shelf import generate_shelf
 from generated_walk import by_phone, generate_walk
 
@@ -65,7 +67,24 @@ def walk() -> Room:
     return generate_walk(3, views=6, width=160, height=120)
 
 
-KINDS = {"bedroom": generate_bedroom, "kitchen": generate_kitchen, "shelf": generate_shelf, "walk": generate_walk}
+@pytest.fixture(scope="module")
+def orbit() -> Room:
+    return generate_orbit(3, views=6, width=160, height=120)
+
+
+@pytest.fixture(scope="module")
+def flat() -> Room:
+    return generate_flat(3, views=8, width=160, height=120)
+
+
+KINDS = {
+    "bedroom": generate_bedroom,
+    "flat": generate_flat,
+    "kitchen": generate_kitchen,
+    "orbit": generate_orbit,
+    "shelf": generate_shelf,
+    "walk": generate_walk,
+}
 
 
 @pytest.mark.parametrize(("kind", "generate"), KINDS.items())
@@ -125,6 +144,35 @@ def test_a_walk_goes_round_twice(walk):
     eyes = np.linalg.inv(walk.cameras.world_to_camera)[:, :3, 3]
     angles = np.unwrap(np.arctan2(eyes[:, 1], eyes[:, 0]))
     assert (np.diff(angles) > 0).all() and angles[-1] - angles[0] > 3 * np.pi
+
+
+def test_an_orbit_has_one_thing_in_the_middle_of_every_photo(orbit):
+    assert orbit.objects[0].name.split()[-1] == "handbag" and len(orbit.objects[0].parts) == 5
+    v, u = np.mgrid[:120, :160]
+    for ids in orbit.ids:
+        mine = ids == 1
+        assert 0.02 < mine.mean() < 0.3
+        assert abs(u[mine].mean() - 80) < 30 and abs(v[mine].mean() - 60) < 25
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_fifth_orbit_is_of_another_thing_which_stands_on_something(seed):
+    orbit = generate_orbit(seed, views=2, width=64, height=48)
+    thing, *stand = orbit.objects
+    assert thing.name.split()[-1] == ["teapot", "robot", "shoe", "handbag", "truck"][seed]
+    lowest = orbit.points[orbit.point_ids == 1, 2].min()
+    highest = max([orbit.points[orbit.point_ids == one.instance_id, 2].max() for one in stand], default=0.0)
+    assert abs(lowest - highest) < 0.03
+
+
+def test_a_flat_has_two_rooms_of_which_the_table_is_seen_from_both_and_nothing_is_known_beyond_four_metres(flat):
+    table = flat.objects[0]
+    eyes = np.linalg.inv(flat.cameras.world_to_camera)[:, 0, 3]
+    sees = np.array([(ids == table.instance_id).any() for ids in flat.ids])
+    assert sees[eyes < 0].any() and sees[eyes > 0].any()
+    beyond = flat.points[flat.point_ids > 0, 0]
+    assert (beyond < -0.5).any() and (beyond > 0.5).any() and (np.abs(beyond) < 3.5).all()
+    assert flat.depth.max() <= 4 and 0.5 < (flat.depth > 0).mean() < 0.98
 
 
 def test_a_phone_exposes_and_balances_anew_and_darkens_corners():

@@ -20,8 +20,8 @@ CHEST = 0.8, 0.42, 0.78
 def bed(frame: str, cover: str, pattern: str, width: float) -> Composite:
     """A bed, 2 m long, its head to +y: a frame, a mattress, and a cover that hangs down on both sides."""
     legs = [box(0.07, 0.07, 0.12).moved(x * (width / 2 - 0.06), y * 0.93, 0) for x in (-1, 1) for y in (-1, 1)]
-    mattress = _rounded(width / 2 - 0.02, 0.96, 0.11).moved(0, -0.01, 0.37)
-    lying = _rounded(width / 2 + 0.02, 0.69, 0.05).moved(0, -0.26, BED_TOP - 0.035)
+    mattress = rounded(width / 2 - 0.02, 0.96, 0.11).moved(0, -0.01, 0.37)
+    lying = rounded(width / 2 + 0.02, 0.69, 0.05).moved(0, -0.26, BED_TOP - 0.035)
     hanging = [box(0.03, 1.34, 0.22).moved(s * (width / 2 + 0.01), -0.26, BED_TOP - 0.26) for s in (-1, 1)]
     turned_down = box(width + 0.02, 0.16, 0.02).moved(0, 0.36, BED_TOP + 0.01)
     return Composite(
@@ -39,7 +39,7 @@ def bed(frame: str, cover: str, pattern: str, width: float) -> Composite:
 def pillow(color: str, shade: str, size: tuple[float, float, float]) -> Composite:
     """A lying pillow, striped unless both colours are one. size: along x, y, z."""
     x, y, z = np.array(size) / 2
-    body = _rounded(x, y, z, power=3).moved(0, 0, z)
+    body = rounded(x, y, z, power=3).moved(0, 0, z)
     return Composite(f"{color} pillow", (Piece("pillow", body, paint(color, shade, "stripes", 0.06)),))
 
 
@@ -139,7 +139,7 @@ def stool(seat: str, foot: str) -> Composite:
         (
             Piece("drum", can(0.2, 0.3), paint(foot)),
             Piece("band", turned_profile([(0.2 + LIFT, 0.12), (0.2 + LIFT, 0.16)]), paint("white")),
-            Piece("seat", _rounded(0.22, 0.22, 0.05, power=3).moved(0, 0, 0.34), paint(seat)),
+            Piece("seat", rounded(0.22, 0.22, 0.05, power=3).moved(0, 0, 0.34), paint(seat)),
         ),
     )
 
@@ -186,7 +186,7 @@ def _folds(width: float, low: float, high: float, deep: float = 0.03) -> Mesh:
     return Mesh(placed, np.tile(normals, (2, 1)), placed, triangles.astype(np.int32))
 
 
-def _rounded(x: float, y: float, z: float, power: float = 8) -> Mesh:
+def rounded(x: float, y: float, z: float, power: float = 8) -> Mesh:
     """A body about the origin, by its half axes: an ellipsoid (power 2) to a cuboid with round edges (large ones)."""
     unit = ball(1.0).moved(0, 0, -1)
     places = unit.vertices / (np.abs(unit.vertices) ** power).sum(axis=1, keepdims=True) ** (1 / power)

@@ -20,7 +20,9 @@ SEAT = grid(1.2, 0.8)
 HOLE = (np.abs(SEAT[:, :2]) < 0.15).all(axis=1)
 
 
-def mounds(places: np.ndarray, label: np.ndarray, color: tuple[int, int, int], asked: float, spacing=STEP) -> Mounds:
+def mounds(
+    places: np.ndarray, label: np.ndarray, color: tuple[int, int, int], asked: float, spacing=STEP, noise=0.0
+) -> Mounds:
     """Of a beige label 1 and label 2 in a colour, which meet each other alone, seen from above."""
     nothing = np.zeros(0, np.int32)
     labels = PointLabels(label, np.ones(len(label)), 2, nothing, nothing, nothing)
@@ -32,11 +34,13 @@ def mounds(places: np.ndarray, label: np.ndarray, color: tuple[int, int, int], a
     seen = Tally("a", both, np.bincount(label)[1:].astype(np.int32), np.zeros((0, 2), np.int32), beside, np.zeros(0))
     cloud = PointCloud(places.astype(np.float32), np.array([BEIGE, color], np.uint8)[label - 1], 1.0, STEP)
     ends = borders(labels.label, cloud, TouchingParams())
-    cloud = replace(cloud, spacing=spacing)
+    cloud = replace(cloud, spacing=spacing, noise=noise)
     return find_mounds(cloud, cameras, labels, [seen], ends, around=0.8, height=asked)
 
 
-def on_seat(height: float, color: tuple[int, int, int], asked: float = 0.09, spacing: float = STEP) -> Mounds:
+def on_seat(
+    height: float, color: tuple[int, int, int], asked: float = 0.09, spacing: float = STEP, noise: float = 0.0
+) -> Mounds:
     """A beige seat (label 1), seen from above, with something of this height and colour in the middle (label 2).
 
     asked: share of its extent from which it stands there.
@@ -47,7 +51,7 @@ def on_seat(height: float, color: tuple[int, int, int], asked: float = 0.09, spa
     sides = np.concatenate([np.zeros((0, 3)), *(rim * (1, 1, 0) + (0, 0, z) for z in steps)])
     places = np.concatenate([SEAT[~HOLE], top, sides]).astype(np.float32)
     label = np.repeat(np.array([1, 2], np.int32), [(~HOLE).sum(), len(top) + len(sides)])
-    return mounds(places, label, color, asked, spacing)
+    return mounds(places, label, color, asked, spacing, noise)
 
 
 @pytest.mark.parametrize(
@@ -66,6 +70,11 @@ def test_what_has_other_colours_still_rises_by_two_thirds_of_what_is_asked(heigh
 @pytest.mark.parametrize(("spacing", "rises"), [(0.03, True), (0.07, False)])
 def test_what_rises_by_less_than_two_spacings_may_be_noise(spacing, rises):
     assert on_seat(0.12, RED, asked=0.0, spacing=spacing).bulges.tolist() == [False, rises]
+
+
+@pytest.mark.parametrize(("noise", "rises"), [(0.01, True), (0.04, False)])
+def test_what_rises_by_less_than_twice_the_noise_of_the_depth_at_two_metres_may_be_noise(noise, rises):
+    assert on_seat(0.12, RED, asked=0.0, noise=noise).bulges.tolist() == [False, rises]
 
 
 def test_a_hump_that_rises_without_an_edge_does_not_stand_on_what_is_round_it():

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
+from ss_flow.tasks.split.stuff import StuffParams
 from ss_flow.tasks.split.supports import Supports, find_supports
 
 STEP = 0.01
@@ -100,6 +103,20 @@ def test_a_crumpled_cloth_is_nothing_to_stand_on():
     assert supports.levels((0,)) == []
 
 
+@pytest.mark.parametrize(
+    ("width", "spacing", "is_level"),
+    [
+        pytest.param(0.16, STEP, True, id="a closed pot"),
+        pytest.param(0.16, 2 * STEP, False, id="a pot that few points show, near the middle of which most lie"),
+        pytest.param(0.5, 2 * STEP, True, id="a cushion that few points show"),
+    ],
+)
+def test_what_lies_near_a_plane_but_no_wider_than_that_is_nothing_to_stand_on(width, spacing, is_level):
+    cloud, cameras, labels = scene([block(width, width, 0.1)])
+    supports = find_supports(replace(cloud, spacing=spacing), cameras, labels, height=0.09)
+    assert supports.levels((0,)) == ([(0,)] if is_level else [])
+
+
 CHEST = block(0.8, 0.5, 0.7)
 
 
@@ -133,7 +150,8 @@ def test_a_chair_or_a_shelf_of_one_piece_is_nothing_to_stand_on(more):
 
 
 def tree(masks: list[set[int]], pieces: list[np.ndarray]) -> dict[frozenset[int], float]:
-    """The agreement of each union of leaves, where four views see all pieces and have these masks, of labels."""
+    """The agreement of each union of leaves, where four views see all pieces, none of them stuff, and have
+    these masks, of labels."""
     cloud, cameras, labels = scene(pieces)
     number = np.arange(1, len(pieces) + 1, dtype=np.int32)
     size = np.array([len(piece) for piece in pieces], np.int32)
@@ -143,7 +161,7 @@ def tree(masks: list[set[int]], pieces: list[np.ndarray]) -> dict[frozenset[int]
         held = np.array([seen * np.isin(number, [*mask]) for mask in masks], np.int32)
         beside = np.zeros((len(pieces), len(pieces)), np.int32)
         views.append(Tally(f"{k}", number, seen, held, beside, np.full(len(masks), 0.9, np.float32)))
-    found = hierarchy(cloud, cameras, [], labels, views, params=HierarchyParams())
+    found = hierarchy(cloud, cameras, [], labels, views, params=HierarchyParams(stuff=StuffParams(extent=1.0)))
     leaves = {node: frozenset({node}) for node in number.tolist()}
     for node in sorted(set(found.parent.tolist()) - {0}):
         children = found.node[found.parent == node].tolist()
@@ -158,6 +176,16 @@ def test_what_stands_on_a_table_is_no_part_of_it_though_every_mask_of_it_holds_t
     found = tree([{1}, {1, 2, 3}, {2, 3}], [top, *mug()])
     assert found[frozenset({2, 3})] > 0.6
     assert found.get(frozenset({1, 2, 3}), 0) < 0.45
+
+
+@pytest.mark.parametrize("edge", [0.0, 0.1], ids=["an edge under it", "an edge beside it"])
+def test_what_stands_on_a_rug_is_no_part_of_it_though_that_is_in_pieces(edge):
+    rug = lying(0.8, 0.8)
+    rug = rug[~((np.abs(rug[:, :2]) < 0.04).all(axis=1))]
+    stool = block(0.08, 0.08, 0.1)
+    found = tree([{1, 2, 3}, {1}, {2}, {3}], [rug[rug[:, 0] < edge], rug[rug[:, 0] >= edge], stool])
+    assert found[frozenset({1, 2})] > 0.6
+    assert found.get(frozenset({1, 2, 3}), 0) <= 0.45
 
 
 def test_two_things_on_a_table_are_not_one_because_a_mask_of_it_holds_both():
