@@ -298,11 +298,13 @@ class _Pieces:
         )
 
     def _on_level(self, members: Members) -> set[int]:
-        """Those of these pieces that, with those they touch, stand on a level one."""
+        """Those of these pieces that, alone or with those they touch, stand on a level one: a mug may be in pieces, and
+        a carton touch the book beside it."""
         found: set[int] = set()
         for base in members:
             levels = self.supports.levels(self.labels[base])
-            for part in self.contact.parted(tuple(piece for piece in members if piece != base)) if levels else []:
+            others = tuple(piece for piece in members if piece != base)
+            for part in {*self.contact.parted(others), *((piece,) for piece in others)} if levels else ():
                 labels = tuple(row for piece in part for row in self.labels[piece])
                 if any(self.supports.hold(level, labels) for level in levels):
                     found.update(part)
