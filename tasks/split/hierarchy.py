@@ -300,22 +300,29 @@ class _Pieces:
         )
 
     def _on_level(self, members: Members) -> set[int]:
-        """Those of these pieces that, with those they touch, stand on a level one and those that go on in its plane."""
+        """Those of these pieces that, alone or with those they touch, stand on a level one: a mug may be in pieces, and
+        a carton touch the book beside it."""
         found: set[int] = set()
         for base in members:
             others = tuple(piece for piece in members if piece != base)
             for level in self.supports.levels(self.labels[base]):
-                for part in self.contact.parted(others):
-                    if self.supports.hold(level, self._labels_of(part)):
-                        found.update(part)
-                        continue
-                    more = {piece for piece in part if self.supports.goes_on(level, self.labels[piece])}
-                    for rest in (
-                        self.contact.parted(tuple(piece for piece in part if piece not in more)) if more else []
-                    ):
-                        if self.supports.hold(level, self._labels_of(rest), self._labels_of(sorted(more))):
-                            found.update(rest)
+                for part in {*self.contact.parted(others), *((piece,) for piece in others)}:
+                    found.update(self._standing(level, part))
         return found
 
-    def _labels_of(self, pieces: Sequence[int]) -> Members:
+    def _standing(self, level: Members, part: Members) -> set[int]:
+        """All pieces of a part that stands on a level surface; or those that stand on it and on what goes on in its
+        plane, as the other pieces of a rug do."""
+        if self.supports.hold(level, self._labels_of(part)):
+            return set(part)
+        ground = tuple(piece for piece in part if self.supports.goes_on(level, self.labels[piece]))
+        rests = self.contact.parted(tuple(piece for piece in part if piece not in ground)) if ground else []
+        return {
+            piece
+            for rest in rests
+            if self.supports.hold(level, self._labels_of(rest), self._labels_of(ground))
+            for piece in rest
+        }
+
+    def _labels_of(self, pieces: Members) -> Members:
         return tuple(row for piece in pieces for row in self.labels[piece])

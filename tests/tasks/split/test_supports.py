@@ -194,3 +194,18 @@ def test_two_things_on_a_table_are_not_one_because_a_mask_of_it_holds_both():
     found = tree([{1, 2, 3, 4}, {2, 3, 4}], [top, *mug(), book])
     assert frozenset({2, 3, 4}) in found
     assert found[frozenset({2, 3, 4})] < 0.7 * 0.9
+
+
+def test_things_that_touch_each_other_on_a_table_stand_on_it_though_together_they_take_half_of_it():
+    sides = [block(0.1, 0.6, 0.1) + np.array([x, 0, 0]) for x in (-0.25, 0.25)]
+    things = [*sides, block(0.4, 0.1, 0.1)]
+    legs = [block(0.05, 0.05, 0.5) + np.array([x, y, -0.51]) for x in (-0.37, 0.37) for y in (-0.37, 0.37)]
+    top = lying(0.8, 0.8)
+    for thing in things:
+        low, high = thing[:, :2].min(axis=0) - STEP / 2, thing[:, :2].max(axis=0) + STEP / 2
+        top = top[~((top[:, :2] >= low) & (top[:, :2] <= high)).all(axis=1)]
+    pieces = [np.concatenate([top, *legs]), *things]
+    everything = frozenset({1, 2, 3, 4})
+    assert tree([{1, 2, 3, 4}], pieces)[everything] == pytest.approx(0.5)  # a group
+    lower = [piece - np.array([0, 0, 0.3]) for piece in things]  # under the table, where they do not stand on it
+    assert tree([{1, 2, 3, 4}], [pieces[0], *lower])[everything] > 0.6
