@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ss_flow.tasks.artifacts import Bool, Float32, InstanceMasks, Int32, UInt8
 from ss_flow.tasks.gaussians.library import VotingView, address, library
 from ss_flow.tasks.gaussians.views import IGNORED, SceneViews, channels_of_mask
-from ss_flow.tasks.geometry.cameras import surface_of_pixels
+from ss_flow.tasks.geometry.cameras import project, surface_of_pixels
 from ss_flow.tasks.geometry.clustering import dbscan, nearest_spacing
 from ss_flow.tasks.geometry.fusion import depth_at
 from ss_flow.tasks.geometry.images import pixels_under, shared_rgb
@@ -28,6 +28,9 @@ REACH = 8
 """Pixels of the photo on either side of a mask's border in which the other views are asked."""
 MOST_VIEWS = 12
 """Views that are asked about another one, evenly spread."""
+COARSEST = 4.0
+"""Pixels of the photos from one point to the next, above which an instance gets more of them. A lawn takes most of the
+scene's points, and a book on the table before it hardly any."""
 BEYOND = 2.0
 """A surface is missing where it lies farther than so many spacings from all labelled points."""
 CONNECTED = 3.0
@@ -79,21 +82,23 @@ def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator
 
 def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> InstanceMasks:
     """The instance with points where its masks hold a surface that has no labelled point: thin legs, mostly, which the
-    borders of the masks hide from the vote on labels.
+    borders of the masks hide from the vote on labels; and what lies between points that are far apart in the photos.
 
     A point joins when the masks of at least four views hold it, and those of at least `share` of the views that see
     it, and when other points lead from it to the labelled ones. What is apart is another thing, unless it lies inside
     the box around all of these, as a chair's leg does whose upper end the seat hides: a piece of at least ten points
     there joins, and for that the masks of three views are enough. One point joins for each cube of the points' spacing,
-    the first; its confidence is that share.
+    or of `COARSEST` pixels where that is less, the first; its confidence is that share, and its part that of the
+    labelled point that it lies beside.
     """
     from scipy.spatial import cKDTree
 
-    if not (spacing := nearest_spacing(instance.points)):
+    if not (own_spacing := nearest_spacing(instance.points)):
         return instance
+    views = _views(scene, instance)
+    spacing = min(own_spacing, COARSEST * _pixel(scene, views, instance.points))
     tree = cKDTree(instance.points)
     found: list[tuple[Float32, UInt8, Float32, Bool]] = []
-    views = _views(scene, instance)
 
     def missing(place: int) -> _Pixels:
         row, column = np.nonzero(instance.mask(place)[::STRIDE, ::STRIDE])
@@ -116,13 +121,20 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     rows = np.concatenate([led_to, _pieces_inside(instance.points, points, led_to, spacing)])
     if not len(rows):
         return instance
+    _, beside = tree.query(points[rows], distance_upper_bound=BEYOND * own_spacing, workers=1)
     return replace(
         instance,
         points=np.concatenate([instance.points, points[rows]]),
         colors=np.concatenate([instance.colors, colors[rows]]),
         point_confidence=np.concatenate([instance.point_confidence, confidence[rows]]),
-        point_part=np.concatenate([instance.point_part, np.zeros(len(rows), np.int32)]),
+        point_part=np.concatenate([instance.point_part, np.append(instance.point_part, np.int32(0))[beside]]),
     )
+
+
+def _pixel(scene: SceneViews, views: list[int], points: Float32) -> float:
+    """Side of a pixel at an instance's points, world units: the median over its views."""
+    cameras = [scene.cameras[view] for view in views]
+    return float(np.median([np.median(project(points, camera)[1]) / camera.fx for camera in cameras]))
 
 
 def _led_to(own: Float32, points: Float32, rows: _Rows, spacing: float) -> _Rows:

@@ -16,6 +16,7 @@ from ss_flow.tasks.artifacts import InstanceMasks
 from ss_flow.tasks.gaussians import library
 from ss_flow.tasks.gaussians.views import IGNORED, NONE_OF_MINE
 from ss_flow.tasks.geometry.cameras import backproject
+from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.splat.consensus import Voter, agreed, completed
 
@@ -129,6 +130,22 @@ def test_surface_that_the_masks_hold_gets_the_points_that_it_lacks(small):
     assert len(added) > 50 and off.max() < 0.005 and added[:, 2].max() > 0.4
     assert len(full.colors) == len(full.point_confidence) == len(full.point_part) == len(full.points)
     assert (full.point_confidence >= 0.7).all()
+
+
+def test_points_far_apart_in_the_photos_get_others_between_them_of_the_same_parts(small, monkeypatch):
+    monkeypatch.setattr("ss_flow.tasks.splat.consensus.COARSEST", 1.0)  # the ball is two dozen pixels wide
+    whole = small.instance(BALL, every=1)
+    pixel = np.median([np.linalg.norm(camera.center - CENTRE) / camera.fx for camera in small.views.cameras])
+    rows = [0]
+    for row, point in enumerate(whole.points):
+        if np.linalg.norm(whole.points[rows] - point, axis=1).min() > 5 * pixel:
+            rows.append(row)
+    fields = {name: getattr(whole, name)[rows] for name in ("points", "colors", "point_confidence", "point_part")}
+    full = completed(small.views.compared(VisibilityParams()), replace(whole, **fields), 0.7)
+    added, part = full.points[len(rows) :], full.point_part[len(rows) :]
+    assert nearest_spacing(full.points) < 1.5 * pixel < 5 * pixel < nearest_spacing(whole.points[rows])
+    assert np.abs(np.linalg.norm(added - CENTRE, axis=1) - RADIUS).max() < 0.005
+    assert len(added) > 2 * len(rows) and (part == (added[:, 2] > 0.25)).mean() > 0.8 and 0 < part.mean() < 1
 
 
 def test_a_complete_instance_and_what_few_masks_hold_gain_no_points(small):
