@@ -23,6 +23,8 @@ NEIGHBOURS = 3
 """The spacing of an instance is the median distance of its Gaussians to the neighbour of this rank."""
 GAP = 5.0
 """Spacings without a Gaussian that part one piece of an instance from another."""
+LONELY = 3.0
+"""Spacings to the neighbour of that rank beyond which a Gaussian is alone, and so on no surface of its instance."""
 LEAST_OWN = 0.5
 """Share of a piece's weight that lies in pixels of its instance, from which it belongs there."""
 BACKGROUND = 0
@@ -36,10 +38,13 @@ def without_strays(cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[
     but the background falls into pieces, GAP spacings and more from one another. The piece that weighs most in the
     pixels of its instance, T * alpha summed over all views, is kept, and so is each that has at least half of its own
     weight there. What of the others lies outside the box around these becomes part 0 of the background; inside of it,
-    it may be a leg that masks lack. The whole scene looks as before, as only labels change.
+    it may be a leg that masks lack. So does a LONELY Gaussian wherever it shows: where no depth is known, single ones
+    hang before and behind things, and photos from one side do not contradict them. The whole scene looks as before, as
+    only labels change.
 
     scene: fully trained. masks: exclusive label maps of all views, one a camera.
     """
+    scene = _as_background(scene, _lonely(scene))
     piece = _pieces_apart(scene)
     rows = np.flatnonzero(piece >= 0)
     if not len(rows):
@@ -53,11 +58,25 @@ def without_strays(cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[
     kept[main] = True
     strays = (piece >= 0) & ~kept[piece]
     strays &= ~_inside_own_box(scene, ~strays)
+    return _as_background(scene, strays)
+
+
+def _as_background(scene: Gaussians, rows: Bool) -> Gaussians:
     return replace(
         scene,
-        instance_id=np.where(strays, BACKGROUND, scene.instance_id).astype(np.int32),
-        part_id=np.where(strays, 0, scene.part_id).astype(np.int32),
+        instance_id=np.where(rows, BACKGROUND, scene.instance_id).astype(np.int32),
+        part_id=np.where(rows, 0, scene.part_id).astype(np.int32),
     )
+
+
+def _lonely(scene: Gaussians) -> Bool:
+    """[N] which Gaussians have hardly any of their instance near them; none of the background."""
+    lonely = np.zeros(len(scene), bool)
+    for instance, rows in rows_by_label(scene.instance_id).items():
+        if instance != BACKGROUND and len(rows) > NEIGHBOURS:
+            distance = _to_neighbours(scene.means[rows])
+            lonely[rows] = distance > LONELY * np.median(distance)
+    return lonely
 
 
 def _pieces_apart(scene: Gaussians) -> Int32:
@@ -67,7 +86,8 @@ def _pieces_apart(scene: Gaussians) -> Int32:
     for instance, rows in rows_by_label(scene.instance_id).items():
         if instance == BACKGROUND or len(rows) <= NEIGHBOURS:
             continue
-        found = dbscan(scene.means[rows], GAP * _spacing(scene.means[rows]), min_samples=1)
+        spacing = float(np.median(_to_neighbours(scene.means[rows])))
+        found = dbscan(scene.means[rows], GAP * spacing, min_samples=1)
         if pieces := int(found.max()):
             piece[rows] = count + found
             count += pieces + 1
@@ -83,11 +103,12 @@ def _inside_own_box(scene: Gaussians, kept: Bool) -> Bool:
     return inside
 
 
-def _spacing(points: Float32) -> float:
+def _to_neighbours(points: Float32) -> Float64:
+    """[N] distance to the neighbour of rank NEIGHBOURS."""
     from scipy.spatial import cKDTree
 
     distance, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1, workers=cores())
-    return float(np.median(np.asarray(distance)[:, -1]))
+    return np.asarray(distance)[:, -1]
 
 
 def _weights(cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[LabelMap]) -> tuple[Float64, Float64]:
