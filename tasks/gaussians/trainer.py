@@ -72,7 +72,7 @@ class TrainParams:
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
     """Gaussians with no larger weight in any view are dropped at the end; 0 keeps them."""
-    max_scale: NonNegative = 0.0
+    max_length: NonNegative = 0.0
     """No standard deviation of an instance's Gaussians exceeds so many times the median of the longest with which they
     start; those of the background (id 0) may. 0 = no limit."""
 
@@ -191,7 +191,7 @@ class _Training:
             raise ValueError("the initial Gaussians hold values that are not finite")
         self._extents = backend.put(extents)
         self._channels = backend.put(channels_of(initial.instance_id, label_ids)) if num_labels else None
-        self._log_longest = backend.put(_log_longest(initial, params.max_scale)) if params.max_scale else None
+        self._log_longest = backend.put(_log_longest(initial, params.max_length)) if params.max_length else None
         self._control = _control(params, GradientRecord(len(initial), backend), float(extents.max()))
         self.step = 0
         # Of each view, those whose colour counts.
@@ -299,9 +299,9 @@ class _Training:
         return TrainResult(parameters.to_gaussians(self._initial), self.step, losses)
 
 
-def _log_longest(initial: Gaussians, max_scale: float) -> Float32:
+def _log_longest(initial: Gaussians, max_length: float) -> Float32:
     """[N] the logarithm of the longest standard deviation that each Gaussian may have."""
-    longest = np.log(np.float32(max_scale)) + log_lengths(initial)
+    longest = np.log(np.float32(max_length)) + log_lengths(initial)
     return np.where(initial.instance_id == 0, np.float32(np.inf), longest)
 
 

@@ -106,7 +106,7 @@ def _settings(params: MergeParams, steps: int) -> TrainParams:
         parts_per_step=SIDES_PER_STEP,
         prune_opacity=params.prune_opacity,
         prune_contribution=params.prune_contribution,
-        max_scale=params.max_scale,
+        max_length=params.max_length,
         rates=params.rates,
     )
 

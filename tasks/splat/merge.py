@@ -106,7 +106,7 @@ class MergeParams:
     extent: Literal["instance", "cameras"] = "instance"
     """What lengths are shares of, the rate of the means above all: "instance", the diagonal of each Gaussian's own
     instance; or "cameras", the radius of the cameras that see them, as in 3DGS (where that is 0, the diagonal)."""
-    max_scale: NonNegative = 1.5
+    max_length: NonNegative = 1.5
     """No Gaussian becomes longer (one standard deviation) than so many times the median with which those of its
     instance start; the background's may. 0 = any."""
     rates: LearningRates = LearningRates(
@@ -197,7 +197,7 @@ def merge_pair(
         mask_weight=w_mask,
         prune_opacity=0.0,
         prune_contribution=0.0,
-        max_scale=params.max_scale,
+        max_length=params.max_length,
         rates=params.rates,
     )
     trained = train(

@@ -81,7 +81,7 @@ class ReconstructParams:
     extent: Literal["instance", "cameras"] = "instance"
     """What lengths are shares of, the rate of the means above all: "instance", the diagonal of the instance's box; or
     "cameras", the radius of the cameras that see it, as in 3DGS (where that is 0, the diagonal)."""
-    max_scale: NonNegative = 1.5
+    max_length: NonNegative = 1.5
     """No Gaussian becomes longer (one standard deviation) than so many times the median with which those of its
     instance start; the background's may. 0 = any."""
     rates: LearningRates = LearningRates(rotation=3e-4)
@@ -266,6 +266,6 @@ def _settings(params: ReconstructParams, iterations: int, scale: float) -> Train
         schedule=params.schedule,
         max_gaussians=round(params.max_gaussians * scale),
         prune_contribution=params.prune_contribution,
-        max_scale=params.max_scale,
+        max_length=params.max_length,
         rates=params.rates,
     )

@@ -191,8 +191,8 @@ TABLE = {
     "splat.refine.max_scale": (0.0, 0.0, 0.5),
     "splat.refine.cut_occluded": (False, False, True),
     "splat.refine.box_margin": (0.0, 0.0, 16.0),
-    "splat.reconstruct.max_scale": (0.0, 0.0, 1.5),
-    "splat.merge.max_scale": (0.0, 0.0, 1.5),
+    "splat.reconstruct.max_length": (0.0, 0.0, 1.5),
+    "splat.merge.max_length": (0.0, 0.0, 1.5),
     # 29
     "splat.refine.tau_iou": (0.95, 0.05, 0.5),
     # 30: ours keeps what the photo gave, and replaces what was drawn from points.

@@ -31,7 +31,7 @@ def test_a_training_is_the_same_on_every_backend(backend):
 
 def test_a_training_that_densifies_is_the_same_until_rounding_parts_them(backend):
     # A millionth of the gradients decides, some steps later, who is split: then all goes other ways, here too.
-    params = TrainParams(iterations=40, schedule=Schedule(10, 30, 10, 25, shorten=False), max_scale=1.5)
+    params = TrainParams(iterations=40, schedule=Schedule(10, 30, 10, 25, shorten=False), max_length=1.5)
     ours, theirs = (trained(one, replace(params, densify_grad=1e-5)) for one in (NATIVE, backend))
     np.testing.assert_allclose(theirs.loss[:20], ours.loss[:20], rtol=0.5 * tolerance(backend))
     assert len(theirs.gaussians) > 100

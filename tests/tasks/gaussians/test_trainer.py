@@ -41,7 +41,7 @@ def test_each_instance_has_a_limit_of_its_own_to_how_long_gaussians_become_and_t
     longer = ball.log_scales + np.log(np.array([1, 1, 4], np.float32))[ids][:, None]
     longer[:6] += 1.5  # two of each
     begun = replace(ball, instance_id=ids, log_scales=longer)
-    params = TrainParams(iterations=1, densify="none", max_scale=1.2, prune_contribution=0.0, prune_opacity=0.0)
+    params = TrainParams(iterations=1, densify="none", max_length=1.2, prune_contribution=0.0, prune_opacity=0.0)
     ended = train(begun, VIEWS, params=params, extent=1.6, seed=1).gaussians
     most = [ended.log_scales[ids == i].max() - np.median(longer[ids == i].max(axis=1)) for i in range(3)]
     assert most[0] > 1 and np.allclose(most[1:], np.log(1.2), atol=1e-5)

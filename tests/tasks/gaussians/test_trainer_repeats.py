@@ -35,7 +35,7 @@ def test_the_number_of_threads_changes_no_byte(native, with_parts):
     params = TrainParams(iterations=240)
     parts = [part_view(0, 300, 0.3), part_view(0, 150, 2.0), part_view(100, 300, 4.0)] if with_parts else []
     if with_parts:
-        params = replace(params, densify="none", part_weight=0.5, parts_per_step=2, max_scale=1.5)
+        params = replace(params, densify="none", part_weight=0.5, parts_per_step=2, max_length=1.5)
     trained = []
     for cores in (1, 2, 3):
         with running(Surroundings(cores=cores)):

@@ -138,7 +138,7 @@ def test_no_gaussian_becomes_much_longer_than_those_of_its_instance_start_and_a_
     instance = replace(instance, points=np.concatenate([instance.points[:-1], instance.points[-1:] + 0.3]))
     start = np.exp(initialise(instance.points, instance.colors, 1, 1.0).log_scales).max(axis=1)
     for times in (3.0, 1.5):
-        params = replace(TRAIN, max_scale=times, max_points=len(instance.points), tau_agree=0.0)
+        params = replace(TRAIN, max_length=times, max_points=len(instance.points), tau_agree=0.0)
         longest = float(np.exp(reconstruct(built.views, instance, params=params).log_scales).max())
         limit = times * float(np.median(start))
         assert 0.9 * limit < longest <= limit * (1 + 1e-5) < start.max()
