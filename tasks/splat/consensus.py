@@ -31,6 +31,8 @@ MOST_VIEWS = 12
 COARSEST = 4.0
 """Pixels of the photos from one point to the next, above which an instance gets more of them. A lawn takes most of the
 scene's points, and a book on the table before it hardly any."""
+COARSEST_TRAINED = 2.0
+"""Pixels of whole photos as they are trained on, up to which it gets none either: they show nothing finer."""
 BEYOND = 2.0
 """A surface is missing where it lies farther than so many spacings from all labelled points."""
 CONNECTED = 3.0
@@ -80,7 +82,7 @@ def agreed(scene: SceneViews, instance: InstanceMasks, share: float) -> Iterator
         yield channels
 
 
-def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> InstanceMasks:
+def completed(scene: SceneViews, instance: InstanceMasks, share: float, *, max_side: int) -> InstanceMasks:
     """The instance with points where its masks hold a surface that has no labelled point: thin legs, mostly, which the
     borders of the masks hide from the vote on labels; and what lies between points that are far apart in the photos.
 
@@ -88,15 +90,17 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     it, and when other points lead from it to the labelled ones. What is apart is another thing, unless it lies inside
     the box around all of these, as a chair's leg does whose upper end the seat hides: a piece of at least ten points
     there joins, and for that the masks of three views are enough. One point joins for each cube of the points' spacing,
-    or of `COARSEST` pixels where that is less, the first; its confidence is that share, and its part that of the
-    labelled point that it lies beside.
+    or of a few pixels where that is less, the first; its confidence is that share, and its part that of the labelled
+    point that it lies beside.
+
+    max_side: longer side of the whole photos that are trained on, pixels.
     """
     from scipy.spatial import cKDTree
 
     if not (own_spacing := nearest_spacing(instance.points)):
         return instance
     views = _views(scene, instance)
-    spacing = min(own_spacing, COARSEST * _pixel(scene, views, instance.points))
+    spacing = min(own_spacing, _a_few_pixels(scene, views, instance.points, max_side))
     tree = cKDTree(instance.points)
     found: list[tuple[Float32, UInt8, Float32, Bool]] = []
 
@@ -131,10 +135,13 @@ def completed(scene: SceneViews, instance: InstanceMasks, share: float) -> Insta
     )
 
 
-def _pixel(scene: SceneViews, views: list[int], points: Float32) -> float:
-    """Side of a pixel at an instance's points, world units: the median over its views."""
-    cameras = [scene.cameras[view] for view in views]
-    return float(np.median([np.median(project(points, camera)[1]) / camera.fx for camera in cameras]))
+def _a_few_pixels(scene: SceneViews, views: list[int], points: Float32, max_side: int) -> float:
+    """How far apart an instance's points may be, world units: the median over its views."""
+    sides = []
+    for camera in (scene.cameras[view] for view in views):
+        pixels = max(COARSEST, COARSEST_TRAINED * max(camera.width, camera.height) / max_side)
+        sides.append(pixels * np.median(project(points, camera)[1]) / camera.fx)
+    return float(np.median(sides))
 
 
 def _led_to(own: Float32, points: Float32, rows: _Rows, spacing: float) -> _Rows:

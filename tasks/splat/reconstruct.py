@@ -172,7 +172,9 @@ def retrain(
 
 def _completed(scene: SceneViews, instance: InstanceMasks, params: ReconstructParams) -> InstanceMasks:
     """With the surface that masks agree on (`tau_agree`); the background has no masks of its own to agree."""
-    return completed(scene, instance, params.tau_agree) if params.tau_agree and instance.instance_id else instance
+    if not params.tau_agree or not instance.instance_id:
+        return instance
+    return completed(scene, instance, params.tau_agree, max_side=params.crop.max_side)
 
 
 def _from_points(instance: InstanceMasks, params: ReconstructParams) -> Gaussians:

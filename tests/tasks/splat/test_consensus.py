@@ -123,7 +123,7 @@ def test_surface_that_the_masks_hold_gets_the_points_that_it_lacks(small):
         point_confidence=whole.point_confidence[low],
         point_part=whole.point_part[low],
     )
-    full = completed(small.views.compared(VisibilityParams()), half, 0.7)
+    full = completed(small.views.compared(VisibilityParams()), half, 0.7, max_side=480)
     np.testing.assert_array_equal(full.points[: low.sum()], half.points)
     added = full.points[low.sum() :]
     off = np.abs(np.linalg.norm(added - CENTRE, axis=1) - RADIUS)
@@ -141,24 +141,26 @@ def test_points_far_apart_in_the_photos_get_others_between_them_of_the_same_part
         if np.linalg.norm(whole.points[rows] - point, axis=1).min() > 5 * pixel:
             rows.append(row)
     fields = {name: getattr(whole, name)[rows] for name in ("points", "colors", "point_confidence", "point_part")}
-    full = completed(small.views.compared(VisibilityParams()), replace(whole, **fields), 0.7)
+    scene, coarse = small.views.compared(VisibilityParams()), replace(whole, **fields)
+    assert completed(scene, coarse, 0.7, max_side=20) is coarse  # trained on pictures that show nothing finer
+    full = completed(scene, coarse, 0.7, max_side=480)
     added, part = full.points[len(rows) :], full.point_part[len(rows) :]
-    assert nearest_spacing(full.points) < 1.5 * pixel < 5 * pixel < nearest_spacing(whole.points[rows])
+    assert nearest_spacing(full.points) < 1.5 * pixel < 5 * pixel < nearest_spacing(coarse.points)
     assert np.abs(np.linalg.norm(added - CENTRE, axis=1) - RADIUS).max() < 0.005
     assert len(added) > 2 * len(rows) and (part == (added[:, 2] > 0.25)).mean() > 0.8 and 0 < part.mean() < 1
 
 
 def test_a_complete_instance_and_what_few_masks_hold_gain_no_points(small):
     scene, instance = small.views.compared(VisibilityParams()), small.instance(BALL)
-    assert completed(scene, instance, 0.7) is instance
+    assert completed(scene, instance, 0.7, max_side=480) is instance
     wide = instance
     for row in (0, 1, 2):
         wide = with_mask(wide, row, grown(instance.mask(row), 6))
-    added = completed(scene, wide, 0.7).points[len(instance.points) :]
+    added = completed(scene, wide, 0.7, max_side=480).points[len(instance.points) :]
     off = np.abs(np.linalg.norm(added - CENTRE, axis=1) - RADIUS)
     assert not (off > 0.01).any()
     lone = replace(instance, points=instance.points[:1])
-    assert completed(scene, lone, 0.7) is lone
+    assert completed(scene, lone, 0.7, max_side=480) is lone
 
 
 def test_surface_apart_from_the_labelled_points_is_another_thing(small):
@@ -172,8 +174,8 @@ def test_surface_apart_from_the_labelled_points_is_another_thing(small):
         point_confidence=ball.point_confidence[apart],
         point_part=ball.point_part[apart],
     )
-    assert len(completed(small.views.compared(VisibilityParams()), far, 0.7).points) == len(far.points)
-    assert len(completed(small.views.compared(VisibilityParams()), both, 0.7).points) > len(both.points)
+    assert len(completed(small.views.compared(VisibilityParams()), far, 0.7, max_side=480).points) == len(far.points)
+    assert len(completed(small.views.compared(VisibilityParams()), both, 0.7, max_side=480).points) > len(both.points)
 
 
 PATCH = CENTRE + RADIUS / np.sqrt(3)
@@ -203,7 +205,7 @@ def test_a_piece_apart_joins_inside_the_box_of_the_rest(small):
     scene = small.views.compared(VisibilityParams())
     for views in (3, 8):
         instance = with_piece_apart(small, 0.1, views)
-        full = completed(scene, instance, 0.3)
+        full = completed(scene, instance, 0.3, max_side=480)
         added = full.points[len(instance.points) :]
         assert len(added) >= 10
         assert (np.linalg.norm(added - PATCH, axis=1) < 0.1 + 1e-4).all()
@@ -218,4 +220,4 @@ def test_a_piece_apart_joins_inside_the_box_of_the_rest(small):
 )
 def test_a_piece_apart_stays_another_thing(small, size, views, below):
     instance = with_piece_apart(small, size, views, below)
-    assert completed(small.views.compared(VisibilityParams()), instance, 0.3) is instance
+    assert completed(small.views.compared(VisibilityParams()), instance, 0.3, max_side=480) is instance
