@@ -5,13 +5,14 @@ Beyond Split&Splat.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.running import cores
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Gaussians, Int32, LabelMap
+from ss_flow.tasks.artifacts import Bool, Float64, Gaussians, Int32, LabelMap
 from ss_flow.tasks.gaussians.render import shares
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
@@ -72,10 +73,8 @@ def _as_background(scene: Gaussians, rows: Bool) -> Gaussians:
 def _lonely(scene: Gaussians) -> Bool:
     """[N] which Gaussians have hardly any of their instance near them; none of the background."""
     lonely = np.zeros(len(scene), bool)
-    for instance, rows in rows_by_label(scene.instance_id).items():
-        if instance != BACKGROUND and len(rows) > NEIGHBOURS:
-            distance = _to_neighbours(scene.means[rows])
-            lonely[rows] = distance > LONELY * np.median(distance)
+    for rows, distance in _things(scene):
+        lonely[rows] = distance > LONELY * np.median(distance)
     return lonely
 
 
@@ -83,15 +82,24 @@ def _pieces_apart(scene: Gaussians) -> Int32:
     """[N] the number of each Gaussian's piece, -1 where its instance is in one, or is the background."""
     piece = np.full(len(scene), -1, np.int32)
     count = 0
-    for instance, rows in rows_by_label(scene.instance_id).items():
-        if instance == BACKGROUND or len(rows) <= NEIGHBOURS:
-            continue
-        spacing = float(np.median(_to_neighbours(scene.means[rows])))
-        found = dbscan(scene.means[rows], GAP * spacing, min_samples=1)
+    for rows, distance in _things(scene):
+        found = dbscan(scene.means[rows], GAP * float(np.median(distance)), min_samples=1)
         if pieces := int(found.max()):
             piece[rows] = count + found
             count += pieces + 1
     return piece
+
+
+def _things(scene: Gaussians) -> Iterator[tuple[NDArray[np.intp], Float64]]:
+    """The rows of each instance but the background and those of few Gaussians, and how far each one's neighbour of rank
+    NEIGHBOURS is."""
+    from scipy.spatial import cKDTree
+
+    for instance, rows in rows_by_label(scene.instance_id).items():
+        if instance != BACKGROUND and len(rows) > NEIGHBOURS:
+            points = scene.means[rows]
+            distance, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1, workers=cores())
+            yield rows, np.asarray(distance)[:, -1]
 
 
 def _inside_own_box(scene: Gaussians, kept: Bool) -> Bool:
@@ -101,14 +109,6 @@ def _inside_own_box(scene: Gaussians, kept: Bool) -> Bool:
         own, known = scene.means[rows], scene.means[rows[kept[rows]]]
         inside[rows] = ((own >= known.min(axis=0)) & (own <= known.max(axis=0))).all(axis=1)
     return inside
-
-
-def _to_neighbours(points: Float32) -> Float64:
-    """[N] distance to the neighbour of rank NEIGHBOURS."""
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1, workers=cores())
-    return np.asarray(distance)[:, -1]
 
 
 def _weights(cameras: Sequence[Camera], scene: Gaussians, masks: Sequence[LabelMap]) -> tuple[Float64, Float64]:

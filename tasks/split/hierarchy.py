@@ -305,8 +305,10 @@ class _Pieces:
         found: set[int] = set()
         for base in members:
             others = tuple(piece for piece in members if piece != base)
-            for level in self.supports.levels(self.labels[base]):
-                for part in {*self.contact.parted(others), *((piece,) for piece in others)}:
+            levels = self.supports.levels(self.labels[base])
+            parts = {*self.contact.parted(others), *((piece,) for piece in others)} if levels else ()
+            for level in levels:
+                for part in parts:
                     found.update(self._standing(level, part))
         return found
 
