@@ -39,8 +39,10 @@ from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
 from generated_flat import generate_flat
 from generated_kitchen import generate_kitchen
+from generated_office import generate_office
 from generated_orbit import generate_orbit
 from generated_shelf import generate_shelf
+from generated_tote import generate_tote
 from generated_walk import generate_walk
 
 from ss_flow.cache.store import Store
@@ -63,8 +65,10 @@ OTHERS = {
     "desk": generate_desk,
     "flat": generate_flat,
     "kitchen": generate_kitchen,
+    "office": generate_office,
     "orbit": generate_orbit,
     "shelf": generate_shelf,
+    "tote": generate_tote,
     "walk": generate_walk,
 }
 COLUMNS = ("whole", "miou", "pq", "over_segmentation", "under_segmentation")

@@ -6,11 +6,15 @@ from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
 from generated_flat import generate_flat
 from generated_kitchen import generate_kitchen
+from generated_office import generate_office
 from generated_orbit import generate_orbit
 from generated_shelf import generate_shelf
+from generated_tote import dropped, generate_tote
 from generated_walk import by_phone, generate_walk
 
 from ss_flow.flows.generated import Room, write_scene
+from ss_flow.flows.generated.composites import Composite, Piece, paint
+from ss_flow.flows.generated.shapes import ball
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 
 
@@ -77,12 +81,24 @@ def flat() -> Room:
     return generate_flat(3, views=8, width=160, height=120)
 
 
+@pytest.fixture(scope="module")
+def tote() -> Room:
+    return generate_tote(3, views=5, width=160, height=120)
+
+
+@pytest.fixture(scope="module")
+def office() -> Room:
+    return generate_office(3, views=6, width=160, height=120)
+
+
 KINDS = {
     "bedroom": generate_bedroom,
     "flat": generate_flat,
     "kitchen": generate_kitchen,
+    "office": generate_office,
     "orbit": generate_orbit,
     "shelf": generate_shelf,
+    "tote": generate_tote,
     "walk": generate_walk,
 }
 
@@ -173,6 +189,42 @@ def test_a_flat_has_two_rooms_of_which_the_table_is_seen_from_both_and_nothing_i
     beyond = flat.points[flat.point_ids > 0, 0]
     assert (beyond < -0.5).any() and (beyond > 0.5).any() and (np.abs(beyond) < 3.5).all()
     assert flat.depth.max() <= 4 and 0.5 < (flat.depth > 0).mean() < 0.98
+
+
+def test_ten_things_lie_in_a_tote_and_some_of_them_on_others(tote):
+    box, *heap = tote.objects
+    assert box.name.endswith("tote") and len(heap) == 10
+    floor, lowest = 0.706, []
+    for thing in heap:
+        places = tote.points[tote.point_ids == thing.instance_id]
+        assert (np.abs(places[:, :2]) < (0.275, 0.185)).all()
+        lowest.append(places[:, 2].min() - floor)
+    assert min(lowest) > -0.005 and sum(low > 0.02 for low in lowest) >= 2
+
+
+def test_what_is_dropped_comes_to_lie_on_what_is_below_it_and_not_in_it():
+    radius = 0.06
+    one = Composite("red ball", (Piece("ball", ball(radius), paint("red")),))
+    heap = dropped([one] * 14, np.random.default_rng(0))
+    middle = np.array([thing.bounds.mean(axis=0) for thing in heap])
+    apart = np.linalg.norm(middle[:, None] - middle, axis=-1)[np.triu_indices(14, 1)]
+    assert (apart > 2 * radius - 0.008).all()
+    assert (middle[:, 2] > radius - 0.008).all() and (middle[:, 2] > 1.5 * radius).any()
+    assert (middle[:, 2] < 4 * radius).all()
+
+
+def test_an_office_has_things_on_its_desk_and_a_chair_before_it_and_the_screen_has_no_depth(office):
+    desk, *on_it, chair = office.objects
+    kinds = [thing.name.split()[-1] for thing in on_it]
+    assert kinds[:8] == ["monitor", "keyboard", "mouse", "lamp", "plant", "pot", "papers", "mug"]
+    for thing in on_it:
+        assert office.points[office.point_ids == thing.instance_id, 2].min() > 0.71
+    feet = office.points[office.point_ids == chair.instance_id]
+    assert feet[:, 2].min() < 0.05 and chair.name.endswith("chair") and desk.name.endswith("desk")
+    monitor = on_it[0]
+    screen = (office.ids == monitor.instance_id) & (office.parts == 1 + monitor.parts.index("screen"))
+    assert (office.depth[screen] > 0).mean() < 0.2
+    assert (office.depth[~screen] > 0).mean() > 0.8
 
 
 def test_a_phone_exposes_and_balances_anew_and_darkens_corners():

@@ -267,6 +267,13 @@ def carton(color: str, ink: str, shade: str, size: tuple[float, float, float]) -
     )
 
 
+def tape(color: str, core: str) -> Composite:
+    """A lying roll of tape on its core, with a hole through it."""
+    rings = [[(r, 0), (r + w, 0), (r + w, 0.045), (r, 0.045), (r, 0)] for r, w in ((0.037, 0.018), (0.033, 0.004))]
+    roll, inside = (turned_profile(ring) for ring in rings)
+    return Composite(f"{color} tape", (Piece("roll", roll, paint(color)), Piece("core", inside, paint(core))))
+
+
 def _band(radius: float, low: float, high: float) -> Mesh:
     """What goes round something, between two heights."""
     return turned_profile([(radius, low), (radius, high)])
