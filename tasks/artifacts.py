@@ -219,8 +219,12 @@ class Observation:
 
     def inside(self, j: int) -> Int32:
         """Points of the cloud that lie inside the j-th mask, ascending."""
+        return self.point_index[self.rows_inside(j)]
+
+    def rows_inside(self, j: int) -> Int32:
+        """The same as rows of `point_index`."""
         row, standing = self.under(j)
-        return self.point_index[row[standing == INSIDE]]
+        return row[standing == INSIDE]
 
     def under(self, j: int) -> tuple[Int32, UInt8]:
         """The points under the j-th mask as rows of `point_index`, ascending, and how each of them stands there."""

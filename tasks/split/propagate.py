@@ -30,6 +30,7 @@ from ss_flow.tasks.split.votes.at_once import (
     MaskClusteringParams,
     cluster_masks,
     vote_at_once,
+    words_of,
 )
 from ss_flow.tasks.split.votes.in_turn import Matches, SequentialParams, vote_in_turn
 from ss_flow.tasks.split.votes.smoothing import smooth
@@ -106,7 +107,7 @@ def propagate(
         votes, matched = vote_in_turn(len(points.points), visibility, observations, params.tau_label, params.in_turn)
         against = np.zeros(len(points.points), np.float32)
     else:
-        votes, against, matched = _at_once(len(points.points), observations, params)
+        votes, against, matched = _at_once(len(points.points), visibility, observations, params)
     leader, share = votes.leaders()
     covered = votes.weight() > against
     sure = covered & (share >= params.tau_label)
@@ -150,11 +151,12 @@ def propagate(
 
 
 def _at_once(
-    num_points: int, observations: Sequence[Observation], params: PropagateParams
+    num_points: int, visibility: Sequence[Visibility], observations: Sequence[Observation], params: PropagateParams
 ) -> tuple[Votes, Float32, Matches]:
     """Votes for labels, votes against any [N], and the label of each mask, from the masks of all views at once."""
-    labels = cluster_masks(observations, num_points, params.at_once)
-    votes, against = vote_at_once(num_points, observations, labels, params.at_once)
+    words = words_of(visibility, num_points)
+    labels = cluster_masks(observations, num_points, params.at_once, words)
+    votes, against = vote_at_once(num_points, observations, labels, params.at_once, words)
     matched = Matches([], [], [])
     for k, (seen, shown) in enumerate(zip(observations, labels, strict=True)):
         for j in np.flatnonzero(shown).tolist():

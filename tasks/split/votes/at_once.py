@@ -3,7 +3,8 @@
 Every view that sees two masks says how far their points lie under one mask of its own. Masks are united as long as
 what speaks for it outweighs what speaks against it (Bansal, Blum, Chawla: "Correlation Clustering", 2004, with real
 weights). Up to `max_views` views, no order of views enters, nor does a second copy of all of them. A mask that holds
-two objects is outvoted by those that part them. Beyond Split&Splat, whose labels can only grow together.
+two objects is outvoted by those that part them. What is small from afar lies there under the mask of what it stands
+on; so a view from farther off counts less (`words_of`). Beyond Split&Splat, whose labels can only grow together.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ss_flow.running import progress
-from ss_flow.tasks.artifacts import INSIDE, STRAY, Float32, Float64, Int32, Observation
+from ss_flow.tasks.artifacts import INSIDE, STRAY, Float32, Float64, Int32, Observation, Visibility
 from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.split.votes.votes import Votes
 
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 
 _AT_ONCE = 1 << 20
 """Pairs of masks that are weighed at once."""
+_AS_NEAR = 1.4
+"""Up to so many times the distance of the third nearest view, a view's word on a point counts in full."""
+_STEPS = 64
+"""Words are multiples of one part in so many: their sums are exact, in any order."""
 
 
 @dataclass(frozen=True)
@@ -46,31 +51,72 @@ class MaskClusteringParams:
     """Weight of a view's vote against every label, for a point that it sees under no mask."""
 
 
-def cluster_masks(observations: Sequence[Observation], num_points: int, params: MaskClusteringParams) -> list[Int32]:
+def words_of(visibility: Sequence[Visibility], num_points: int) -> list[Float32]:
+    """How much each view's word on the points that it sees counts, 0..1: [M] for each view.
+
+    It falls with the area that a point's surroundings cover in its photo, from 1.4 times the distance on from which
+    the third nearest view sees the point; with fewer than three views, all count in full.
+    """
+    nearest = np.full((3, num_points), np.inf, np.float32)
+    # A second copy of a view is no other view.
+    for view in {(view.point_index.tobytes(), view.depth.tobytes()): view for view in visibility}.values():
+        depth = view.depth
+        for distance in nearest:
+            here = distance[view.point_index]
+            distance[view.point_index], depth = np.minimum(here, depth), np.maximum(here, depth)
+    words = []
+    for view in visibility:
+        as_near = _AS_NEAR * nearest[-1][view.point_index] / view.depth
+        words.append((np.rint(_STEPS * np.minimum(as_near, 1) ** 2) / _STEPS).astype(np.float32))
+    return words
+
+
+def cluster_masks(
+    observations: Sequence[Observation],
+    num_points: int,
+    params: MaskClusteringParams,
+    words: Sequence[Float32] = (),
+) -> list[Int32]:
     """The object that each mask of each view shows: for each view [J], 1.. from the largest object on, 0 = none.
 
-    observations: one of each view.
+    observations: one of each view. words: of each view, from `words_of`; without any, all count in full.
     """
+    words = words or _in_full(observations)
     lots = -(-len(observations) // params.max_views)
     if lots <= 1:
-        return _cluster([[seen.inside(j) for j in range(len(seen.mask))] for seen in observations], num_points, params)
+        within_masks = [[seen.inside(j) for j in range(len(seen.mask))] for seen in observations]
+        said = [[word[seen.rows_inside(j)] for j in range(len(seen.mask))]
+                for seen, word in zip(observations, words, strict=True)]  # fmt: skip
+        return _cluster(within_masks, said, num_points, params)
     within: list[Int32] = [np.zeros(0, np.int32)] * len(observations)
     found: list[list[Int32]] = []
     for lot in range(lots):
         # Every lot gets views from all over, so that all lots see the same objects.
         views = observations[lot::lots]
-        within[lot::lots] = labels = cluster_masks(views, num_points, params)
-        leader, _ = vote_at_once(num_points, views, labels, params)[0].leaders()
+        within[lot::lots] = labels = cluster_masks(views, num_points, params, words[lot::lots])
+        leader, _ = vote_at_once(num_points, views, labels, params, words[lot::lots])[0].leaders()
         order = np.argsort(leader, kind="stable").astype(np.int32)
         count = max((int(of_view.max(initial=0)) for of_view in labels), default=0)
         found.append(np.split(order, np.searchsorted(leader[order], np.arange(1, count + 1)))[1:])
-    across = _cluster(found, num_points, params)
+    in_full = [[np.ones(len(rows), np.float32) for rows in of_lot] for of_lot in found]
+    across = _cluster(found, in_full, num_points, params)
     return [np.append(0, across[k % lots])[of_view].astype(np.int32) for k, of_view in enumerate(within)]
 
 
-def _cluster(views: list[list[Int32]], num_points: int, params: MaskClusteringParams) -> list[Int32]:
-    """The same for the points inside the masks of each view."""
-    contents = [b"".join([np.int64(len(points)).tobytes() + points.tobytes() for points in masks]) for masks in views]
+def _in_full(observations: Sequence[Observation]) -> list[Float32]:
+    return [np.ones(len(seen.point_index), np.float32) for seen in observations]
+
+
+def _cluster(
+    views: list[list[Int32]], words: list[list[Float32]], num_points: int, params: MaskClusteringParams
+) -> list[Int32]:
+    """The same for the points inside the masks of each view, and the view's word on each of them."""
+    contents = [
+        b"".join(
+            [np.int64(len(p)).tobytes() + p.tobytes() + word.tobytes() for p, word in zip(masks, said, strict=True)]
+        )
+        for masks, said in zip(views, words, strict=True)
+    ]
     first: dict[bytes, int] = {}
     original = [first.setdefault(content, k) for k, content in enumerate(contents)]
     labels = [np.zeros(len(masks), np.int32) for masks in views]
@@ -83,7 +129,10 @@ def _cluster(views: list[list[Int32]], num_points: int, params: MaskClusteringPa
         members = membership([points for points, _, _ in found], num_points)
         alike = Counter(original)
         copies = np.array([alike[k] for _, k, _ in found])
-        together, said = evidence(members, np.array([k for _, k, _ in found]), copies, params.min_share)
+        spoken = members.copy()
+        spoken.data = np.sqrt(np.concatenate([words[k][j] for _, k, j in found]))  # of a pair it takes the product
+        view = np.array([k for _, k, _ in found])
+        together, said = evidence(members, view, copies, params.min_share, masks=spoken)
         cluster = correlation_clusters(together, said, copies, params.rate)
         size = np.bincount(cluster, weights=np.diff(members.indptr))
         number = np.empty(len(size), np.int32)
@@ -182,23 +231,25 @@ def vote_at_once(
     observations: Sequence[Observation],
     labels: list[Int32],
     params: MaskClusteringParams,
+    words: Sequence[Float32] = (),
 ) -> tuple[Votes, Float32]:
     """The votes of all views on all points: those for labels, and [N] the weight of those against any.
 
-    labels: for each view, what each of its masks shows, 0 = nothing. A mask votes for the points under it; a view
-    votes against all labels where it sees a point under none of its masks.
+    labels: for each view, what each of its masks shows, 0 = nothing. words: as in `cluster_masks`. A mask votes for the
+    points under it; a view votes against all labels where it sees a point under none of its masks.
     """
     votes = Votes(num_points)
     against = np.zeros(num_points, np.float32)
-    for k, (seen, shown) in enumerate(zip(observations, labels, strict=True)):
+    words = words or _in_full(observations)
+    for k, (seen, shown, word) in enumerate(zip(observations, labels, words, strict=True)):
         progress(k, len(labels), seen.name)
         for j in np.flatnonzero(shown).tolist():
             row, standing = seen.under(j)
             kept = standing != STRAY
             weight = np.where(standing == INSIDE, 1.0, params.border_vote)[kept]
-            votes.add(seen.point_index[row[kept]], int(shown[j]), weight)
+            votes.add(seen.point_index[row[kept]], int(shown[j]), weight * word[row[kept]])
         if len(seen.mask):  # a view without masks knows nothing
             free = np.ones(len(seen.point_index), bool)
             free[seen.row] = False
-            against[seen.point_index[free]] += params.background_vote
-    return votes, against
+            against[seen.point_index[free]] += word[free]
+    return votes, params.background_vote * against

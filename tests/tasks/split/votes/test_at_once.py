@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 
-from ss_flow.tasks.artifacts import BORDER, INSIDE, STRAY, Observation
+from ss_flow.tasks.artifacts import BORDER, INSIDE, STRAY, Observation, Visibility
 from ss_flow.tasks.split.votes.at_once import (
     MaskClusteringParams,
     cluster_masks,
@@ -14,6 +14,7 @@ from ss_flow.tasks.split.votes.at_once import (
     evidence,
     membership,
     vote_at_once,
+    words_of,
 )
 
 SMALL = MaskClusteringParams(min_points=1)
@@ -169,3 +170,38 @@ def test_a_view_without_masks_says_nothing_against_labels_that_others_give():
     votes, against = vote_at_once(20, views, [seven, none, seven], params)
     assert votes.weight().tolist() == [2] * 10 + [0] * 10
     assert against.tolist() == [0] * 10 + [2 * 0.5] * 10
+
+
+def at(depth, points=20):
+    """All points, seen from one distance."""
+    seen = np.arange(points, dtype=np.int32)
+    return Visibility("view", seen, seen, np.full(points, depth, np.float32), 4, 5)
+
+
+def test_a_view_counts_less_from_farther_off_than_the_third_nearest_sees_a_point():
+    words = words_of([at(1.0), at(2.0), at(2.01), at(2.7), at(5.6)], 20)
+    assert [float(word[0]) for word in words] == [1, 1, 1, 1, 0.25]
+    assert all((word == word[0]).all() for word in words)
+    assert [word[0] for word in words_of([at(1.0), at(9.0)], 20)] == [1, 1]
+
+
+def test_a_second_copy_of_a_view_is_no_nearer_one():
+    seen = [at(1.0), at(1.1), at(5.0), at(6.0)]
+    assert [word[0] for word in words_of(seen, 20)] == [word[0] for word in words_of(seen * 2, 20)][:4] == [1] * 4
+
+
+def test_far_views_that_do_not_part_what_near_ones_do_join_nothing():
+    # Half of the views are near and part paper and desk, which lie under one mask in the others.
+    views = [view(range(4), range(4, 20))] * 3 + [view(WHOLE)] * 3
+    words = words_of([at(d) for d in (1.0, 1.05, 1.1, 2.2, 2.25, 2.3)], 20)
+    alike, weighed = cluster_masks(views, 20, SMALL), cluster_masks(views, 20, SMALL, words)
+    assert alike[0][0] == alike[0][1]
+    assert weighed[0][0] != weighed[0][1]
+
+
+def test_a_far_view_votes_less_for_labels_and_against_them():
+    params = MaskClusteringParams()
+    labels, words = [np.array([7], np.int32)], [np.full(20, 0.25, np.float32)]
+    votes, against = vote_at_once(20, [view(LEFT)], labels, params, words)
+    assert votes.weight()[0] == 0.25
+    assert against[15] == pytest.approx(0.25 * params.background_vote)
