@@ -1,7 +1,7 @@
 """How many things are exactly one instance: Split with a segmenter's masks on generated rooms of composite things.
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
-                                          [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | --walk]
+                                          [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | ...]
                                           [--photos] [--lying] [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
@@ -11,8 +11,8 @@ each thing its best IoU, and of how many predicted ids each covers at least a te
 results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
 shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
 of small things on a table, in few near views of a depth sensor; with --bedroom, a bedroom, with --kitchen, a kitchen,
-with --shelf, a shelf of goods, with --walk, a table in a garden instead (`tests/support/generated_*.py`). With
---photos, from the photos alone: without depth and poses. With --lying, photos lie on their side, as a phone stores
+with --shelf, a shelf of goods, with --walk, a table in a garden, with --tote, goods in a heap, with --office, a work
+place instead (`tests/support/generated_*.py`). With --photos, from the photos alone: without depth and poses. With --lying, photos lie on their side, as a phone stores
 them.
 """
 

@@ -70,7 +70,7 @@ def part_labels(
         one = cluster[own]
         if len(np.unique(one)) < len(own) and min_views > 1:
             hangs = hang_together([pieces[row] for row in own], cloud, observations, min_views)
-            _, one = np.unique(np.stack([one, hangs]), axis=1, return_inverse=True)
+            one = np.unique(np.stack([one, hangs]), axis=1, return_inverse=True)[1].astype(np.int32)
         clusters = [own[one == number] for number in np.unique(one)]
         largest, *others = sorted(clusters, key=lambda rows: -int(size[rows].sum()))
         for rows in others:
