@@ -12,8 +12,8 @@ results are kept: a run with other parameters computes only what they change. --
 shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
 of small things on a table, in few near views of a depth sensor; with --bedroom, a bedroom, with --kitchen, a kitchen,
 with --shelf, a shelf of goods, with --walk, a table in a garden, with --tote, goods in a heap, with --office, a work
-place instead (`tests/support/generated_*.py`). With --photos, from the photos alone: without depth and poses. With --lying, photos lie on their side, as a phone stores
-them.
+place instead (`tests/support/generated_*.py`). With --photos, from the photos alone: without depth and poses. With
+--lying, photos lie on their side, as a phone stores them.
 """
 
 from __future__ import annotations
