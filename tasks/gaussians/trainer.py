@@ -72,6 +72,9 @@ class TrainParams:
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
     """Gaussians with no larger weight in any view are dropped at the end; 0 keeps them."""
+    prune_hidden: Fraction = 0.0
+    """Gaussians whose largest weight in any view is less than this share of their opacity are dropped at the end: so
+    little of them is left to see by what stands before them."""
     max_length: NonNegative = 0.0
     """No standard deviation of an instance's Gaussians exceeds so many times the median of the longest with which they
     start; those of the background (id 0) may. 0 = no limit."""
@@ -291,11 +294,12 @@ class _Training:
         parameters, params, xp = self.parameters, self._params, self._backend.xp
         losses = self.losses()
         parameters.keep(parameters.opacities() >= params.prune_opacity)
-        if params.prune_contribution > 0:
+        if params.prune_contribution > 0 or params.prune_hidden > 0:
             strongest = xp.zeros_like(parameters.values["opacity_logits"])
             for there in self._there:
                 strongest = xp.maximum(strongest, self._backend.strongest(parameters.values, there))
-            parameters.keep(strongest >= params.prune_contribution)
+            seen = strongest >= params.prune_hidden * parameters.opacities()
+            parameters.keep(seen & (strongest >= params.prune_contribution))
         return TrainResult(parameters.to_gaussians(self._initial), self.step, losses)
 
 
