@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +9,6 @@ import numpy as np
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     Bool,
-    Cameras,
-    DepthMap,
     EditedScene,
     Float32,
     Float64,
@@ -20,10 +17,11 @@ from ss_flow.tasks.artifacts import (
     UInt8,
 )
 from ss_flow.tasks.edit.flat_surfaces import FlatSurface, flat_surfaces
-from ss_flow.tasks.edit.holes import Measured, Remains, Uncovered, stayed, uncovered
+from ss_flow.tasks.edit.holes import HIDES, Measured, Remains, Uncovered, stayed, uncovered
 from ss_flow.tasks.edit.operations import edited
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
+from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 
 _NEARBY = 0.5
@@ -42,6 +40,8 @@ _UNSEEN = 1.5
 """How far from all points of a plane it was not seen, in spacings."""
 _DEPTH_ERROR = 0.02
 """Of a depth map, as a share of the depth."""
+_FAINT = 0.05
+"""Share of a pixel below which it does not show what has left."""
 _LENDERS = 2000
 """At least so many points of a plane, and less than twice as many, lend filled places their colours."""
 _AT_ONCE = 1000
@@ -64,10 +64,10 @@ def fill(
     by RANSAC; as thick as the points are rough; connected). The ray of every pixel that showed the instances is
     followed to the first plane behind them. It counts where it meets the plane inside the convex hull of its points, so
     that nothing is continued beyond what was seen; further than 1.5 spacings from any of them; where nothing that is
-    still there hides it; and where no view looked through it, by its depth map. One such place in each cube of the
-    points' spacing becomes a Gaussian, with the mean colour of the plane's points, each weighed by the inverse cube of
-    its distance (Shepard 1968), and the ids of the nearest Gaussian of all that stayed. What was filled before stays,
-    and no place within a spacing of it is filled a second time.
+    still there hides it; and where no view looked through it, by its depth map or, where this knows nothing, by what
+    the scene showed. One such place in each cube of the points' spacing becomes a Gaussian, with the mean colour of the
+    plane's points, each weighed by the inverse cube of its distance (Shepard 1968), and the ids of the nearest Gaussian
+    of all that stayed. What was filled before stays, and no place within a spacing of it is filled a second time.
 
     after: without what only came to light (`clear`), as that would hide the surfaces behind.
     gone: labels of the dense points that are no longer there, those of the instances among them.
@@ -83,7 +83,7 @@ def fill(
     thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))
     planes = [plane for around in arounds for plane in flat_surfaces(points, around, thickness)]
     places, plane_of = _behind(views, planes, spacing, thickness)
-    solid = ~_seen_through(places, cameras, measured.depths, thickness)
+    solid = ~_seen_through(places, before, instances, measured, thickness)
     places, plane_of = places[solid], plane_of[solid]
     chosen = _one_a_cube(places, spacing)
     chosen = chosen[~_within(places[chosen], after.means[after.filled > 0], spacing)]
@@ -172,13 +172,22 @@ def _behind(
     return np.concatenate(places), np.concatenate(plane_of)
 
 
-def _seen_through(places: Float64, cameras: Cameras, depths: Sequence[DepthMap], tolerance: float) -> Bool:
-    """[M] places that a view of the capture looked through: it measured something further behind."""
+def _seen_through(
+    places: Float64, before: EditedScene, instances: tuple[int, ...], measured: Measured, tolerance: float
+) -> Bool:
+    """[M] places that a view of the capture looked through: it measured something further behind, or, where no depth
+    was measured, the scene shows something there that is not what has left."""
     free = np.zeros(len(places), bool)
-    for view, measured in enumerate(depths):
-        height, width = measured.depth.shape
-        rows, column, row, z = pixels_in_view(places, camera_of(cameras, view).scaled(width, height))
-        free[rows[measured.depth[row, column] > z + np.maximum(tolerance, _DEPTH_ERROR * z)]] = True
+    for view, known in enumerate(measured.depths):
+        height, width = known.depth.shape
+        camera = camera_of(measured.cameras, view).scaled(width, height)
+        rows, column, row, z = pixels_in_view(places, camera)
+        if not len(rows):
+            continue
+        shown = render(before, camera, label_ids=instances)
+        solid = (shown.alpha >= HIDES) & (shown.label_masks.sum(axis=0) < _FAINT)
+        depth = np.where(known.depth > 0, known.depth, np.where(solid, shown.depth / np.maximum(shown.alpha, HIDES), 0))
+        free[rows[depth[row, column] > z + np.maximum(tolerance, _DEPTH_ERROR * z)]] = True
     return free
 
 

@@ -29,7 +29,7 @@ SHOWS = 0.5
 """Accumulated alpha from which on a pixel shows something."""
 _MARGIN = 16
 """Pixels around a picture from which points still reach into it."""
-_HIDES = 0.9
+HIDES = 0.9
 """Accumulated alpha from which on nothing can be seen through a pixel."""
 _NEIGHBOURS = 8
 
@@ -167,7 +167,7 @@ def uncovered(
             continue
         empty = (old.alpha >= SHOWS) & (new.alpha < SHOWS)
         there = old.depth.astype(np.float64) / np.maximum(old.alpha, SHOWS)
-        now = np.where(new.alpha >= _HIDES, new.depth.astype(np.float64) / np.maximum(new.alpha, _HIDES), np.inf)
+        now = np.where(new.alpha >= HIDES, new.depth.astype(np.float64) / np.maximum(new.alpha, HIDES), np.inf)
         yield Uncovered(name, camera, left, shows_put, empty, there, now)
 
 

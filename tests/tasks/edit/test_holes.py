@@ -125,6 +125,31 @@ def test_a_place_that_a_view_looked_through_is_not_filled(seen, removed):
     assert not after.filled.any() and len(after) == len(removed)
 
 
+@pytest.mark.parametrize("recess", [False, True])
+def test_what_the_scene_shows_behind_a_place_tells_where_no_depth_was_measured(seen, recess):
+    measured, scene = seen
+    low, high = box_scene.BOXES[BOX - 1, :, :2]
+
+    def around(places):
+        """What of the floor is less than 30 cm from the box: no point was measured there."""
+        inside = [((places[:, :2] > low - d) & (places[:, :2] < high + d)).all(axis=1) for d in (0.05, 0.3)]
+        return inside[1] & ~inside[0] & (places[:, 2] < SPACING)
+
+    points = measured.points
+    known = ~around(points.points)
+    blind = Measured(
+        measured.cameras,
+        [replace(depth, depth=np.zeros_like(depth.depth)) for depth in measured.depths],
+        replace(points, points=points.points[known], colors=points.colors[known]),
+        replace(measured.labels, label=measured.labels.label[known], confidence=measured.labels.confidence[known]),
+    )
+    lower = np.where(around(scene.means)[:, None], np.float32([0, 0, -0.2]), np.float32(0))
+    scene = replace(scene, means=scene.means + lower) if recess else select(scene, ~around(scene.means))
+    after = fill(scene, operations.remove(scene, instances=(BOX,)), blind, instances=(BOX,), gone=(BOX,))
+    filled = around(after.means[after.filled > 0]).sum() * SPACING**2
+    assert filled < 0.3 if recess else filled > 0.45  # square metres; that no view shows the recess, some are left
+
+
 def test_of_things_far_apart_each_is_filled_with_the_surface_that_it_stood_on(monkeypatch):
     table = [[-0.9, -0.7, 0.0], [-0.5, -0.3, 0.3]]
     on_the_table, on_the_floor = [[-0.8, -0.6, 0.3], [-0.6, -0.4, 0.5]], [[0.5, 0.4, 0.0], [0.9, 0.8, 0.4]]
