@@ -38,10 +38,10 @@ def contradicted(cameras: Cameras, photos: Sequence[Features], matches: Sequence
             continue
         for name, beside, rows in ((own, other, pair[:, 0]), (other, own, pair[:, 1])):
             size = len(met[name])
-            of_pair = np.bincount(rows, fits, size), np.bincount(rows, minlength=size).astype(np.float64)
+            of_pair = [np.bincount(row, minlength=size).astype(np.float64) for row in (rows[fits], rows)]
             fit[name] += of_pair[0]
             met[name] += of_pair[1]
-            partners[beside].append((name, *of_pair))
+            partners[beside].append((name, of_pair[0], of_pair[1]))
 
     def share(name: str) -> float:
         seen = met[name] > 0
