@@ -17,7 +17,7 @@ from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import (
     Plane,
     axes_in,
-    box_diagonal,
+    extent_of,
     middle_of,
     on_plane,
     plane_of_most,
@@ -30,8 +30,6 @@ from ss_flow.tasks.geometry.shape import (
 
 _FEW = 20
 """Points below which nothing has a shape."""
-_ENOUGH = 2000
-"""At least so many points of a group, and less than twice as many, tell."""
 _THICKNESS = 2.0
 """Distance from a plane up to which a point lies on it, in multiples of the cloud's spacing."""
 _FLAT = 0.7
@@ -61,8 +59,6 @@ _SECTORS = 16
 """Directions round the foot."""
 _ROUND = 0.75
 """Share of these in which the surface goes on. Behind the back of a chair there is no seat."""
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
 
 Labels = tuple[int, ...]
 """Some labels, by their rows."""
@@ -155,7 +151,7 @@ class Supports:
         if len(own) < _FEW:
             return False
         centre, normal = plane
-        height, extent = (own - centre) @ normal, box_diagonal(own, _TRIM)
+        height, extent = (own - centre) @ normal, extent_of(own)
         low, high = np.quantile(height, (0.1, 0.9))
         if high < max(self.height * extent, _RISES * self.points.spacing) or low < -self._thickness:
             return False
@@ -176,7 +172,7 @@ class Supports:
         return _THICKNESS * self.points.spacing
 
     def _places(self, labels: Labels) -> Float64:
-        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])], _ENOUGH)
+        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])])
 
 
 def find_supports(points: PointCloud, cameras: Cameras, labels: PointLabels, *, height: float) -> Supports:
