@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from labelled_points import labels_of, lying, one_camera
 
 from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
@@ -11,12 +12,6 @@ from ss_flow.tasks.split.supports import Supports, find_supports
 STEP = 0.01
 TABLE, BODY, HANDLE, BOOK = range(4)
 MUG = (BODY, HANDLE)
-
-
-def lying(width: float, depth: float, height: float = 0.0) -> np.ndarray:
-    """[N, 3] points of a rectangle about the z axis."""
-    x, y = np.meshgrid(np.arange(-width / 2, width / 2, STEP), np.arange(-depth / 2, depth / 2, STEP))
-    return np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
 
 
 def block(width: float, depth: float, height: float) -> np.ndarray:
@@ -35,11 +30,8 @@ def scene(pieces: list[np.ndarray], turn: float = 0.0) -> tuple[PointCloud, Came
     pose = np.eye(4)
     pose[:3, :3] = [(1, 0, 0), down, np.cross((1, 0, 0), down)]
     pose[:3, 3] = -pose[:3, :3] @ (0, -2, 2)
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
-    nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), len(pieces), nothing, nothing, nothing)
     colors = np.array([(118, 76, 46), (45, 85, 200), (240, 238, 230), (205, 40, 40)], np.uint8)[label - 1]
-    return PointCloud(places.astype(np.float32), colors, 1.0, STEP), cameras, labels
+    return PointCloud(places.astype(np.float32), colors, 1.0, STEP), one_camera(pose), labels_of(label)
 
 
 def table_with(*pieces: np.ndarray, turn: float = 0.0) -> Supports:
