@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,13 +54,11 @@ class Sheets:
     def standing(self, pieces: Sequence[tuple[int, ...]]) -> Bool:
         """Which pieces, each some labels (rows), rise from another one that is a sheet in something larger: [P]."""
         stands = np.zeros(len(pieces), bool)
-        parts = self._flat_ones_joined(pieces)
-        whole = [tuple(row for i in part for row in pieces[i]) for part in parts]
-        for sheet in np.flatnonzero(self._outwards(whole) > self.flush).tolist():
-            if (plane := self._plane_of(whole[sheet])) is None:
+        for sheet in np.flatnonzero(self._outwards(pieces) > self.flush).tolist():
+            if (plane := self._plane_of(pieces[sheet])) is None:
                 continue
             centre, normal = plane
-            for i in set(range(len(pieces))) - set(parts[sheet]):
+            for i in set(range(len(pieces))) - {sheet}:
                 other = self._places(pieces[i])
                 rises = np.quantile(np.abs((other - centre) @ normal), 0.9)
                 stands[i] |= bool(rises >= max(self.height * extent_of(other), _RISES * self.points.spacing))
@@ -71,17 +68,6 @@ class Sheets:
         """Whether a piece, some labels (rows), goes on without an edge into another one, mostly, where they touch."""
         here = np.ix_(piece, other)
         return bool(self.smooth[here].sum() >= max(_MOSTLY * self.meets[here].sum(), 1))
-
-    def _flat_ones_joined(self, pieces: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
-        """The pieces by number, those as one that go on into each other in one plane: a page may be in pieces."""
-        parts: list[tuple[int, ...]] = [(i,) for i in range(len(pieces))]
-        for a, b in combinations(range(len(pieces)), 2):
-            first, second = (next(part for part in parts if i in part) for i in (a, b))
-            if first == second or not self.smooth[np.ix_(pieces[a], pieces[b])].any():
-                continue
-            if self._plane_of(tuple(row for i in first + second for row in pieces[i])) is not None:
-                parts = [part for part in parts if part not in (first, second)] + [first + second]
-        return parts
 
     def _plane_of(self, labels: tuple[int, ...]) -> Plane | None:
         """The plane in which the labels (rows) lie; None where they do not lie in one."""

@@ -54,11 +54,6 @@ def test_a_mug_stands_on_the_page_that_lies_on_a_table():
     assert on_table().standing([(PAGE,), (MUG,)]).tolist() == [False, True]
 
 
-def test_a_page_in_two_pieces_is_one_sheet():
-    sheets = halved(*scene(), at=0.0)
-    assert sheets.standing([(PAGE,), (3,), (MUG,)]).tolist() == [False, False, True]
-
-
 def test_a_piece_of_the_page_that_no_mask_shows_with_it_tells_nothing():
     sheets = replace(halved(*scene(), at=0.05), flush=0.7)
     assert sheets.standing([(PAGE,), (MUG,)]).tolist() == [False, True]
