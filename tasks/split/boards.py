@@ -14,7 +14,7 @@ import numpy as np
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import Plane, axes_in, box_diagonal, middle_of, refitted, sector_of, thinned, towards
+from ss_flow.tasks.geometry.shape import Plane, axes_in, extent_of, middle_of, refitted, sector_of, thinned, towards
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.touching import TouchingParams
@@ -31,8 +31,6 @@ _BEHIND = 0.05
 """Share of them that may lie behind it: a seat has legs."""
 _ENOUGH = 3000
 """At least so many points of an instance, and less than twice as many, tell."""
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
 _TRIPLES, _BEST, _ROUNDS = 1500, 60, 3
 """Planes that are tried, each through three points; how many of them, those that most points lie on, are looked at
 closely; and how often each of these is then fitted to the points on it."""
@@ -99,7 +97,7 @@ def board_of(places: Float64, spacing: float, eye: Float64, *, rises: float, aro
     the board, below what rises, is no part of it.
     """
     some = thinned(places, _ENOUGH)
-    extent = box_diagonal(some, _TRIM) if len(some) else 0.0
+    extent = extent_of(some) if len(some) else 0.0
     if len(places) < _FEW or 2 * spacing > _COARSE * extent:
         return None
     thickness = max(_THICKNESS * extent, 2 * spacing)

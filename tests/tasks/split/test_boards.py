@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
+from labelled_points import one_camera
 
-from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import Hierarchy, PointCloud, PointLabels
 from ss_flow.tasks.split.boards import BoardParams, board_of, part_boards
 
 STEP = 0.02
@@ -104,12 +105,11 @@ def parted(head_color=FUR, *, stuff=False, **params) -> tuple[PointLabels, Point
     cloud = PointCloud(np.concatenate(sets).astype(np.float32), colors, 1.0, STEP)
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = (-EYE[0], EYE[1], EYE[2])
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
     rows = np.arange(3, dtype=np.int32)
     before = PointLabels(label, np.ones(len(label)), 9, 0 * rows, rows, np.array([7, 3, 7], np.int32))
     node = np.array([3, 7], np.int32)
     tree = Hierarchy(node, 0 * node, np.ones(2, np.float32), np.array([False, stuff]))
-    return before, part_boards(cloud, cameras, before, tree, params=BoardParams(**params))
+    return before, part_boards(cloud, one_camera(pose), before, tree, params=BoardParams(**params))
 
 
 def test_a_head_on_its_plaque_becomes_two_instances_with_new_ids_and_the_others_keep_theirs():
