@@ -15,7 +15,7 @@ import numpy as np
 
 from ss_flow.cache.canonical import digest
 from ss_flow.closure import Closure, closure_of, fix_sources
-from ss_flow.distributions import Changes, versions_of
+from ss_flow.distributions import Changes, version, versions_of
 from ss_flow.task import FileRef, Task
 
 SCHEMA = 3
@@ -43,7 +43,7 @@ class Recipe:
     def of(cls, task: Task[..., Any], closure: Closure | None = None, changes: Changes = ()) -> Recipe:
         """closure: of the task's function, where it is known already. changes: see `versions_of`."""
         closure = closure or closure_of(task.function)
-        packages: dict[str, str] = {}
+        packages = {name: version(name) for name in task.uses}
         for module in sorted(closure.modules):
             packages |= versions_of(module, changes)
         parts = {

@@ -124,6 +124,7 @@ class Task(Generic[P, R]):
     function: Callable[P, R]
     name: str
     resources: Resources
+    uses: tuple[str, ...]
     isolate: bool
     environment: Callable[[], Mapping[str, str]] | None
 
@@ -221,18 +222,21 @@ def task(
     *,
     name: str | None = None,
     resources: Resources = Resources(),
+    uses: tuple[str, ...] = (),
     isolate: bool = False,
     environment: Callable[[], Mapping[str, str]] | None = None,
 ) -> Callable[[Callable[P, R]], Task[P, R]]:
     """Declare a function as a task.
 
     name: the step's name; by default the module below `ss_flow.tasks`, and the function where the two differ.
+    uses: distributions whose versions count in the key, besides those that the code imports.
     isolate: run in a process of its own (the library aborts on errors, or is not deterministic beside others).
-    environment: what else of this machine the result depends on (the instruction set, the version of a plug-in that the
-        code does not import); its items enter the key.
+    environment: what else of this machine the result depends on (say, the instruction set); its items enter the key.
     Raises TypeError when the function does not declare the types of its artifacts and of its result, or does not name
     each of its arguments.
     """
+    if isinstance(uses, str):
+        raise TypeError(f'uses takes a tuple of names: uses=("{uses}",)')
 
     def declare(function: Callable[P, R]) -> Task[P, R]:
         from ss_flow.closure import fix_sources  # not above: the bare `ss-flow` declares no task
@@ -246,7 +250,7 @@ def task(
             raise TypeError(f"the task {step} must declare the type of {', '.join(untyped)}")
         if any(p.kind not in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) for p in of.parameters.values()):
             raise TypeError(f"the task {step} must name its arguments one by one: no *args, no **kwargs, no `/`")
-        declared: Any = Task(function, step, resources, isolate, environment)
+        declared: Any = Task(function, step, resources, uses, isolate, environment)
         functools.update_wrapper(declared, function)
         return typing.cast(Task[P, R], declared)
 

@@ -47,6 +47,11 @@ def test_a_task_names_its_arguments_one_by_one():
             task(name="t")(function)
 
 
+def test_the_distributions_that_a_task_uses_are_a_tuple_and_no_text():
+    with pytest.raises(TypeError, match=r'uses=\("open3d",\)'):
+        task(uses="open3d")
+
+
 def test_a_task_that_another_process_would_not_find_is_refused(store):
     @task(name="t.inner")
     def inner(*, slope: float) -> Linear:
