@@ -20,7 +20,8 @@ def canonical_code(node: Any, counted: list[ast.AST], imports: Imports) -> str:
     """
     if type(node) is list:
         return f"[{','.join([canonical_code(item, counted, imports) for item in node])}]"
-    names = _fields_of(type(node))
+    kind: Any = type(node)
+    names = _fields_of(kind)
     if names is None:
         return repr(node)
     counted.append(node)
@@ -41,7 +42,7 @@ def canonical_code(node: Any, counted: list[ast.AST], imports: Imports) -> str:
 
 
 @functools.cache
-def _fields_of(kind: type) -> tuple[str, ...] | None:
+def _fields_of(kind: Any) -> tuple[str, ...] | None:
     """What counts of a kind of node; None of anything else.
 
     Not "ctx", read or written: it says where it stands; nor "kind": u"" is "".
