@@ -195,6 +195,8 @@ class _Training:
         self._extents = backend.put(extents)
         self._channels = backend.put(channels_of(initial.instance_id, label_ids)) if num_labels else None
         self._log_longest = backend.put(_log_longest(initial, params.max_length)) if params.max_length else None
+        self._limits: tuple[Any, Any] | None = None
+        """`origin` of the parameters, and what of that holds for each: laid out anew when Gaussians came or went."""
         self._control = _control(params, GradientRecord(len(initial), backend), float(extents.max()))
         self.step = 0
         # Of each view, those whose colour counts.
@@ -243,7 +245,9 @@ class _Training:
         rates = params.rates.at(done_share).by_parameter(self._extents[parameters.origin])
         parameters.step(found.gradients, AdamStep(self.step, rates, degree))
         if self._log_longest is not None:
-            parameters.limit_scale(self._log_longest[parameters.origin])
+            if self._limits is None or self._limits[0] is not parameters.origin:
+                self._limits = parameters.origin, self._log_longest[parameters.origin]
+            parameters.limit_scale(self._limits[1])
         if self._control is not None:
             seen = Seen(found.gradients["centers"], found.radii, self._pixels[view])
             self._control.after(self.step, parameters, seen, self._generator)
@@ -304,9 +308,9 @@ class _Training:
 
 
 def _log_longest(initial: Gaussians, max_length: float) -> Float32:
-    """[N] the logarithm of the longest standard deviation that each Gaussian may have."""
+    """[N, 3] the logarithm of the longest standard deviation that each Gaussian may have, along each axis."""
     longest = np.log(np.float32(max_length)) + log_lengths(initial)
-    return np.where(initial.instance_id == 0, np.float32(np.inf), longest)
+    return np.repeat(np.where(initial.instance_id == 0, np.float32(np.inf), longest)[:, None], 3, axis=1)
 
 
 def _control(params: TrainParams, record: GradientRecord, extent: float) -> AdaptiveControl | None:

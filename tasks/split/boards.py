@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ss_flow.task import task
+from ss_flow.running import in_threads
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import Plane, axes_in, extent_of, middle_of, refitted, sector_of, thinned, towards
@@ -58,7 +59,7 @@ class BoardParams:
     """Cosine of both colour histograms up to which they are two things: a lamp has the colour of its base."""
 
 
-@task(name="split.part_boards")
+@task(name="split.part_boards", resources=Resources(cores=1, most_cores=8))
 def part_boards(
     points: PointCloud, cameras: Cameras, labels: PointLabels, tree: Hierarchy, *, params: BoardParams
 ) -> PointLabels:
@@ -70,12 +71,16 @@ def part_boards(
     eye, spread, bins = middle_of(cameras), TouchingParams().color_spread, bins_of(points.colors)
     changed, parted = labels.label.copy(), list[int]()
     rows_of = rows_by_label(labels.label)
-    for name in sorted(rows_of.keys() - {0, *tree.node[tree.stuff].tolist()}):
-        rows = rows_of[name]
-        places = points.points[rows].astype(np.float64)
-        board = board_of(places, points.spacing, eye, rises=params.rises, around=params.around)
+    names = sorted(rows_of.keys() - {0, *tree.node[tree.stuff].tolist()})
+
+    def board_in(name: int) -> Bool | None:
+        places = points.points[rows_of[name]].astype(np.float64)
+        return board_of(places, points.spacing, eye, rises=params.rises, around=params.around)
+
+    for name, board in zip(names, in_threads(board_in, names), strict=True):
         if board is None:
             continue
+        rows = rows_of[name]
         if likeness(*(histogram(bins[rows[side]], spread) for side in (board, ~board))) <= params.alike:
             changed[rows] = labels.num_labels + 2 * len(parted) + np.where(board, 1, 2)
             parted.append(name)

@@ -1,8 +1,13 @@
+import threading
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from labelled_points import one_camera
 
+from ss_flow.running import Surroundings, running
 from ss_flow.tasks.artifacts import Hierarchy, PointCloud, PointLabels
+from ss_flow.tasks.split import boards
 from ss_flow.tasks.split.boards import BoardParams, board_of, part_boards
 
 STEP = 0.02
@@ -125,3 +130,18 @@ def test_both_of_one_colour_stay_one_thing_and_so_does_stuff():
     for before, after in (parted(WOOD), parted(stuff=True), parted(rises=0.9)):
         assert (after.label == before.label).all() and after.match_label.tolist() == before.match_label.tolist()
         assert after.num_labels == before.num_labels
+
+
+def test_instances_that_are_looked_at_side_by_side_are_divided_as_one_after_the_other():
+    threads = set[str]()
+    looked = boards.board_of
+
+    def noted(*given, **settings):
+        threads.add(threading.current_thread().name)
+        return looked(*given, **settings)
+
+    with patch.object(boards, "board_of", noted), running(Surroundings(cores=3)):
+        _, after = parted()
+    assert threads and all(name.startswith("view") for name in threads)
+    _, alone = parted()
+    assert (after.label == alone.label).all() and after.num_labels == alone.num_labels
