@@ -24,6 +24,7 @@ from ss_flow.resolution import Failure
 from ss_flow.tasks.artifacts import EditedScene
 from ss_flow.tasks.deliver.output import RUN_FILE, write_scene
 from ss_flow.tasks.deliver.places import RESULT, check_replaceable, replacing_own
+from ss_flow.tasks.edit.clear import clear
 from ss_flow.tasks.edit.fill import fill
 from ss_flow.tasks.edit.holes import Holes, Measured, holes
 from ss_flow.tasks.edit.operations import begin
@@ -48,7 +49,8 @@ class Edit:
 
     def build(self) -> dict[str, Any]:
         """Add the script's nodes to a flow: "scene", "report_pictures", and for each operation N after which something
-        has left its place "holes_N", and "unfilled_N" where its holes are filled."""
+        has left its place "holes_N"; where its holes are filled, "whole_N" before and "cleared_N" after what came to
+        light is taken away, and "unfilled_N"."""
         results = self.source.results
         measured = Measured(*(results.node(name) for name in _NEEDED[1:]))
         scene = begin(results.node("scene"))
@@ -59,6 +61,9 @@ class Edit:
                 if step.leaving:
                     outputs[f"holes_{step.number}"] = holes(scene, after, measured, **left)
                 if step.leaving and step.fill:
+                    outputs[f"whole_{step.number}"] = after
+                    after = clear(scene, after, measured, **left)
+                    outputs[f"cleared_{step.number}"] = after
                     after = fill(scene, after, measured, **left)
                     outputs[f"unfilled_{step.number}"] = holes(scene, after, measured, **left)
             scene = after
@@ -163,5 +168,6 @@ def _told(step: Step, made: Results) -> dict[str, Any]:
         "largest_area": round(float(hole.area.max(initial=0)), 6),
     }
     if step.fill:
+        told["cleared"] = len(made.one(f"whole_{step.number}")) - len(made.one(f"cleared_{step.number}"))
         told["open_after_filling"] = int(made.one(f"unfilled_{step.number}").unmeasured.sum())
     return told

@@ -34,8 +34,8 @@ class Loading:
         for statement in statements:
             if isinstance(statement, DEFINITIONS):
                 self._callables.setdefault(statement.name, []).append(statement)
-        self._inner = {name: _functions_in(of) for name, of in self._callables.items()}
-        """The functions in each, methods among them, with the names of their parameters."""
+        self._inner: dict[str, list[tuple[Function, set[str]]]] = {}
+        """The functions in those that are called, methods among them, with the names of their parameters."""
         self._aliases: dict[str, set[str]] = {}
         """Names that each may stand for (a part of) the same object as; what different functions call alike is one."""
         self._elements: dict[str, set[str]] = {}
@@ -98,16 +98,23 @@ class Loading:
 
     def _calls_in(self, part: ast.AST) -> Iterator[ast.AST]:
         """The functions that a piece of code calls, of a class all methods; parameters are what they are given."""
-        for node in ast.walk(part):
+        for node in walk(part):
             if isinstance(node, ast.Call) and (name := _root(node.func)):
                 hook = node.func.attr if isinstance(node.func, ast.Attribute) and node.func.attr == _HOOK else ""
                 given = set[str]().union(*map(_names, (*node.args, *(keyword.value for keyword in node.keywords))))
-                for called in {name, *self._reached([name])} & self._inner.keys():
-                    for function, parameters in self._inner[called]:
+                for called in {name, *self._reached([name])} & self._callables.keys():
+                    for function, parameters in self._functions_in(called):
                         if hook in ("", function.name):
                             for parameter in parameters - {"self", "cls"} if given else ():
                                 self._alias(parameter, given)
                             yield function
+
+    def _functions_in(self, name: str) -> list[tuple[Function, set[str]]]:
+        """Those in a function or class, itself included: looked for when it is called, which few are at load."""
+        if name not in self._inner:
+            nodes = itertools.chain(*map(walk, self._callables[name]))
+            self._inner[name] = [(node, _parameters(node)) for node in nodes if isinstance(node, FUNCTIONS)]
+        return self._inner[name]
 
     def _parts_of(self, statement: ast.stmt) -> Iterator[ast.AST]:
         """What of a statement runs when its module is loaded: of a definition, its decorators, which are calls, unless
@@ -132,7 +139,7 @@ class Loading:
 
         Where its value is used, a method of an object counts, but no function of a library: that tells its result.
         """
-        for node in ast.walk(part):
+        for node in walk(part):
             if isinstance(node, ast.Subscript | ast.Attribute) and is_written(node):
                 yield _root(node)
             elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
@@ -147,7 +154,7 @@ class Loading:
                 yield from {_root(node.func)} - self._callables.keys() - self._imported.keys()
 
     def _note_aliases(self, part: ast.AST) -> None:
-        for node in ast.walk(part):
+        for node in walk(part):
             match node:
                 case ast.Assign(targets=targets, value=value):
                     pairs = [(target, value) for target in targets]
@@ -171,19 +178,31 @@ class Loading:
         self._aliases.setdefault(name, set()).update(others)
 
 
-def _functions_in(definitions: Iterable[ast.stmt]) -> list[tuple[Function, set[str]]]:
-    nodes = itertools.chain(*map(ast.walk, definitions))
-    return [(node, _parameters(node)) for node in nodes if isinstance(node, FUNCTIONS)]
+def walk(node: ast.AST) -> list[ast.AST]:
+    """A node and all in it, as `ast.walk` goes through them, but for what says how a name is used.
+
+    That one makes generators of every node, and is most of what an analysis takes.
+    """
+    nodes = [node]
+    for node in nodes:
+        for name in node._fields:
+            part = getattr(node, name, None)
+            if isinstance(part, ast.AST):
+                if name != "ctx":
+                    nodes.append(part)
+            elif isinstance(part, list):
+                nodes += [item for item in part if isinstance(item, ast.AST)]
+    return nodes
 
 
 def _parameters(function: ast.AST) -> set[str]:
     """Those of the functions in it, too."""
-    return {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
+    return {node.arg for node in walk(function) if isinstance(node, ast.arg)}
 
 
 def declared_global(function: ast.AST) -> list[str]:
     """The names that a function declares global."""
-    return [name for node in ast.walk(function) if isinstance(node, ast.Global) for name in node.names]
+    return [name for node in walk(function) if isinstance(node, ast.Global) for name in node.names]
 
 
 def is_written(node: ast.Name | ast.Subscript | ast.Attribute) -> bool:
@@ -199,4 +218,4 @@ def _root(node: ast.expr) -> str:
 
 
 def _names(part: ast.AST) -> set[str]:
-    return {node.id for node in ast.walk(part) if isinstance(node, ast.Name)}
+    return {node.id for node in walk(part) if isinstance(node, ast.Name)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,25 +18,36 @@ def canonical_code(node: Any, counted: list[ast.AST], imports: Imports) -> str:
     Left out are docstrings (under fields too), and the `@task(...)` decorator: how a task runs (cores, memory) is not
     what it returns.
     """
-    if isinstance(node, list):
+    if type(node) is list:
         return f"[{','.join([canonical_code(item, counted, imports) for item in node])}]"
-    if not isinstance(node, ast.AST):
+    kind: Any = type(node)
+    names = _fields_of(kind)
+    if names is None:
         return repr(node)
     counted.append(node)
     fields = []
-    for name in node._fields:
+    for name in names:
         part = getattr(node, name, None)
-        if part is None or name in ("ctx", "kind"):  # read or written: it says where it stands; "kind": u"" is ""
+        if part is None:
             continue
         if name in ("annotation", "returns"):
             counted += _quoted(part)
-        if isinstance(node, DEFINITIONS):
+        elif name in ("body", "decorator_list") and isinstance(node, DEFINITIONS):
             if name == "body":
                 part = [statement for statement in part if not _is_docstring(statement)]
-            elif name == "decorator_list" and not isinstance(node, ast.ClassDef):
+            elif not isinstance(node, ast.ClassDef):
                 part = [decorator for decorator in part if not _declares_task(decorator, imports)]
         fields.append(f"{name}={canonical_code(part, counted, imports)}")
     return f"{type(node).__name__}({','.join(fields)})"
+
+
+@functools.cache
+def _fields_of(kind: Any) -> tuple[str, ...] | None:
+    """What counts of a kind of node; None of anything else.
+
+    Not "ctx", read or written: it says where it stands; nor "kind": u"" is "".
+    """
+    return tuple(name for name in kind._fields if name not in ("ctx", "kind")) if issubclass(kind, ast.AST) else None
 
 
 def _quoted(annotation: ast.AST) -> Iterator[ast.AST]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from blake3 import blake3
 
-from ss_flow.at_load import DEFINITIONS, FUNCTIONS, Loading, declared_global, is_written
+from ss_flow.at_load import DEFINITIONS, FUNCTIONS, Loading, declared_global, is_written, walk
 from ss_flow.cache.files import stamp
 from ss_flow.distributions import is_distributed
 from ss_flow.errors import ExecutorLost
@@ -104,7 +104,8 @@ def read_loaded(packages: tuple[str, ...], loose: bool) -> bool:
     changed = False
     for name in _loaded(packages, loose, len(sys.modules)):
         specification = _specification(name)
-        if name in _known and _known[name][0] is specification:
+        known = _known.get(name)
+        if known is not None and known[0] is specification:
             if name not in _outdated and _is_exchanged(name):
                 _outdated[name] = EDITED
                 changed = True
@@ -257,7 +258,7 @@ def module_without_stars(name: str) -> Module | None:
     module = Module(name, source.is_package)
     statements = list(_top_level(ast.parse(source.text, str(source.path)).body, ()))
     for statement, tests in statements:
-        nodes = ast.walk(statement) if isinstance(statement, _BLOCKS) else (statement,)
+        nodes = walk(statement) if isinstance(statement, _BLOCKS) else (statement,)
         for name, origins in imports_of(module, nodes).items():
             module.imports.setdefault(name, []).extend(origins)
             if tests:  # which of several it is
@@ -302,7 +303,7 @@ def _bound_at_top(statement: ast.stmt) -> list[str]:
     """The names that a statement binds in its module, `:=` included."""
     if isinstance(statement, DEFINITIONS):
         return _bound_names(statement)
-    return [*_bound_names(statement), *(n.target.id for n in ast.walk(statement) if isinstance(n, ast.NamedExpr))]
+    return [*_bound_names(statement), *(n.target.id for n in walk(statement) if isinstance(n, ast.NamedExpr))]
 
 
 def _bound_names(statement: ast.AST) -> list[str]:
@@ -310,14 +311,14 @@ def _bound_names(statement: ast.AST) -> list[str]:
         case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
             return [statement.name]
         case ast.Assign():
-            return [n.id for target in statement.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+            return [n.id for target in statement.targets for n in walk(target) if isinstance(n, ast.Name)]
         case ast.AnnAssign(target=ast.Name(id=name)) | ast.AugAssign(target=ast.Name(id=name)):
             return [name]
         case ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)) | ast.MatchMapping(rest=str(name)):
             return [name]
         case _ if isinstance(statement, _BLOCKS):
-            inner = [name for child in ast.walk(statement) if child is not statement for name in _bound_names(child)]
-            return [*inner, *(n.id for n in ast.walk(statement) if isinstance(n, ast.Name) and is_written(n))]
+            inner = [name for child in walk(statement) if child is not statement for name in _bound_names(child)]
+            return [*inner, *(n.id for n in walk(statement) if isinstance(n, ast.Name) and is_written(n))]
     return []
 
 

@@ -64,11 +64,11 @@ def _tell(document: dict[str, Any], folder: Path, out: Console) -> None:
     for warning in document["warnings"]:
         out.print(f"[yellow]warning[/] {escape(warning['label'])}: {escape(warning['text'])}")
     for hole in document["edit"]["holes"]:
-        after = hole.get("open_after_filling")
-        filled = f"; after filling {after} are still open" if after is not None else ""
         out.print(
             f"operation {hole['operation']}: of {hole['pixels']} pixels in {hole['views']} views, "
-            f"{hole['unmeasured']} have nothing measured behind them, {hole['empty']} are empty{filled}"
+            f"{hole['unmeasured']} have nothing measured behind them, {hole['empty']} are empty"
+            + (f"; after filling {hole['open_after_filling']} are still open" if "cleared" in hole else "")
+            + (f"; {hole['cleared']} Gaussians that no view had shaped went too" if hole.get("cleared") else "")
         )
     hits = sum(node["hit"] for node in document["nodes"])
     out.print(escape(f"ok: {len(document['nodes']) - hits} results computed, {hits} reused; see {folder}"))

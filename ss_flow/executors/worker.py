@@ -7,6 +7,7 @@ whoever started it is gone.
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import pickle
 import queue
@@ -114,6 +115,7 @@ class Worker:
 
 def serve(descriptor: int) -> None:
     """What the process does: calls come in over the pipe, signs of progress and results go out."""
+    gc.set_threshold(20_000)  # as in the process that started this one
     connection = Connection(descriptor)
     inbox: queue.SimpleQueue[Invocation] = queue.SimpleQueue()
     cancelled = threading.Event()

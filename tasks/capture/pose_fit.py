@@ -6,14 +6,14 @@ right poses, and depth that a sensor measured in one view is met in the other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float64, Int32
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.lens import found_lens, undistorted
 from ss_flow.tasks.capture.matches import MAX_ERROR, Matches
@@ -165,13 +165,21 @@ def matches_that_fit(cameras: Cameras, photos: Sequence[Features], matches: Sequ
 
     photos: all that the matches name; their lenses may bend lines as `Cameras.radial` says.
     """
+    fits = [fit for *_, fit in pairs_that_fit(cameras, photos, matches)]
+    return sum(int(fit.sum()) for fit in fits), sum(map(len, fits))
+
+
+def pairs_that_fit(
+    cameras: Cameras, photos: Sequence[Features], matches: Sequence[Matches]
+) -> Iterator[tuple[str, str, Int32, Bool]]:
+    """Of each pair of photos with cameras: both names, the matches [m, 2] as `Matches.pair`, and which of them [m] lie
+    near each other's epipolar lines; photos as for `matches_that_fit`."""
     rows = cameras.row_of()
     points = {}
     for photo in photos:
         if photo.name in rows:
             lens, seen = found_lens(cameras, rows[photo.name]), photo.points.astype(np.float64)
             points[photo.name] = seen if lens.pinhole else undistorted(seen, lens)
-    fit, total = 0, 0
     for own in matches:
         for i, other in enumerate(own.others):
             if own.name not in points or other not in points:
@@ -179,8 +187,7 @@ def matches_that_fit(cameras: Cameras, photos: Sequence[Features], matches: Sequ
             pair = own.pairs_with(i)
             fundamental = _fundamental(cameras, rows[own.name], rows[other])
             off = sampson_distance(fundamental, points[own.name][pair[:, 0]], points[other][pair[:, 1]])
-            fit, total = fit + int((off < MAX_ERROR).sum()), total + len(pair)
-    return fit, total
+            yield own.name, other, pair, off < MAX_ERROR
 
 
 def sampson_distance(fundamental: Float64, first: np.ndarray, second: np.ndarray) -> Float64:

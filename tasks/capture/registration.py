@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ss_flow.running import warn
-from ss_flow.task import task
+from ss_flow.running import in_threads, warn
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame, Registration
 from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.geometry.images import decode_rgb, resampled, size_within
@@ -73,7 +73,7 @@ class _View:
         return float(self.edges.mean())
 
 
-@task(name="capture.registration")
+@task(name="capture.registration", resources=Resources(cores=1, most_cores=8))
 def registration(
     frames: Sequence[Frame],
     cameras: Cameras,
@@ -89,11 +89,12 @@ def registration(
     advise: whether to warn where the depth maps had better be scaled and shifted.
     """
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(params.views, len(frames))).round().astype(int))
-    looked = (_view(frames[k], cameras.intrinsics[k], depths[k], params.jump) for k in chosen.tolist())
+    some = ((frames[k], cameras.intrinsics[k], depths[k]) for k in chosen.tolist())
+    looked = in_threads(lambda given: _view(*given, params.jump), some)
     views = [view for view in looked if len(view.outline) >= _LEAST_OUTLINE]
     if len(views) < _LEAST_VIEWS:
         return Registration(1.0, np.zeros(2), 0.0)
-    coarse = [_coarse_fits(view) for view in views]
+    coarse = list(in_threads(_coarse_fits, views))
     found = _search(views, coarse)
     halves = views[::2], views[1::2]
     first, second = _search(halves[0], coarse[::2]), _search(halves[1], coarse[1::2])
@@ -232,16 +233,20 @@ def _blurred(views: Sequence[_View], sigma: float) -> list[_View]:
 
 def _coarse_fits(view: _View) -> Float32:
     """[S, 2 R + 1, 2 R + 1] the fit of a view, its edges blurred, at every scale and whole shift (y, x) up to R."""
-    import cv2
+    from scipy import fft
 
     (view,) = _blurred([view], 2)
     height, width = view.edges.shape
-    padded = cv2.copyMakeBorder(view.edges, *[_REACH] * 4, cv2.BORDER_CONSTANT, value=view.neutral)
+    padded = np.pad(view.edges, _REACH, constant_values=view.neutral)
+    # Of all scales the photo is the same, so it is transformed once; and of the shifts only these are wanted.
+    size = [fft.next_fast_len(side, real=True) for side in padded.shape]
+    photo, shifts = fft.rfft2(padded, size), slice(2 * _REACH + 1)
     fits = []
     for scale in _SCALES.tolist():
         at = np.floor(view.outline * scale + view.center).astype(int)
         at = at[((at >= 0) & (at < (width, height))).all(axis=1)]
         drawn = np.bincount(at[:, 1] * width + at[:, 0], minlength=height * width).astype(np.float32)
-        drawn = drawn.reshape(height, width)
-        fits.append(cv2.matchTemplate(padded, drawn, cv2.TM_CCORR) + view.neutral * (len(view.outline) - len(at)))
+        product = photo * fft.rfft2(drawn.reshape(height, width), size).conj()
+        fit = fft.irfft(fft.ifft(product, axis=0)[shifts], size[1])[:, shifts]
+        fits.append(fit + view.neutral * (len(view.outline) - len(at)))
     return np.asarray(np.stack(fits) / len(view.outline), np.float32)

@@ -15,6 +15,7 @@ from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, Frame, Int32
 from ss_flow.tasks.capture.colmap import SEED, load_pycolmap
 from ss_flow.tasks.capture.colmap_database import fill_database
+from ss_flow.tasks.capture.contradicted import contradicted
 from ss_flow.tasks.capture.features import FeatureParams, Features
 from ss_flow.tasks.capture.ingest import warn_of_skipped
 from ss_flow.tasks.capture.lens import found_lens, without_distortion
@@ -145,11 +146,32 @@ def _mapped(
 
     pipeline.add_callback(int(step.value), told)
     pipeline.run()
-    models = [manager.get(number) for number in range(manager.size())]
     sizes = [(photo.name, photo.width, photo.height) for photo in kept]
-    whole = [_cameras(model, sizes, params) for model in models if _plausible(model)]
-    large = [model for model in whole if 2 * len(model) >= max(map(len, whole))]
-    return max(large, key=lambda model: _worth(model, kept, matches), default=_cameras(None, sizes, params))
+
+    def cameras(number: int) -> Cameras:
+        return _cameras(manager.get(number), sizes, params)
+
+    models = {number: cameras(number) for number in range(manager.size()) if _plausible(manager.get(number))}
+    large = [number for number, model in models.items() if 2 * len(model) >= max(map(len, models.values()))]
+    if not large:
+        return _cameras(None, sizes, params)
+    best = max(large, key=lambda number: _worth(models[number], kept, matches))
+    wrong = contradicted(models[best], kept, matches)
+    if not wrong:
+        return models[best]
+    for number in reversed(range(manager.size())):
+        if number != best:
+            manager.delete(number)
+    _without_pose(manager.get(0), wrong)
+    pycolmap.IncrementalPipeline(_incremental_options(pycolmap, params), database, manager).run()
+    _without_pose(manager.get(0), contradicted(cameras(0), kept, matches))
+    return cameras(0)
+
+
+def _without_pose(model: Any, names: Sequence[str]) -> None:
+    """Take the poses of some photos out of one of COLMAP's models, and the points that hang on them."""
+    for image in [image for image in model.images.values() if image.name in names]:
+        model.deregister_frame(image.frame_id)
 
 
 @task(name="capture.unregistered")

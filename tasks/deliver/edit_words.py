@@ -85,9 +85,10 @@ def _color(value: Any) -> str:
 
 
 def _hole(hole: Mapping[str, Any]) -> str:
-    if not hole["unmeasured"]:
-        return ""
-    text = f" Behind {hole['unmeasured']:,} of the {hole['pixels']:,} pixels that showed it nothing was measured"
-    if "open_after_filling" in hole:
-        text += f"; after filling, behind {hole['open_after_filling']:,}"
-    return f"{text}."
+    text = ""
+    if hole["unmeasured"]:
+        text = f" Behind {hole['unmeasured']:,} of the {hole['pixels']:,} pixels that showed it nothing was measured"
+        text += f"; after filling, behind {hole['open_after_filling']:,}." if "open_after_filling" in hole else "."
+    if cleared := hole.get("cleared"):
+        text += f" {cleared:,} Gaussians that no view had shaped came to light, and went too."
+    return text

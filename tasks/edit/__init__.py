@@ -1,2 +1,2 @@
-"""Changes of a finished scene: `operations`, the `holes` that they leave, how these are closed (`fill`) by the
-`flat_surfaces` around them, `pictures`."""
+"""Changes of a finished scene: `operations`, the `holes` that they leave, how these are closed (`clear` takes away what
+comes to light, `fill` continues the `flat_surfaces` around), `pictures`."""

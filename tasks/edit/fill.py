@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +9,6 @@ import numpy as np
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     Bool,
-    Cameras,
-    DepthMap,
     EditedScene,
     Float32,
     Float64,
@@ -20,7 +17,7 @@ from ss_flow.tasks.artifacts import (
     UInt8,
 )
 from ss_flow.tasks.edit.flat_surfaces import FlatSurface, flat_surfaces
-from ss_flow.tasks.edit.holes import Measured, Remains, Uncovered, uncovered
+from ss_flow.tasks.edit.holes import HIDES, Measured, Remains, Uncovered, stayed, uncovered
 from ss_flow.tasks.edit.operations import edited
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
@@ -41,14 +38,14 @@ _PATCHES = 500
 """Points at which the roughness is looked up."""
 _UNSEEN = 1.5
 """How far from all points of a plane it was not seen, in spacings."""
-_NEAR = 4.0
-"""How far from filled places Gaussians may hide that no view has shaped, in spacings."""
-_FAINT = 0.1
-"""Weight in every pixel up to which no view can have shaped a Gaussian."""
 _DEPTH_ERROR = 0.02
 """Of a depth map, as a share of the depth."""
-_LENDERS = 32
-"""Points that lend a filled place their colour."""
+_FAINT = 0.05
+"""Share of a pixel below which it does not show what has left."""
+_LENDERS = 2000
+"""At least so many points of a plane, and less than twice as many, lend filled places their colours."""
+_AT_ONCE = 1000
+"""Places whose colours are found together."""
 _OPACITY = 0.95
 
 
@@ -67,11 +64,12 @@ def fill(
     by RANSAC; as thick as the points are rough; connected). The ray of every pixel that showed the instances is
     followed to the first plane behind them. It counts where it meets the plane inside the convex hull of its points, so
     that nothing is continued beyond what was seen; further than 1.5 spacings from any of them; where nothing that is
-    still there hides it; and where no view looked through it, by its depth map. One such place in each cube of the
-    points' spacing becomes a Gaussian, with the median colour of the 32 nearest points of the plane and the ids of the
-    nearest Gaussian of all that stayed. Small Gaussians near filled places that only came to light when the instances
-    left are taken away. What was filled before stays, and no place within a spacing of it is filled a second time.
+    still there hides it; and where no view looked through it, by its depth map or, where this knows nothing, by what
+    the scene showed. One such place in each cube of the points' spacing becomes a Gaussian, with the mean colour of the
+    plane's points, each weighed by the inverse cube of its distance (Shepard 1968), and the ids of the nearest Gaussian
+    of all that stayed. What was filled before stays, and no place within a spacing of it is filled a second time.
 
+    after: without what only came to light (`clear`), as that would hide the surfaces behind.
     gone: labels of the dense points that are no longer there, those of the instances among them.
     """
     points, cameras = measured.points, measured.cameras
@@ -85,7 +83,7 @@ def fill(
     thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))
     planes = [plane for around in arounds for plane in flat_surfaces(points, around, thickness)]
     places, plane_of = _behind(views, planes, spacing, thickness)
-    solid = ~_seen_through(places, cameras, measured.depths, thickness)
+    solid = ~_seen_through(places, before, instances, measured, thickness)
     places, plane_of = places[solid], plane_of[solid]
     chosen = _one_a_cube(places, spacing)
     chosen = chosen[~_within(places[chosen], after.means[after.filled > 0], spacing)]
@@ -96,11 +94,9 @@ def fill(
     for number in np.unique(plane_of).tolist():
         of_plane = plane_of == number
         colors[of_plane] = _colors(places[of_plane], points, planes[number].rows)
-    shaped = select(after, ~_came_to_light(before, after, instances, views, places, measured, gone))
-    # What has moved, or come instead, may lie nearer to the floor that it left than the rest of the floor does.
-    stayed = np.isin(shaped.instance_id, before.instance_id) & ~np.isin(shaped.instance_id, instances)
     filling = _flat(places, colors, plane_of, planes, spacing)
-    return concatenate([shaped, _with_ids_of(select(shaped, stayed), filling)])
+    # What has moved, or come instead, may lie nearer to the floor that it left than the rest of the floor does.
+    return concatenate([after, _with_ids_of(select(after, stayed(before, after, instances)), filling)])
 
 
 def _places_left(before: EditedScene, instances: tuple[int, ...], reach: float) -> list[Float64]:
@@ -176,49 +172,23 @@ def _behind(
     return np.concatenate(places), np.concatenate(plane_of)
 
 
-def _seen_through(places: Float64, cameras: Cameras, depths: Sequence[DepthMap], tolerance: float) -> Bool:
-    """[M] places that a view of the capture looked through: it measured something further behind."""
-    free = np.zeros(len(places), bool)
-    for view, measured in enumerate(depths):
-        height, width = measured.depth.shape
-        rows, column, row, z = pixels_in_view(places, camera_of(cameras, view).scaled(width, height))
-        free[rows[measured.depth[row, column] > z + np.maximum(tolerance, _DEPTH_ERROR * z)]] = True
-    return free
-
-
-def _came_to_light(
-    before: EditedScene,
-    after: EditedScene,
-    instances: tuple[int, ...],
-    views: list[Uncovered],
-    places: Float64,
-    measured: Measured,
-    gone: tuple[int, ...],
+def _seen_through(
+    places: Float64, before: EditedScene, instances: tuple[int, ...], measured: Measured, tolerance: float
 ) -> Bool:
-    """[N] Gaussians of `after` that what has left had hidden, and no view has shaped: they weigh twice as much now.
-
-    They often carry the colours of what hid them. Small ones go near filled places (large ones show elsewhere too), and
-    of those that lie far from every measured point that remains, inside of what has left, say, all that are faint in
-    all views.
-    """
-    stays = ~np.isin(before.instance_id, instances) & np.isin(before.instance_id, after.instance_id)
-    rest = select(before, stays)
-    reach = _NEAR * measured.points.spacing
-    with_it, without = np.zeros(len(before), np.float32), np.zeros(len(rest), np.float32)
-    for view in views:
-        np.maximum(with_it, render(before, view.camera).max_contribution, out=with_it)
-        np.maximum(without, render(rest, view.camera).max_contribution, out=without)
-    small = rest.log_scales.max(axis=1, initial=-np.inf) < np.log(reach)
-    grown = without > 2 * with_it[stays]
-    alone = grown & ~_within(rest.means, measured.points.points[Remains.of(measured, gone).rows], reach)
-    if alone.any():
-        for number in range(len(measured.cameras)):
-            np.maximum(with_it, render(before, camera_of(measured.cameras, number)).max_contribution, out=with_it)
-    came = np.zeros(len(after), bool)
-    stayed = np.flatnonzero(~np.isin(after.instance_id, instances))[: len(rest)]  # what is new comes last
-    beside = grown & small & _within(rest.means, places, reach)
-    came[stayed] = (rest.filled == 0) & (beside | (alone & (with_it[stays] < _FAINT)))
-    return came
+    """[M] places that a view of the capture looked through: it measured something further behind, or, where no depth
+    was measured, the scene shows something there that is not what has left."""
+    free = np.zeros(len(places), bool)
+    for view, known in enumerate(measured.depths):
+        height, width = known.depth.shape
+        camera = camera_of(measured.cameras, view).scaled(width, height)
+        rows, column, row, z = pixels_in_view(places, camera)
+        if not len(rows):
+            continue
+        shown = render(before, camera, label_ids=instances)
+        solid = (shown.alpha >= HIDES) & (shown.label_masks.sum(axis=0) < _FAINT)
+        depth = np.where(known.depth > 0, known.depth, np.where(solid, shown.depth / np.maximum(shown.alpha, HIDES), 0))
+        free[rows[depth[row, column] > z + np.maximum(tolerance, _DEPTH_ERROR * z)]] = True
+    return free
 
 
 def _within(places: Float32 | Float64, others: Float32 | Float64, distance: float) -> Bool:
@@ -236,11 +206,15 @@ def _one_a_cube(places: Float64, side: float) -> Int32:
 
 
 def _colors(places: Float64, points: PointCloud, rows: Int32) -> UInt8:
-    """The median of the nearest points: those next to what has left often carry some of its colour."""
-    from scipy.spatial import cKDTree
+    """Smooth over the whole place, and at its border nearly those of the surface beside it."""
+    from scipy.spatial.distance import cdist
 
-    near = cKDTree(points.points[rows]).query(places, k=min(_LENDERS, len(rows)), workers=1)[1]
-    return np.median(points.colors[rows[near]], axis=1).astype(np.uint8)
+    lenders = rows[:: max(1, len(rows) // _LENDERS)]
+    colors = np.zeros((len(places), 3))
+    for first in range(0, len(places), _AT_ONCE):
+        near = (cdist(places[first : first + _AT_ONCE], points.points[lenders]) + points.spacing) ** -3
+        colors[first : first + _AT_ONCE] = near @ points.colors[lenders] / near.sum(axis=1, keepdims=True)
+    return np.rint(colors).astype(np.uint8)
 
 
 def _flat(places: Float64, colors: UInt8, plane_of: Int32, planes: list[FlatSurface], spacing: float) -> EditedScene:

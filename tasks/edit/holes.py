@@ -25,11 +25,11 @@ from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, camera_of, pixels_in_view, project
 
-_SHOWS = 0.5
+SHOWS = 0.5
 """Accumulated alpha from which on a pixel shows something."""
 _MARGIN = 16
 """Pixels around a picture from which points still reach into it."""
-_HIDES = 0.9
+HIDES = 0.9
 """Accumulated alpha from which on nothing can be seen through a pixel."""
 _NEIGHBOURS = 8
 
@@ -142,13 +142,17 @@ def holes(
     )
 
 
+def stayed(before: EditedScene, after: EditedScene, instances: tuple[int, ...]) -> Bool:
+    """[N] which rows of the scene after an edit neither belong to what has left its place nor came instead."""
+    return np.isin(after.instance_id, before.instance_id) & ~np.isin(after.instance_id, instances)
+
+
 def uncovered(
     before: EditedScene, after: EditedScene, cameras: Cameras, instances: tuple[int, ...]
 ) -> Iterator[Uncovered]:
     """The views that show the instances, each cropped to them."""
     own = select(before, np.isin(before.instance_id, instances))
-    was_there = np.isin(after.instance_id, before.instance_id) & ~np.isin(after.instance_id, instances)
-    put = np.unique(after.instance_id[~was_there]).tolist()
+    put = np.unique(after.instance_id[~stayed(before, after, instances)]).tolist()
     for view, name in enumerate(cameras.names):
         progress(view + 1, len(cameras), name)
         camera = camera_of(cameras, view)
@@ -158,12 +162,12 @@ def uncovered(
         (y0, x0), (y1, x1) = reach.min(axis=0), reach.max(axis=0) + 1
         camera = camera.cropped(int(x0), int(y0), int(x1), int(y1))
         old, new = render(before, camera, label_ids=instances), render(after, camera, label_ids=put)
-        left, shows_put = (shown.label_masks.sum(axis=0) >= _SHOWS for shown in (old, new))
+        left, shows_put = (shown.label_masks.sum(axis=0) >= SHOWS for shown in (old, new))
         if not left.any():
             continue
-        empty = (old.alpha >= _SHOWS) & (new.alpha < _SHOWS)
-        there = old.depth.astype(np.float64) / np.maximum(old.alpha, _SHOWS)
-        now = np.where(new.alpha >= _HIDES, new.depth.astype(np.float64) / np.maximum(new.alpha, _HIDES), np.inf)
+        empty = (old.alpha >= SHOWS) & (new.alpha < SHOWS)
+        there = old.depth.astype(np.float64) / np.maximum(old.alpha, SHOWS)
+        now = np.where(new.alpha >= HIDES, new.depth.astype(np.float64) / np.maximum(new.alpha, HIDES), np.inf)
         yield Uncovered(name, camera, left, shows_put, empty, there, now)
 
 

@@ -1,5 +1,5 @@
-"""One-to-one measures of a segmentation: panoptic quality, average precision, Hungarian mIoU, over- and
-under-segmentation, whole instances.
+"""One-to-one measures of a segmentation: panoptic quality, Hungarian mIoU, over- and under-segmentation, whole
+instances.
 
 All take the contingency table of instances only (label 0 taken out with `Contingency.without`).
 """
@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.tasks.artifacts import Float64
 from ss_flow.tasks.evaluate.contingency import Contingency, Counts
 
 _MATCH = 0.5
@@ -52,27 +51,6 @@ def panoptic_quality(table: Contingency, ignored: NDArray[np.bool_] | None = Non
     weight = tp + 0.5 * fp + 0.5 * fn
     rq = tp / weight if weight else 0.0
     return PanopticQuality(sq * rq, sq, rq, tp, fp, fn)
-
-
-def monotone_average_precision(table: Contingency, confidence: Float64, threshold: float = _MATCH) -> float:
-    """Class-agnostic average precision: the area under precision over recall, precision made monotone.
-
-    ScanNet's evaluation integrates and matches otherwise: `scannet_ap`.
-
-    confidence: [P] of each prediction; the most confident choose first, ties by their order. A prediction is right when
-    its IoU with an instance that none has chosen before exceeds the threshold.
-    """
-    iou = table.iou.copy()
-    right = np.zeros(len(confidence), bool)
-    order = np.argsort(-confidence, kind="stable")
-    for rank, prediction in enumerate(order):
-        best = int(iou[:, prediction].argmax()) if len(iou) else -1
-        if best >= 0 and iou[best, prediction] > threshold:
-            right[rank] = True
-            iou[best] = 0
-    precision = np.cumsum(right) / np.arange(1, len(right) + 1)
-    envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    return float(envelope[right].sum() / max(1, len(table.truth_ids)))
 
 
 def hungarian_miou(table: Contingency) -> float:

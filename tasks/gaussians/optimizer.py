@@ -68,9 +68,9 @@ class Parameters:
         self._second["opacity_logits"][:] = 0
 
     def limit_scale(self, log_longest: Array) -> None:
-        """No standard deviation above these: [N] their logarithms, of world units."""
+        """No standard deviation above these: [N, 3] their logarithms, of world units."""
         log_scales = self.values["log_scales"]
-        self.backend.xp.minimum(log_scales, log_longest[:, None], out=log_scales)
+        self.backend.xp.minimum(log_scales, log_longest, out=log_scales)
 
     def finite(self) -> bool:
         return all(bool(self.backend.xp.isfinite(a).all()) for a in self.values.values())

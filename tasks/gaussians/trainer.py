@@ -72,6 +72,9 @@ class TrainParams:
     """Fainter Gaussians are dropped at every densification and at the end."""
     prune_contribution: Fraction = 1 / 255
     """Gaussians with no larger weight in any view are dropped at the end; 0 keeps them."""
+    prune_hidden: Fraction = 0.0
+    """Gaussians whose largest weight in any view is less than this share of their opacity are dropped at the end: so
+    little of them is left to see by what stands before them."""
     max_length: NonNegative = 0.0
     """No standard deviation of an instance's Gaussians exceeds so many times the median of the longest with which they
     start; those of the background (id 0) may. 0 = no limit."""
@@ -192,6 +195,8 @@ class _Training:
         self._extents = backend.put(extents)
         self._channels = backend.put(channels_of(initial.instance_id, label_ids)) if num_labels else None
         self._log_longest = backend.put(_log_longest(initial, params.max_length)) if params.max_length else None
+        self._limits: tuple[Any, Any] | None = None
+        """`origin` of the parameters, and what of that holds for each: laid out anew when Gaussians came or went."""
         self._control = _control(params, GradientRecord(len(initial), backend), float(extents.max()))
         self.step = 0
         # Of each view, those whose colour counts.
@@ -240,7 +245,9 @@ class _Training:
         rates = params.rates.at(done_share).by_parameter(self._extents[parameters.origin])
         parameters.step(found.gradients, AdamStep(self.step, rates, degree))
         if self._log_longest is not None:
-            parameters.limit_scale(self._log_longest[parameters.origin])
+            if self._limits is None or self._limits[0] is not parameters.origin:
+                self._limits = parameters.origin, self._log_longest[parameters.origin]
+            parameters.limit_scale(self._limits[1])
         if self._control is not None:
             seen = Seen(found.gradients["centers"], found.radii, self._pixels[view])
             self._control.after(self.step, parameters, seen, self._generator)
@@ -291,18 +298,19 @@ class _Training:
         parameters, params, xp = self.parameters, self._params, self._backend.xp
         losses = self.losses()
         parameters.keep(parameters.opacities() >= params.prune_opacity)
-        if params.prune_contribution > 0:
+        if params.prune_contribution > 0 or params.prune_hidden > 0:
             strongest = xp.zeros_like(parameters.values["opacity_logits"])
             for there in self._there:
                 strongest = xp.maximum(strongest, self._backend.strongest(parameters.values, there))
-            parameters.keep(strongest >= params.prune_contribution)
+            seen = strongest >= params.prune_hidden * parameters.opacities()
+            parameters.keep(seen & (strongest >= params.prune_contribution))
         return TrainResult(parameters.to_gaussians(self._initial), self.step, losses)
 
 
 def _log_longest(initial: Gaussians, max_length: float) -> Float32:
-    """[N] the logarithm of the longest standard deviation that each Gaussian may have."""
+    """[N, 3] the logarithm of the longest standard deviation that each Gaussian may have, along each axis."""
     longest = np.log(np.float32(max_length)) + log_lengths(initial)
-    return np.where(initial.instance_id == 0, np.float32(np.inf), longest)
+    return np.repeat(np.where(initial.instance_id == 0, np.float32(np.inf), longest)[:, None], 3, axis=1)
 
 
 def _control(params: TrainParams, record: GradientRecord, extent: float) -> AdaptiveControl | None:

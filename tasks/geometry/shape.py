@@ -24,7 +24,12 @@ def box_diagonal(points: Float32 | Float64, trim: float = 0.005) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def thinned(points: Float32 | Float64, enough: int) -> Float64:
+def extent_of(points: Float32 | Float64) -> float:
+    """How large a group of dense points [N, 3] is, world units: a fiftieth of them on each side may be strays."""
+    return box_diagonal(points, 0.02)
+
+
+def thinned(points: Float32 | Float64, enough: int = 2000) -> Float64:
     """Every n-th of the points [N, 3], so that at least `enough` are left, or all, but less than twice as many."""
     return points[:: max(1, len(points) // enough)].astype(np.float64)
 
@@ -33,6 +38,14 @@ def plane_through(points: Float64) -> Plane:
     """The plane with the least squared distances from points [N, 3]: their mean, and its unit normal."""
     centre = points.mean(axis=0)
     return centre, np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
+
+
+def normals_of(offsets: Float32, part: Bool) -> Float64:
+    """[R, 3] the normal, to either side, of the plane through some of the points [R, K, 3]: those of `part` [R, K]."""
+    own = part[..., None]
+    mean = (offsets * own).sum(axis=1, keepdims=True) / np.maximum(part.sum(axis=1), 1)[:, None, None]
+    centred = (offsets - mean) * own
+    return np.asarray(np.linalg.eigh(np.einsum("rki,rkj->rij", centred, centred))[1][:, :, 0])
 
 
 def axes_in(normal: Float64) -> Float64:

@@ -106,6 +106,7 @@ def _settings(params: MergeParams, steps: int) -> TrainParams:
         parts_per_step=SIDES_PER_STEP,
         prune_opacity=params.prune_opacity,
         prune_contribution=params.prune_contribution,
+        prune_hidden=params.prune_hidden,
         max_length=params.max_length,
         rates=params.rates,
     )
@@ -120,6 +121,7 @@ def _opening(settings: TrainParams, steps: int) -> TrainParams:
         rates=replace(settings.rates, position_final=settings.rates.position, final_share=1.0),
         prune_opacity=0.0,
         prune_contribution=0.0,
+        prune_hidden=0.0,
     )
 
 

@@ -54,6 +54,7 @@ _OF_LAST_PASS = (
     "side_weight",
     "side_views",
     "relabel_after",
+    "prune_hidden",
     "sh_every",
 )
 """What the merging of a pair never reads."""
@@ -92,6 +93,9 @@ class MergeParams:
     """Fainter Gaussians are dropped in the end."""
     prune_contribution: Fraction = 1 / 255
     """Gaussians that add no more than this to any pixel of any view are dropped in the end."""
+    prune_hidden: Fraction = 0.05
+    """Gaussians of which no view shows more than this share are dropped in the end of the last pass: nothing has shaped
+    them, and they come to light when a thing is looked at from elsewhere, or another is taken away."""
     sh_degree: HarmonicsDegree = 2
     """Highest degree of the colour's spherical harmonics."""
     sh_every: Count = 500

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ss_flow.task import task
+from ss_flow.running import in_threads
+from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Hierarchy, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import Plane, axes_in, box_diagonal, middle_of, refitted, sector_of, thinned, towards
+from ss_flow.tasks.geometry.shape import Plane, axes_in, extent_of, middle_of, refitted, sector_of, thinned, towards
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.touching import TouchingParams
@@ -31,8 +32,6 @@ _BEHIND = 0.05
 """Share of them that may lie behind it: a seat has legs."""
 _ENOUGH = 3000
 """At least so many points of an instance, and less than twice as many, tell."""
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
 _TRIPLES, _BEST, _ROUNDS = 1500, 60, 3
 """Planes that are tried, each through three points; how many of them, those that most points lie on, are looked at
 closely; and how often each of these is then fitted to the points on it."""
@@ -60,7 +59,7 @@ class BoardParams:
     """Cosine of both colour histograms up to which they are two things: a lamp has the colour of its base."""
 
 
-@task(name="split.part_boards")
+@task(name="split.part_boards", resources=Resources(cores=1, most_cores=8))
 def part_boards(
     points: PointCloud, cameras: Cameras, labels: PointLabels, tree: Hierarchy, *, params: BoardParams
 ) -> PointLabels:
@@ -72,12 +71,16 @@ def part_boards(
     eye, spread, bins = middle_of(cameras), TouchingParams().color_spread, bins_of(points.colors)
     changed, parted = labels.label.copy(), list[int]()
     rows_of = rows_by_label(labels.label)
-    for name in sorted(rows_of.keys() - {0, *tree.node[tree.stuff].tolist()}):
-        rows = rows_of[name]
-        places = points.points[rows].astype(np.float64)
-        board = board_of(places, points.spacing, eye, rises=params.rises, around=params.around)
+    names = sorted(rows_of.keys() - {0, *tree.node[tree.stuff].tolist()})
+
+    def board_in(name: int) -> Bool | None:
+        places = points.points[rows_of[name]].astype(np.float64)
+        return board_of(places, points.spacing, eye, rises=params.rises, around=params.around)
+
+    for name, board in zip(names, in_threads(board_in, names), strict=True):
         if board is None:
             continue
+        rows = rows_of[name]
         if likeness(*(histogram(bins[rows[side]], spread) for side in (board, ~board))) <= params.alike:
             changed[rows] = labels.num_labels + 2 * len(parted) + np.where(board, 1, 2)
             parted.append(name)
@@ -99,7 +102,7 @@ def board_of(places: Float64, spacing: float, eye: Float64, *, rises: float, aro
     the board, below what rises, is no part of it.
     """
     some = thinned(places, _ENOUGH)
-    extent = box_diagonal(some, _TRIM) if len(some) else 0.0
+    extent = extent_of(some) if len(some) else 0.0
     if len(places) < _FEW or 2 * spacing > _COARSE * extent:
         return None
     thickness = max(_THICKNESS * extent, 2 * spacing)

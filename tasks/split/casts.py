@@ -10,7 +10,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Int32, PointCloud
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import box_diagonal, on_plane, plane_of_most, thinned
+from ss_flow.tasks.geometry.shape import extent_of, on_plane, plane_of_most, thinned
 from ss_flow.tasks.split.shadows import logarithms, may_shade
 from ss_flow.tasks.split.votes.touching import Borders
 
@@ -26,10 +26,7 @@ _EVEN = 0.25
 """Median deviation of its colours, in each logarithm: what is printed has several."""
 _FEW = 20
 """Points below which nothing has a plane."""
-_ENOUGH, _ROUNDS = 2000, 4
-"""At least so many points of either tell, less than twice as many; and how often the plane is fitted to them."""
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
+_ROUNDS = 4
 
 
 def find_casts(points: PointCloud, label: Int32, surface: Int32, ends: Borders, stuff: Bool) -> Bool:
@@ -56,13 +53,13 @@ def find_casts(points: PointCloud, label: Int32, surface: Int32, ends: Borders, 
         rows, ground = rows_of[int(names[name])], rows_of[int(names[np.bincount(other[on_stuff]).argmax()])]
         places = points.points[rows].astype(np.float64)
         away = np.linalg.norm(points.points[ground] - places.mean(axis=0), axis=1)
-        ground = ground[away <= box_diagonal(places, _TRIM)]
+        ground = ground[away <= extent_of(places)]
         if min(len(rows), len(ground)) < _FEW:
             continue
         color = np.median(brightness[rows], axis=0)
         even = np.median(np.abs(brightness[rows] - color), axis=0).max() <= _EVEN
         if even and may_shade(color - np.median(brightness[ground], axis=0)):
             thickness = _THICKNESS * points.spacing
-            plane = plane_of_most(thinned(points.points[ground], _ENOUGH), thickness, _ROUNDS)
-            casts[name] = on_plane(thinned(places, _ENOUGH), plane, thickness).mean() >= _FLAT
+            plane = plane_of_most(thinned(points.points[ground]), thickness, _ROUNDS)
+            casts[name] = on_plane(thinned(places), plane, thickness).mean() >= _FLAT
     return casts

@@ -40,8 +40,11 @@ def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) ->
     them. Numbered from the largest part on in each instance. An instance that is a single label keeps its parts as they
     are; one that is a piece of a single label has of its parts those that it holds.
     """
-    pair = np.stack([instances.label, labels.label, parts.part], axis=1)
-    found, row, size = np.unique(pair, axis=0, return_inverse=True, return_counts=True)
+    three = instances.label, labels.label, parts.part
+    sides = [int(one.max(initial=0)) + 1 for one in three]
+    # As one number each: rows of three are sorted ten times as slowly.
+    code, row, size = np.unique(np.ravel_multi_index(three, sides), return_inverse=True, return_counts=True)
+    found = np.stack(np.unravel_index(code, sides), axis=1)
     alone = np.isin(found[:, 0], np.unique(labels.label))
     number = np.where(alone, found[:, 2], 0)
     for instance in np.unique(found[~alone, 0]):

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, Visibility
 from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.shape import normals_of
 from ss_flow.tasks.split.votes.touching import Borders
 
 _REACH = 8.0
@@ -89,19 +89,11 @@ def _sinking(points: PointCloud, outwards: Float32, label: Int32, ends: Borders)
         offset = np.where(found[..., None], points.points[near] - points.points[here][:, None], 0)
         carries = np.where(found, label[near], 0)
         own = carries == label[here][:, None]
-        depth = np.einsum("rkc,rc->rk", offset, -_normals(offset, own, outwards[here]))[of]
+        normal = normals_of(offset, own)
+        normal = np.where((normal * outwards[here]).sum(axis=1, keepdims=True) < 0, -normal, normal)
+        depth = np.einsum("rkc,rc->rk", offset, -normal)[of]
         others = carries[of] == ends.touches[1][some][:, None]
         distance = (np.linalg.norm(offset, axis=2)[of] * others).sum(axis=1)
         known = (own.sum(axis=1)[of] >= _FEW[0]) & (others.sum(axis=1) >= _FEW[1])
         sinks[some] = known * (depth * others).sum(axis=1) / np.maximum(distance, np.finfo(np.float32).tiny)
     return sinks
-
-
-def _normals(offset: Float32, own: Bool, outwards: Float32) -> NDArray[np.float32]:
-    """[R, 3] the normal of the plane through some of the points [R, K, 3], those that are `own` [R, K], on the side of
-    `outwards` [R, 3]."""
-    count = np.maximum(own.sum(axis=1), 1)[:, None]
-    centred = (offset - ((offset * own[..., None]).sum(axis=1) / count)[:, None]) * own[..., None]
-    _, axes = np.linalg.eigh(np.einsum("rki,rkj->rij", centred, centred))
-    normal = axes[:, :, 0]
-    return np.where((normal * outwards).sum(axis=1, keepdims=True) < 0, -normal, normal)

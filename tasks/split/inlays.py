@@ -19,8 +19,6 @@ from ss_flow.tasks.split.looks import Looks
 
 _FEW = 100
 """Points below which a label has no outline."""
-_ENOUGH = 2000
-"""At least so many points of a label, and less than twice as many, tell its plane."""
 _THICKNESS, _ROUNDS = 3.0, 4
 """Distance from a plane up to which points lie on it, in spacings; and how often it is fitted to those."""
 _FLAT = 0.8
@@ -77,7 +75,7 @@ def find_inlays(looks: Looks, label: Int32, asked: Bool) -> Inlays:
     own, places, planes = list[int](), list[Float64](), list[Float64]()
     for row in np.flatnonzero(asked & (size >= _FEW)).tolist():
         points = cloud.points[rows_of[int(names[row])]].astype(np.float64)
-        centre, normal = plane_of_most(thinned(points, _ENOUGH), thickness, _ROUNDS)
+        centre, normal = plane_of_most(thinned(points), thickness, _ROUNDS)
         if on_plane(points, (centre, normal), thickness).mean() >= _FLAT:
             own.append(row)
             places.append(_beside(points, (centre, normal), _CELL * cloud.spacing))

@@ -10,7 +10,7 @@ import numpy as np
 from ss_flow.running import in_threads
 from ss_flow.tasks.artifacts import Bool, Cameras, Float64, Int32, PointCloud, PointLabels, Tally
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, plane_through, thinned, towards
+from ss_flow.tasks.geometry.shape import extent_of, middle_of, plane_through, thinned, towards
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 from ss_flow.tasks.split.votes.touching import Borders, TouchingParams
 
@@ -22,10 +22,6 @@ _FEW = 20
 """Points below which a label has no shape."""
 _SMALL = 0.5
 """What stands on something is smaller than this share of it, in points: the body of a mug does not stand on its rim."""
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
-_ENOUGH = 2000
-"""At least so many points of a label, and less than twice as many, tell."""
 _CLEAR = 2.0
 """Standard deviations of the depth by which a label must rise at least: by the 1.3 above which a tenth of the points of
 something flat lie, so does a print on a wall."""
@@ -90,13 +86,13 @@ def find_mounds(
 
     def rises(row: int) -> bool:
         inside = rows_of[int(names[row])]
-        own = thinned(points.points[inside], _ENOUGH)
+        own = thinned(points.points[inside])
         rest = np.sort(np.concatenate([rows_of[name] for name in names[share[row] > _BESIDE].tolist()]))
         distance, _ = cKDTree(points.points[rest]).query(own)
         centre, normal = plane_through(own[distance <= np.quantile(distance, _FOOT)])
         rise = np.quantile((own - centre) @ towards(normal, centre, eye), 0.9)
         alike = likeness(histogram(bins[inside], spread), histogram(bins[rest], spread))
-        enough = height * max(2 * alike, _LEAST) * box_diagonal(own, _TRIM)
+        enough = height * max(2 * alike, _LEAST) * extent_of(own)
         noise = points.noise * float(np.linalg.norm(centre - eye))
         return bool(rise >= max(enough, 2 * points.spacing, _CLEAR * noise))
 

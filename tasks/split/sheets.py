@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float64, Int32, PointCloud, PointLabels
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import box_diagonal, plane_through, thinned
+from ss_flow.tasks.geometry.shape import Plane, extent_of, on_plane, plane_through, thinned
 from ss_flow.tasks.split.votes.touching import Borders
 
 _FEW = 20
@@ -29,10 +28,6 @@ _RISES = 3.0
 _MOSTLY = 0.6
 """Share of the points that touch something at which a piece must go on into that without an edge, to lie in it: halfway
 between what lies in another thing (.77 and more) and what does not (.41 and less), in 45 scenes."""
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
-_ENOUGH = 2000
-"""At least so many points of a piece, and less than twice as many, tell."""
 
 
 @dataclass(frozen=True)
@@ -53,22 +48,20 @@ class Sheets:
     labels outside of the set."""
     height: float
     """How far something must rise from the sheet to stand on it, as a share of its extent."""
-    _planes: dict[tuple[int, ...], tuple[Float64, Float64] | None] = field(default_factory=dict, init=False)
+    _planes: dict[tuple[int, ...], Plane | None] = field(default_factory=dict, init=False)
     """Planes found so far: many sets share their pieces."""
 
     def standing(self, pieces: Sequence[tuple[int, ...]]) -> Bool:
         """Which pieces, each some labels (rows), rise from another one that is a sheet in something larger: [P]."""
         stands = np.zeros(len(pieces), bool)
-        parts = self._flat_ones_joined(pieces)
-        whole = [tuple(row for i in part for row in pieces[i]) for part in parts]
-        for sheet in np.flatnonzero(self._outwards(whole) > self.flush).tolist():
-            if (plane := self._plane_of(whole[sheet])) is None:
+        for sheet in np.flatnonzero(self._outwards(pieces) > self.flush).tolist():
+            if (plane := self._plane_of(pieces[sheet])) is None:
                 continue
             centre, normal = plane
-            for i in set(range(len(pieces))) - set(parts[sheet]):
+            for i in set(range(len(pieces))) - {sheet}:
                 other = self._places(pieces[i])
                 rises = np.quantile(np.abs((other - centre) @ normal), 0.9)
-                stands[i] |= bool(rises >= max(self.height * box_diagonal(other, _TRIM), _RISES * self.points.spacing))
+                stands[i] |= bool(rises >= max(self.height * extent_of(other), _RISES * self.points.spacing))
         return stands
 
     def lies_in(self, piece: tuple[int, ...], other: tuple[int, ...]) -> bool:
@@ -76,24 +69,13 @@ class Sheets:
         here = np.ix_(piece, other)
         return bool(self.smooth[here].sum() >= max(_MOSTLY * self.meets[here].sum(), 1))
 
-    def _flat_ones_joined(self, pieces: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
-        """The pieces by number, those as one that go on into each other in one plane: a page may be in pieces."""
-        parts: list[tuple[int, ...]] = [(i,) for i in range(len(pieces))]
-        for a, b in combinations(range(len(pieces)), 2):
-            first, second = (next(part for part in parts if i in part) for i in (a, b))
-            if first == second or not self.smooth[np.ix_(pieces[a], pieces[b])].any():
-                continue
-            if self._plane_of(tuple(row for i in first + second for row in pieces[i])) is not None:
-                parts = [part for part in parts if part not in (first, second)] + [first + second]
-        return parts
-
-    def _plane_of(self, labels: tuple[int, ...]) -> tuple[Float64, Float64] | None:
-        """Centre and normal of the plane in which the labels (rows) lie; None where they do not lie in one."""
+    def _plane_of(self, labels: tuple[int, ...]) -> Plane | None:
+        """The plane in which the labels (rows) lie; None where they do not lie in one."""
         if labels not in self._planes:
             places = self._places(labels)
-            centre, normal = _plane(places)
-            flat = (np.abs((places - centre) @ normal) <= _THICKNESS * self.points.spacing).mean() >= _FLAT
-            self._planes[labels] = (centre, normal) if flat else None
+            plane = _plane(places)
+            flat = on_plane(places, plane, _THICKNESS * self.points.spacing).mean() >= _FLAT
+            self._planes[labels] = plane if flat else None
         return self._planes[labels]
 
     def _outwards(self, pieces: Sequence[tuple[int, ...]]) -> Float64:
@@ -114,7 +96,7 @@ class Sheets:
         return (outside - inside) * border / (border + _FEW)
 
     def _places(self, labels: tuple[int, ...]) -> Float64:
-        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])], _ENOUGH)
+        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])])
 
 
 def find_sheets(points: PointCloud, labels: PointLabels, ends: Borders, *, flush: float, height: float) -> Sheets:
@@ -142,7 +124,7 @@ def _counts(own: NDArray[np.intp], names: Int32, touches: Int32) -> Float64:
     return np.bincount(pair, minlength=len(names) ** 2).reshape(len(names), -1).astype(np.float64)
 
 
-def _plane(places: Float64) -> tuple[Float64, Float64]:
+def _plane(places: Float64) -> Plane:
     """The plane through some points [N, 3], without the tenth that is farthest from it."""
     centre, normal = plane_through(places)
     distance = np.abs((places - centre) @ normal)

@@ -11,6 +11,7 @@ from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import (
     Plane,
     box_diagonal,
+    extent_of,
     middle_of,
     on_plane,
     plane_of_most,
@@ -22,9 +23,9 @@ from ss_flow.tasks.geometry.shape import (
 from ss_flow.tasks.ranges import Count, Fraction
 
 _ROUNDS = 4
-_TRIM, _STRAY = 0.02, 0.1
-"""Share of the points, on every side, that the scene's extent and a label's leave out. Of a picture's mount every tenth
-point may be a stray somewhere on the wall."""
+_STRAY = 0.1
+"""Share of the points, on every side, that a label's extent leaves out. Of a picture's mount every tenth point may be a
+stray somewhere on the wall."""
 _FEW = 10
 """Points below which a label has no plane."""
 _ENOUGH = 4000
@@ -56,7 +57,7 @@ def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params
     """
     names = np.unique(labels.label[labels.label > 0])
     scene, eye = thinned(points.points, 10 * _ENOUGH), middle_of(cameras)
-    least = params.extent * box_diagonal(scene, _TRIM) if len(scene) else 0.0
+    least = params.extent * extent_of(scene) if len(scene) else 0.0
     rows_of = rows_by_label(labels.label)
     stuff = np.zeros(len(names), bool)
     for row, name in enumerate(names.tolist()):

@@ -17,7 +17,7 @@ from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import (
     Plane,
     axes_in,
-    box_diagonal,
+    extent_of,
     middle_of,
     on_plane,
     plane_of_most,
@@ -30,8 +30,6 @@ from ss_flow.tasks.geometry.shape import (
 
 _FEW = 20
 """Points below which nothing has a shape."""
-_ENOUGH = 2000
-"""At least so many points of a group, and less than twice as many, tell."""
 _THICKNESS = 2.0
 """Distance from a plane up to which a point lies on it, in multiples of the cloud's spacing."""
 _FLAT = 0.7
@@ -61,8 +59,6 @@ _SECTORS = 16
 """Directions round the foot."""
 _ROUND = 0.75
 """Share of these in which the surface goes on. Behind the back of a chair there is no seat."""
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
 
 Labels = tuple[int, ...]
 """Some labels, by their rows."""
@@ -82,8 +78,7 @@ class Supports:
     height: float
     """How far something must rise from a surface to stand on it, as a share of its extent."""
     _planes: dict[Labels, Plane | None] = field(default_factory=dict, init=False)
-    _answers: dict[tuple[Labels, Labels, Labels], bool] = field(default_factory=dict, init=False)
-    _shares: dict[tuple[Labels, Labels], float] = field(default_factory=dict, init=False)
+    _answers: dict[tuple[Labels, Labels], bool] = field(default_factory=dict, init=False)
     """What was found so far: many sets share their pieces."""
 
     def levels(self, labels: Labels) -> list[Labels]:
@@ -91,22 +86,12 @@ class Supports:
         together = [labels] if len(labels) > 1 else []
         return [level for level in (*together, *((row,) for row in labels)) if self._plane_of(level)]
 
-    def goes_on(self, level: Labels, labels: Labels) -> bool:
-        """Whether labels lie in the plane of others that `levels` names, as the pieces of a rug do."""
-        plane = self._plane_of(level)
-        if plane is None:
-            return False
-        if (level, labels) not in self._shares:
-            on = on_plane(self._places(labels), plane, self._thickness)
-            self._shares[level, labels] = float(on.mean())
-        return self._shares[level, labels] >= _FLAT
-
-    def hold(self, level: Labels, labels: Labels, more: Labels = ()) -> bool:
-        """Whether labels, taken together, stand on others that `levels` names. more: labels in which these go on."""
-        if (level, labels, more) not in self._answers:
+    def hold(self, level: Labels, labels: Labels) -> bool:
+        """Whether labels, taken together, stand on others that `levels` names."""
+        if (level, labels) not in self._answers:
             plane = self._plane_of(level)
-            self._answers[level, labels, more] = plane is not None and self._stands(plane, (*level, *more), labels)
-        return self._answers[level, labels, more]
+            self._answers[level, labels] = plane is not None and self._stands(plane, level, labels)
+        return self._answers[level, labels]
 
     def _plane_of(self, labels: Labels) -> Plane | None:
         """The level plane, its normal upwards, in which labels lie, or their top; None where there is neither."""
@@ -155,7 +140,7 @@ class Supports:
         if len(own) < _FEW:
             return False
         centre, normal = plane
-        height, extent = (own - centre) @ normal, box_diagonal(own, _TRIM)
+        height, extent = (own - centre) @ normal, extent_of(own)
         low, high = np.quantile(height, (0.1, 0.9))
         if high < max(self.height * extent, _RISES * self.points.spacing) or low < -self._thickness:
             return False
@@ -176,7 +161,7 @@ class Supports:
         return _THICKNESS * self.points.spacing
 
     def _places(self, labels: Labels) -> Float64:
-        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])], _ENOUGH)
+        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])])
 
 
 def find_supports(points: PointCloud, cameras: Cameras, labels: PointLabels, *, height: float) -> Supports:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Float64, Int32
 from ss_flow.tasks.geometry.clustering import rows_by_label
-from ss_flow.tasks.geometry.shape import box_diagonal, middle_of, on_plane, plane_of_most, thinned, towards
+from ss_flow.tasks.geometry.shape import extent_of, middle_of, on_plane, plane_of_most, thinned, towards
 from ss_flow.tasks.ranges import Count, Fraction
 from ss_flow.tasks.split.gaps import bridged
 from ss_flow.tasks.split.looks import Looks
@@ -28,10 +28,6 @@ _OPEN = 0.2
 """Least share of a common border at which the colour stays nevertheless: a poster's outline shows all along."""
 _ACROSS = 2
 """How many points beside one carry another label where its own label ends, as in `votes.touching`."""
-_TRIM = 0.02
-"""Share of the points, on every side, that an extent leaves out."""
-_ENOUGH = 2000
-"""At least so many points of a label, and less than twice as many, tell its plane."""
 _ROUNDS = 8
 _FILLED = 30
 """How often points without a label take that of their neighbours, to tell which labels touch."""
@@ -153,7 +149,7 @@ class _Surfaces:
                 places = self._cloud.points[rows].astype(np.float64)
                 names.append(name)
                 boxes.append(np.stack([places.min(axis=0), places.max(axis=0)]))
-                longest.append(self._params.gap * box_diagonal(places, _TRIM))
+                longest.append(self._params.gap * extent_of(places))
         if not names:
             return []
         low, high = np.stack(boxes, axis=1)
@@ -173,8 +169,8 @@ class _Surfaces:
 
     def _common_plane(self, rows: tuple[NDArray[np.intp], NDArray[np.intp]]) -> tuple[Float64, Float64, float] | None:
         """The plane of the larger of two sets of points, with its thickness; None where not most of each lies on it."""
-        larger, smaller = (thinned(self._cloud.points[part], _ENOUGH) for part in sorted(rows, key=len, reverse=True))
-        thickness = max(self._params.thickness * box_diagonal(smaller, _TRIM), self._cloud.spacing)
+        larger, smaller = (thinned(self._cloud.points[part]) for part in sorted(rows, key=len, reverse=True))
+        thickness = max(self._params.thickness * extent_of(smaller), self._cloud.spacing)
         plane = plane_of_most(larger, thickness, _ROUNDS)
         if any(on_plane(part, plane, thickness).mean() < self._params.flat for part in (larger, smaller)):
             return None

@@ -43,8 +43,7 @@ from ss_flow.tasks.artifacts import (
     Visibility,
 )
 from ss_flow.tasks.evaluate.contingency import contingency
-from ss_flow.tasks.evaluate.instances import evaluate_masks, pooled
-from ss_flow.tasks.evaluate.panoptic import monotone_average_precision
+from ss_flow.tasks.evaluate.instances import evaluate_masks
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -70,7 +69,6 @@ COLUMNS = (
     "macc50",
     "pq",
     "pq_things",
-    "ap50",
     "over_segmentation",
     "under_segmentation",
     "points",
@@ -199,15 +197,12 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
     instances = reproject(room.cloud, labels, whole, in_views, min_views=split.reproject.min_views)
     maps = resolve(room.cameras, instances)
     values = evaluate_masks(maps, room.truth, tree).values
-    table = pooled(maps, room.truth).without(truth=0, predicted=0)
-    confidence = {i.instance_id: i.confidence * np.sqrt(len(i.views)) for i in instances}
     known = room.true_label >= 0
     on_points = contingency(room.true_label[known], labels.label[known]).without(truth=0, predicted=0)
     return values | {
-        "ap50": monotone_average_precision(table, np.array([confidence[int(i)] for i in table.predicted_ids])),
         "points": float(on_points.best_iou().mean()),
         "moved": moved(labels.label, again.label),
-        "labels": float(len(table.predicted_ids)),
+        "labels": values["num_predicted"],
         "seconds": seconds,
     }
 

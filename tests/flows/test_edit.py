@@ -71,6 +71,9 @@ def test_the_folder_tells_its_source_its_script_and_the_holes(warm):
     assert document["edit"]["script"]["operations"] == [operation]
     (hole,) = document["edit"]["holes"]
     assert hole["operation"] == 1 and hole["instances"] == [own]
+    removed = read_gaussians(warm.out / "scene_labeled.ply").instance_id == own
+    left = len(removed) - removed.sum() - hole["cleared"] + document["edit"]["num_filled"]
+    assert hole["cleared"] > 0 and len(read_gaussians(place / "scene_labeled.ply")) == left
     assert 0 <= hole["open_after_filling"] <= hole["unmeasured"] <= hole["pixels"]
     assert not (read_gaussians(place / "scene_labeled.ply").instance_id == own).any()
     columns = read_columns(place / "scene_labeled.ply")

@@ -230,6 +230,7 @@ TABLE = {
     # 37
     "splat.merge.prune_opacity": (0.005, 0.0, 0.005),
     "splat.merge.prune_contribution": (0.0, 0.0, 1 / 255),
+    "splat.merge.prune_hidden": (0.0, 0.0, 0.05),
     "splat.reconstruct.prune_contribution": (0.0, 0.0, 1 / 255),
     # 38: the text says CLIP, the code how it is asked.
     "semantics.query.prompt": ("an image of a {text}", "an image of a {text}", "{text}"),

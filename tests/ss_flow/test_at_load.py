@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import time
+from pathlib import Path
 
 import pytest
+
+from ss_flow import at_load
 
 
 @pytest.mark.parametrize(
@@ -97,3 +101,9 @@ def test_a_module_in_which_much_is_called_when_it_is_loaded_is_read_in_a_moment(
     began = time.process_time()
     assert "probe.step.M" in package(step=step)
     assert time.process_time() - began < 3
+
+
+def test_a_walk_goes_through_a_module_as_python_s_own_does_but_for_how_names_are_used():
+    for file in Path(at_load.__file__).parent.glob("*.py"):
+        tree = ast.parse(file.read_text())
+        assert at_load.walk(tree) == [node for node in ast.walk(tree) if not isinstance(node, ast.expr_context)]

@@ -6,8 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Frame, MaskSet, Visibility
-from ss_flow.tasks.geometry.cameras import camera_of, looking
+from ss_flow.tasks.artifacts import (
+    Bool,
+    Cameras,
+    DepthMap,
+    EditedScene,
+    Frame,
+    MaskSet,
+    PointCloud,
+    PointLabels,
+    Visibility,
+)
+from ss_flow.tasks.edit.holes import Measured
+from ss_flow.tasks.edit.operations import edited
+from ss_flow.tasks.gaussians.initialise import initialise
+from ss_flow.tasks.geometry.cameras import backproject, camera_of, looking
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.packed import Masks
 
@@ -77,6 +90,29 @@ def distance_to_scene(points: np.ndarray) -> np.ndarray:
     outside = np.maximum(BOXES[:, 0] - points[:, None], points[:, None] - BOXES[:, 1])
     boxes = np.abs(np.where(outside.max(axis=-1) <= 0, outside.max(axis=-1), np.linalg.norm(outside.clip(0), axis=-1)))
     return np.minimum(np.abs(points[:, 2]), boxes.min(axis=1))
+
+
+def measured(spacing: float) -> tuple[Measured, EditedScene]:
+    """What the cameras see of the floor and the boxes: as points with true ids, and as Gaussians at these.
+
+    spacing: one point a cube of this side, metres.
+    """
+    seen = cameras()
+    places, ids = [], []
+    for view in range(VIEWS):
+        depth, own = cast(view)
+        places.append(backproject(depth, camera_of(seen, view)))
+        ids.append(own.ravel())
+    points, labels = np.concatenate(places).astype(np.float32), np.concatenate(ids).astype(np.int32)
+    near = (np.abs(points) < 6).all(axis=1)
+    _, first = np.unique(np.floor(points[near] / spacing).astype(int), axis=0, return_index=True)
+    points, labels = points[near][first], labels[near][first]
+    none, ones = np.zeros(0, np.int32), np.ones(len(points), np.float32)
+    known = PointLabels(labels, ones, 3, none, none, none)
+    cloud = PointCloud(points, COLORS[labels], 1.0, spacing)
+    return Measured(seen, depths(), cloud, known), edited(
+        initialise(points, COLORS[labels], labels, 1.0, opacity=0.9), filled=0
+    )
 
 
 def mask_set(masks: np.ndarray, name: str = "0") -> MaskSet:

@@ -1,6 +1,7 @@
 """Flat rectangles of even colours, as points, and what views see of them."""
 
 import numpy as np
+from labelled_points import one_camera
 
 from ss_flow.tasks.artifacts import Cameras, PointCloud, Visibility
 from ss_flow.tasks.geometry.cameras import camera_of, looking, pixels_in_view
@@ -32,8 +33,7 @@ def scene(*patches: Patch, unlabelled: int = 0) -> tuple[PointCloud, Cameras, np
     label[label > len(patches) - unlabelled] = 0
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = (0.5, 0.5, 3)
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
-    return PointCloud(places, colors, 1.0, STEP), cameras, label
+    return PointCloud(places, colors, 1.0, STEP), one_camera(pose), label
 
 
 def views_of(cloud: PointCloud, *eyes: tuple[float, float, float]) -> tuple[Cameras, list[Visibility]]:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from depth_sensor import sensed
 from furniture import BED_TOP, CHEST, basket, bed, chest, clock, curtain, lamp, pillow, rug, stool, wardrobe
-from household import bag, duck, jar, plant, room_of, sized
+from household import bag, bare_room, duck, jar, plant, room_of, sized, skirting_board
 
 from ss_flow.flows.generated.composites import Composite, Piece, book, cup, paint, picture, printed_box, stood_up
-from ss_flow.flows.generated.layout import CEILING, COLORS, HALF_WIDTH
+from ss_flow.flows.generated.layout import COLORS, HALF_WIDTH
 from ss_flow.flows.generated.prints import rectangle, sheet
 from ss_flow.flows.generated.room import Room, looking_at
 from ss_flow.flows.generated.shapes import box, can, joined
@@ -87,10 +87,6 @@ def _furnish(rng: np.random.Generator) -> tuple[list[Composite], float]:
 
 def _structure() -> Composite:
     """Floor, walls, a window with a rod over it, a skirting board."""
-    size = 2 * HALF_WIDTH
-    wall = sheet([rectangle(0, CEILING / 2, size, CEILING)]).moved(0, HALF_WIDTH, 0)
-    board = box(size, 0.012, 0.08).moved(0, HALF_WIDTH - 0.006, 0)
-
     bars = [box(1.0, 0.05, 0.05).moved(0, -0.02, z) for z in (0.9, 1.42, 1.95)]
     bars += [box(0.05, 0.05, 1.1).moved(x, -0.02, 0.9) for x in (-0.5, 0, 0.5)]
     rod = can(0.012, 1.8).moved(0, 0, -0.9).turned(np.pi / 2, axis=1).moved(0, -0.09, 2.12)
@@ -101,12 +97,8 @@ def _structure() -> Composite:
     return Composite(
         "grey structure",
         (
-            Piece("floor", box(size, size, 0.02).moved(0, 0, -0.02), paint("tan", "ochre", "planks", 0.2)),
-            Piece(
-                "walls", joined([wall.turned(k * np.pi / 2) for k in range(4)]), paint("cream", "sand", "noise", 0.14)
-            ),
-            Piece("ceiling", box(size, size, 0.02).moved(0, 0, CEILING), paint("white")),
-            Piece("skirting", joined([board.turned(k * np.pi / 2) for k in range(4)]), paint("white")),
+            *bare_room(paint("tan", "ochre", "planks", 0.2)),
+            skirting_board(),
             Piece("glass", glass, paint("sky")),
             Piece("bars", bars_, paint("white")),
             Piece("rod", rod, paint("umber")),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from depth_sensor import sensed
 from household import (
+    bare_room,
     bottle,
     bowl_of_fruit,
     cutting_board,
@@ -26,7 +27,7 @@ from household import (
 )
 
 from ss_flow.flows.generated.composites import Composite, Piece, book, cup, paint
-from ss_flow.flows.generated.layout import CEILING, COLORS, HALF_WIDTH
+from ss_flow.flows.generated.layout import COLORS, HALF_WIDTH
 from ss_flow.flows.generated.prints import rectangle, sheet
 from ss_flow.flows.generated.room import Room, looking_at
 from ss_flow.flows.generated.shapes import box, joined
@@ -88,9 +89,7 @@ def _furnish(rng: np.random.Generator) -> tuple[list[Composite], tuple[float, fl
 
 def _structure(doors: str) -> Composite:
     """Floor, walls, tiles, a counter with six doors, two cupboards on the wall."""
-    size, front = 2 * HALF_WIDTH, HALF_WIDTH - _DEPTH
-    wall = sheet([rectangle(0, CEILING / 2, size, CEILING)]).moved(0, HALF_WIDTH, 0)
-    walls = [wall.turned(k * np.pi / 2) for k in range(4)]
+    front = HALF_WIDTH - _DEPTH
     tiles = [rectangle(x, z, 0.14, 0.14) for x in np.arange(-1.5, 1.51, 0.15) for z in np.arange(0.98, 1.4, 0.15)]
     leaves = np.linspace(-1.25, 1.25, 6)
     handles = [box(0.14, 0.02, 0.012).moved(x, front - 0.02, 0.7) for x in leaves]
@@ -98,9 +97,7 @@ def _structure(doors: str) -> Composite:
     return Composite(
         "grey structure",
         (
-            Piece("floor", box(size, size, 0.02).moved(0, 0, -0.02), paint("grey", "sand", "checks", 0.3)),
-            Piece("walls", joined(walls), paint("cream", "sand", "noise", 0.14)),
-            Piece("ceiling", box(size, size, 0.02).moved(0, 0, CEILING), paint("white")),
+            *bare_room(paint("grey", "sand", "checks", 0.3)),
             Piece("tiles", sheet(tiles, 0.004).moved(0, HALF_WIDTH, 0), paint("white")),
             Piece("counter", box(3.0, _DEPTH - 0.03, _TOP - 0.04).moved(0, _BEHIND + 0.01, 0), paint("white")),
             Piece(

@@ -13,14 +13,12 @@ import numpy as np
 from depth_sensor import seen_near
 from furniture import stool
 from generated_walk import by_phone
-from household import room_of, round_table, sized
+from household import bare_room, room_of, round_table, sized, skirting_board
 from toys import handbag, robot, shoe, teapot, truck
 
-from ss_flow.flows.generated.composites import Composite, Piece, paint
-from ss_flow.flows.generated.layout import CEILING, COLORS, HALF_WIDTH
-from ss_flow.flows.generated.prints import rectangle, sheet
+from ss_flow.flows.generated.composites import Composite, paint
+from ss_flow.flows.generated.layout import COLORS
 from ss_flow.flows.generated.room import Room, looking_at
-from ss_flow.flows.generated.shapes import box, joined
 from ss_flow.tasks.artifacts import Float64
 
 _VIEWS = 26
@@ -62,20 +60,8 @@ def _furnish(seed: int, rng: np.random.Generator) -> tuple[list[Composite], Floa
 
 def _structure(rng: np.random.Generator) -> Composite:
     """Floor, walls, a skirting board."""
-    size = 2 * HALF_WIDTH
-    wall = sheet([rectangle(0, CEILING / 2, size, CEILING)]).moved(0, HALF_WIDTH, 0)
-    board = box(size, 0.012, 0.08).moved(0, HALF_WIDTH - 0.006, 0)
     floor = [paint("tan", "ochre", "planks", 0.2), paint("grey", "sand", "noise", 0.1), paint("sand")][rng.integers(3)]
-    walls = joined([wall.turned(k * np.pi / 2) for k in range(4)])
-    return Composite(
-        "grey structure",
-        (
-            Piece("floor", box(size, size, 0.02).moved(0, 0, -0.02), floor),
-            Piece("walls", walls, paint("cream", "sand", "noise", 0.14)),
-            Piece("ceiling", box(size, size, 0.02).moved(0, 0, CEILING), paint("white")),
-            Piece("skirting", joined([board.turned(k * np.pi / 2) for k in range(4)]), paint("white")),
-        ),
-    )
+    return Composite("grey structure", (*bare_room(floor), skirting_board()))
 
 
 def _poses(views: int, middle: Float64, far: float, rng: np.random.Generator) -> Float64:

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ss_flow.flows.generated.composites import Composite, Piece, paint, stretched, tube
+from ss_flow.flows.generated.layout import CEILING, HALF_WIDTH, Material
 from ss_flow.flows.generated.prints import LIFT, ellipse, lines_of_text, on_face, rectangle, sheet
 from ss_flow.flows.generated.render import Renderer
 from ss_flow.flows.generated.room import Room, RoomParams, furnished_room, photographed
@@ -30,6 +31,24 @@ def room_of(
     params = RoomParams(composite=True, views=len(poses), width=width, height=height, seed=seed, held_out=0)
     seen = photographed(renderer, poses, params, rng)
     return furnished_room(seen, photographed(renderer, np.zeros((0, 4, 4)), params, rng), pieces)
+
+
+def bare_room(floor: Material) -> tuple[Piece, ...]:
+    """Floor, walls and ceiling of an empty room, twice `HALF_WIDTH` wide and deep."""
+    size = 2 * HALF_WIDTH
+    wall = sheet([rectangle(0, CEILING / 2, size, CEILING)]).moved(0, HALF_WIDTH, 0)
+    walls = joined([wall.turned(k * np.pi / 2) for k in range(4)])
+    return (
+        Piece("floor", box(size, size, 0.02).moved(0, 0, -0.02), floor),
+        Piece("walls", walls, paint("cream", "sand", "noise", 0.14)),
+        Piece("ceiling", box(size, size, 0.02).moved(0, 0, CEILING), paint("white")),
+    )
+
+
+def skirting_board() -> Piece:
+    """The one round such a room."""
+    board = box(2 * HALF_WIDTH, 0.012, 0.08).moved(0, HALF_WIDTH - 0.006, 0)
+    return Piece("skirting", joined([board.turned(k * np.pi / 2) for k in range(4)]), paint("white"))
 
 
 def sized(thing: Composite, factor: float) -> Composite:

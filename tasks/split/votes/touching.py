@@ -14,6 +14,7 @@ import numpy as np
 
 from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, PointCloud
+from ss_flow.tasks.geometry.shape import normals_of
 from ss_flow.tasks.ranges import Fraction, Positive, Range
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
 
@@ -139,13 +140,10 @@ def _normals(points: Float32, rows: Int32, near: Int32, label: Int32) -> Float32
 
     An edge between two labels stays sharp, as neither takes part in the other's normals.
     """
-    part = ((label[near] == label[rows, None]) & (near != rows[:, None]))[..., None]
+    part = (label[near] == label[rows, None]) & (near != rows[:, None])
     part[:, 0] = True
-    offset = (points[near] - points[rows, None]) * part
-    count = part.sum(axis=1)
-    offset = (offset - offset.sum(axis=1, keepdims=True) / np.maximum(count, 1)[:, None]) * part
-    _, axes = np.linalg.eigh(np.einsum("rki,rkj->rij", offset, offset))
-    return np.where(count >= _FEW, axes[:, :, 0], 0).astype(np.float32)
+    normal = normals_of(points[near] - points[rows, None], part)
+    return np.where(part.sum(axis=1)[:, None] >= _FEW, normal, 0).astype(np.float32)
 
 
 def _meeting(own: Int32, at_border: Bool, point: Int32, touched: Int32, contact: float) -> list[tuple[int, int]]:

@@ -12,7 +12,16 @@ from ss_flow.flows.generated import RoomParams, generate
 from ss_flow.task import FileRef
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Registration
 from ss_flow.tasks.capture import ingest, sensor_depth
-from ss_flow.tasks.capture.registration import RegistrationParams, calibrated, registration
+from ss_flow.tasks.capture.registration import (
+    _REACH,
+    _SCALES,
+    RegistrationParams,
+    _blurred,
+    _coarse_fits,
+    _View,
+    calibrated,
+    registration,
+)
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.geometry.images import encode_png
 
@@ -169,3 +178,21 @@ def test_no_depth_is_invented(scale, x, y, seed, share):
     views = one_view(depth, size=(16, 12), center=(8.0, 6.0))
     moved = calibrated(*views, Registration(scale, np.array([x, y]), 0.5))[0].depth
     assert set(moved.ravel().tolist()) <= {0.0, *depth.ravel().tolist()}
+
+
+@given(seed=st.integers(0, 2**32 - 1), height=st.integers(20, 60), width=st.integers(20, 60))
+def test_a_coarse_fit_is_the_mean_of_the_blurred_edges_under_the_outline_at_every_scale_and_shift(seed, height, width):
+    rng = np.random.default_rng(seed)
+    center = np.array([width / 2, height / 2])
+    outline = (rng.random((30, 2)) - 0.5) * (1.3 * width, 1.3 * height)  # some of it beyond the photo
+    view = _View(rng.random((height, width), np.float32), outline, center)
+    fits = _coarse_fits(view)
+    (blurred,) = _blurred([view], 2)
+    around = np.pad(blurred.edges, _REACH, constant_values=blurred.neutral)
+    for row in (0, 20, 33, len(_SCALES) - 1):
+        x, y = np.floor(outline * _SCALES[row] + center).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        for dy, dx in ((0, 0), (_REACH, _REACH), (3, 2 * _REACH), (2 * _REACH, 2 * _REACH)):
+            # What a scale moves out of the photo is not asked again at every shift.
+            met = np.where(inside, around[(y + dy) * inside, (x + dx) * inside], blurred.neutral)
+            assert fits[row, dy, dx] == pytest.approx(met.mean(), abs=1e-5)

@@ -169,13 +169,14 @@ def test_a_report_of_an_edit_says_so_and_what_was_done():
         {"op": "merge", "instances": ["a", "b"], "name": "c"},
         {"op": "split", "instance": "c"},
     ]
-    hole = {"operation": 1, "pixels": 12_000, "unmeasured": 1082, "open_after_filling": 61}
+    hole = {"operation": 1, "cleared": 1294, "pixels": 12_000, "unmeasured": 1082, "open_after_filling": 61}
     edit = {"source": "/home/someone/kitchen", "script": {"operations": operations}, "holes": [hole], "num_filled": 67}
     html = report_html(RUN | {"edit": edit}, pictures=())
     told = [line.strip() for line in re.findall(r"<li>(.*?)</li>", html.split("<ol>")[1].split("</ol>")[0])]
     assert told == [
         "Removed red mug, instance 5 and the background, filled the hole (in &lt;the&gt; way). Behind 1,082 of the"
-        " 12,000 pixels that showed it nothing was measured; after filling, behind 61.",
+        " 12,000 pixels that showed it nothing was measured; after filling, behind 61. 1,294 Gaussians that no view had"
+        " shaped came to light, and went too.",
         "Kept nothing but lamp.",
         "Copied lamp as lamp b, moved by (0.4, 0, 0).",
         "Changed instance 3, turned by 90° about (0, 0, 1), scaled by 0.5.",

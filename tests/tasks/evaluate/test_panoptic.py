@@ -13,7 +13,6 @@ from hypothesis.extra import numpy as hnp
 from ss_flow.tasks.evaluate.contingency import Contingency, contingency
 from ss_flow.tasks.evaluate.panoptic import (
     hungarian_miou,
-    monotone_average_precision,
     over_segmentation,
     panoptic_quality,
     pieces,
@@ -99,24 +98,3 @@ def test_an_empty_prediction_scores_zero_everywhere() -> None:
     assert panoptic_quality(table) == (0, 0, 0, 0, 0, 2)
     assert hungarian_miou(table) == over_segmentation(table) == under_segmentation(table) == 0
     assert not whole(table).any() and not pieces(table).any()
-
-
-def test_average_precision_is_the_area_under_the_monotone_precision() -> None:
-    # Predictions 1 and 3 are right, 2 is wrong; a third instance is missed.
-    table = _table([1, 1, 1, 2, 2, 2, 3, 0, 0, 0], [1, 1, 1, 3, 3, 3, 0, 2, 2, 2])
-    assert monotone_average_precision(table, np.array([0.9, 0.8, 0.7])) == pytest.approx(1 / 3 + 1 / 3 * 2 / 3)
-    assert monotone_average_precision(table, np.array([0.9, 0.7, 0.8])) == pytest.approx(2 / 3)
-
-
-def test_of_two_predictions_of_one_instance_the_surer_is_right() -> None:
-    table = _table([1, 1, 1, 1, 1], [1, 1, 1, 2, 2])
-    assert monotone_average_precision(table, np.array([0.5, 0.9]), 0.3) == pytest.approx(1.0)
-    assert monotone_average_precision(table, np.array([0.9, 0.5]), 0.5) == pytest.approx(1.0)
-    assert monotone_average_precision(table, np.array([0.5, 0.9]), 0.5) == pytest.approx(0.5)
-
-
-@given(_IDS, _IDS)
-def test_average_precision_never_exceeds_the_share_of_instances_found(truth: np.ndarray, predicted: np.ndarray) -> None:
-    table = _table(truth, predicted)
-    found = panoptic_quality(table).matched / max(1, len(table.truth_ids))
-    assert 0 <= monotone_average_precision(table, np.ones(len(table.predicted_ids))) <= found + 1e-12

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from labelled_points import labels_of
 
 from ss_flow.errors import InputError
 from ss_flow.running import Surroundings, running
 from ss_flow.task import FileRef
-from ss_flow.tasks.artifacts import Gaussians, LabelMap, PointCloud, PointLabels, Visibility
+from ss_flow.tasks.artifacts import Gaussians, LabelMap, PointCloud, Visibility
 from ss_flow.tasks.evaluate.contingency import contingency
 from ss_flow.tasks.evaluate.points import (
     TruePoints,
@@ -37,12 +38,6 @@ PREDICTED = np.array([5, 5, 5, 7, 7, 7, 5, 9])
 
 def _cloud(points: np.ndarray) -> PointCloud:
     return PointCloud(points.astype(np.float32), np.zeros((len(points), 3), np.uint8), 1.0, 0.1)
-
-
-def _labels(label: list[int]) -> PointLabels:
-    none = np.zeros(0, np.int32)
-    array = np.array(label, np.int32)
-    return PointLabels(array, np.ones(len(label), np.float32), 9, none, none, none)
 
 
 def test_ig_protocol_gives_the_golden_values_e3() -> None:
@@ -98,7 +93,7 @@ def test_points_and_gaussians_are_scored_on_the_points_of_the_ground_truth() -> 
     truth = TruePoints(place.astype(np.float32), TRUTH.astype(np.int32))
     expected = point_metrics(TRUTH, PREDICTED, {})
     assert expected["miou"] == ig_metrics(TRUTH, PREDICTED)["miou"]
-    assert evaluate_points(shown, _labels(PREDICTED.tolist()), (), truth).values == expected
+    assert evaluate_points(shown, labels_of(PREDICTED.tolist()), (), truth).values == expected
     n = len(place)
     scene = Gaussians(
         shown.points,
@@ -162,7 +157,7 @@ def test_the_surer_predictions_are_those_of_more_confidence_and_of_more_views() 
         for i, confidence, views in ((5, 0.5, 16), (7, 0.9, 4), (6, 0.2, 25))  # times the root: 2, 1.8 and 1
     ]
     found = evaluate_points(
-        _cloud(place), _labels(predicted.tolist()), instances, TruePoints(place, truth.astype(np.int32))
+        _cloud(place), labels_of(predicted.tolist()), instances, TruePoints(place, truth.astype(np.int32))
     )
     # As in the second case above: the wrong one comes between two right ones.
     assert found.values["ap50"] == pytest.approx(1 / 3 + (1 / 2 + 2 / 3) / 2 / 3)
@@ -194,7 +189,7 @@ def test_ids_of_views_begin_at_one_and_have_no_gap_for_it() -> None:
     cloud = _cloud(np.arange(6).reshape(2, 3))
     for ids, gaps in (([1, 2, 0], 0), ([1, 3, 0], 1), ([2, 3, 0], 1)):
         truth = lifted(cloud, [seen], [LabelMap("a", np.uint16([ids]))])
-        assert evaluate_points(cloud, _labels([1, 2]), (), truth).values["id_gaps"] == gaps
+        assert evaluate_points(cloud, labels_of([1, 2]), (), truth).values["id_gaps"] == gaps
 
 
 def _scan(folder: Path, groups: list[list[int]], finer: list[list[int]] | None = None) -> dict[str, FileRef]:

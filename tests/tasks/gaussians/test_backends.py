@@ -178,7 +178,7 @@ def test_every_backend_remembers_the_same_gradients_and_limits_the_same_values(b
         for centers, radii in seen:
             record.add(one.put(centers), one.put(radii), 500)
         parameters.limit_opacity(0.05)
-        parameters.limit_scale(one.put(np.log(np.linspace(0.01, 1, 120, dtype=np.float32))))
+        parameters.limit_scale(one.put(np.log(np.linspace(0.01, 1, 360, dtype=np.float32)).reshape(120, 3)))
         parameters.keep(parameters.longest() > 0.05)
         found.append((one.host(record.mean()), parameters.to_gaussians(made), one.host(parameters.opacities())))
     (mean, gaussians, opacities), (their_mean, theirs, their_opacities) = found
@@ -231,6 +231,7 @@ def test_a_step_carries_nothing_to_the_host_or_from_it(stand_in, with_labels):
     first, second = ({n: torch.zeros_like(v) for n, v in moved.items()} for _ in range(2))
     record, made = GradientRecord(120, backend), initialise(values["means"], np.zeros((120, 3), np.uint8), 1, 1.0)
     parameters, longest = Parameters(made, 1, backend), backend.put(np.ones(120, np.float32))
+    limits = backend.put(np.ones((120, 3), np.float32))
     rates = dict.fromkeys(("quaternions", "log_scales", "opacity_logits", "sh", "sh_rest"), 0.1)
     with FromTheHost() as heard:
         settings, weights = Settings((0.2, 0.4, 0.6), 7, 1, winners=False), Objective().at(0.5, 0.7)
@@ -238,7 +239,7 @@ def test_a_step_carries_nothing_to_the_host_or_from_it(stand_in, with_labels):
         parts = list(backend.towards_parts(moved, [(slice(0, 60), there), (slice(30, 120), there)], 0.5))
         backend.adam(moved, found.gradients, first, second, AdamStep(1, {**rates, "means": 0.1 * longest}, 1))
         record.add(found.gradients["centers"], found.radii, int(target.counted.sum()))
-        parameters.limit_scale(longest)
+        parameters.limit_scale(limits)
     assert heard.moves == []
     for name in PARAMETERS:
         assert found.gradients[name].shape == values[name].shape == moved[name].shape

@@ -166,6 +166,18 @@ def test_what_is_faint_and_what_no_view_shows_are_dropped_in_the_end(rules, left
     assert len(train(ball, VIEWS, params=params, extent=1.6, seed=1).gaussians) == left
 
 
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_what_is_hidden_from_all_views_is_dropped_in_the_end_if_asked(share):
+    ball = ball_points()
+    ball.opacity_logits[:] = 4
+    ball.means[:20] *= 0.05  # inside; the others hide them
+    params = TrainParams(iterations=1, densify="none", prune_opacity=0.0, prune_contribution=0.0, prune_hidden=share)
+    left = train(ball, VIEWS, params=params, extent=1.6, seed=1).gaussians
+    inside = np.linalg.norm(left.means, axis=1) < 0.5 * np.linalg.norm(ball.means[20:], axis=1).min()
+    assert inside.sum() == (0 if share else 20)
+    assert 240 < (~inside).sum() <= 280  # some of the ball's far side is hidden as well
+
+
 def test_a_limit_of_none_lets_densification_go_on():
     few = select(ball_points(), np.arange(60))
     counts = [

@@ -1,6 +1,7 @@
 import numpy as np
+from labelled_points import labels_of
 
-from ss_flow.tasks.artifacts import Descriptors, PointLabels
+from ss_flow.tasks.artifacts import Descriptors
 from ss_flow.tasks.models.colour_words import ColourWords
 from ss_flow.tasks.semantics import name as module
 from ss_flow.tasks.semantics.name import InstanceNames, given_names, name
@@ -43,7 +44,7 @@ def test_an_instance_is_called_what_the_user_calls_the_object_that_it_is():
     objects = np.array([1] * 7 + [2] * 2 + [3] * 3 + [0] + [4] * 3, np.int32)
     words = ("red", "red", "blue", "green")
     names = InstanceNames(np.array([5, 7, 8, 9], np.int32), words, np.ones(4, np.float32), "colour words")
-    found = given_names(names, labelled(objects), labelled(labels), objects=("my mug", "fork", "knife", "unseen"))
+    found = given_names(names, labels_of(objects), labels_of(labels), objects=("my mug", "fork", "knife", "unseen"))
     assert found.names == ("red", "my mug", "blue", "knife")
     assert found.given.tolist() == [7, 9]
     assert (found.encoder, found.instance_id.tolist()) == ("colour words", [5, 7, 8, 9])
@@ -51,10 +52,5 @@ def test_an_instance_is_called_what_the_user_calls_the_object_that_it_is():
 
 def test_an_object_whose_instance_was_left_out_names_nothing():
     names = InstanceNames(np.zeros(0, np.int32), (), np.zeros(0, np.float32), "colour words")
-    found = given_names(names, labelled(np.ones(3, np.int32)), labelled(np.ones(3, np.int32)), objects=("mug",))
+    found = given_names(names, labels_of(np.ones(3, np.int32)), labels_of(np.ones(3, np.int32)), objects=("mug",))
     assert found.names == () and len(found.given) == 0
-
-
-def labelled(label: np.ndarray) -> PointLabels:
-    none = np.zeros(0, np.int32)
-    return PointLabels(label, np.ones(len(label), np.float32), 9, none, none, none)

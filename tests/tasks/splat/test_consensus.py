@@ -23,11 +23,6 @@ from ss_flow.tasks.splat.consensus import Voter, agreed, completed
 BALL = 2
 
 
-@pytest.fixture(scope="module")
-def small() -> SmallScene:
-    return SmallScene()
-
-
 def with_mask(instance: InstanceMasks, row: int, mask: np.ndarray) -> InstanceMasks:
     masks = instance.dense()
     masks[row] = mask

@@ -46,7 +46,7 @@ def test_what_no_mask_shows_comes_back_as_it_is(built):
 def test_the_last_pass_gives_gaussians_to_the_instance_that_photos_show_there(built):
     ball = replace(built.ball, instance_id=np.where(np.arange(len(built.ball)) % 6, 2, 1).astype(np.int32))
     scene = assemble((built.background, built.box, ball))
-    params = replace(MERGE, prune_opacity=0.0, prune_contribution=0.0)
+    params = replace(MERGE, prune_opacity=0.0, prune_contribution=0.0, prune_hidden=0.0)
 
     def gained(params: MergeParams) -> int:
         """Gaussians of the ball."""

@@ -25,11 +25,6 @@ SEGMENTER = Model("stand-in", "segmenter", (), (), ())
 
 
 @pytest.fixture(scope="module")
-def small() -> SmallScene:
-    return SmallScene()
-
-
-@pytest.fixture(scope="module")
 def box(small: SmallScene) -> Gaussians:
     """The box's surface points as thin, solid Gaussians."""
     mine = small.labels == 1

@@ -9,31 +9,16 @@ import pytest
 from ball_and_box import VIEWS, SmallScene
 
 from ss_flow.tasks.artifacts import Gaussians, LabelMap
-from ss_flow.tasks.gaussians.initialise import initialise, select
+from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.views import SceneViews
 from ss_flow.tasks.geometry.images import encode_png, size_within
-from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.masks.overlap import iou
 from ss_flow.tasks.splat import relabel
 from ss_flow.tasks.splat.relabel import relabelled, shown_masks
 
 FLOOR, BOX, BALL = 0, 1, 2
-
-
-@pytest.fixture(scope="module")
-def small() -> SmallScene:
-    return SmallScene()
-
-
-@pytest.fixture(scope="module")
-def scene(small) -> Gaussians:
-    """Small, opaque Gaussians all over the surface, with their true labels."""
-    rows = first_of_each_cube(small.points, 0.03)
-    labels = small.labels[rows]
-    round_ones = initialise(small.points[rows], small.colors[rows], labels, 0.9, np.full(len(rows), 3), opacity=0.95)
-    return replace(round_ones, log_scales=round_ones.log_scales - np.float32(np.log(2)))
 
 
 def compared(small: SmallScene) -> SceneViews:

@@ -69,11 +69,6 @@ def test_the_background_gets_all_that_no_instance_has():
     assert after.origin.tolist() == [REFINED, 0]
 
 
-@pytest.fixture(scope="module")
-def small() -> SmallScene:
-    return SmallScene()
-
-
 def settled(small: SmallScene, *instances: InstanceMasks, contested: str = "points", frames=None) -> np.ndarray:
     """[VIEWS, H, W] ids after refinement."""
     views = replace(small.views, frames=frames or small.frames)

@@ -33,11 +33,6 @@ from ss_flow.tasks.splat.side_views import (
 BOX, BALL = 1, 2
 
 
-@pytest.fixture(scope="module")
-def small() -> SmallScene:
-    return SmallScene()
-
-
 def compared(small: SmallScene) -> SceneViews:
     return small.views.compared(VisibilityParams())
 

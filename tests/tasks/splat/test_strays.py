@@ -12,24 +12,9 @@ from ss_flow.tasks.artifacts import Gaussians, LabelMap
 from ss_flow.tasks.gaussians.initialise import NO_GAUSSIANS, concatenate, initialise, select
 from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.geometry.cameras import Camera, project
-from ss_flow.tasks.geometry.sampling import first_of_each_cube
 from ss_flow.tasks.splat.strays import without_strays
 
 FLOOR, BOX, BALL = 0, 1, 2
-
-
-@pytest.fixture(scope="module")
-def small() -> SmallScene:
-    return SmallScene()
-
-
-@pytest.fixture(scope="module")
-def scene(small) -> Gaussians:
-    """Small, opaque Gaussians all over the surface, with their true labels."""
-    rows = first_of_each_cube(small.points, 0.03)
-    labels = small.labels[rows]
-    round_ones = initialise(small.points[rows], small.colors[rows], labels, 0.9, np.full(len(rows), 3), opacity=0.95)
-    return replace(round_ones, log_scales=round_ones.log_scales - np.float32(np.log(2)))
 
 
 def far_from_ball(scene: Gaussians, count: int) -> np.ndarray:

@@ -1,7 +1,13 @@
+import threading
+from unittest.mock import patch
+
 import numpy as np
 import pytest
+from labelled_points import one_camera
 
-from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels
+from ss_flow.running import Surroundings, running
+from ss_flow.tasks.artifacts import Hierarchy, PointCloud, PointLabels
+from ss_flow.tasks.split import boards
 from ss_flow.tasks.split.boards import BoardParams, board_of, part_boards
 
 STEP = 0.02
@@ -104,12 +110,11 @@ def parted(head_color=FUR, *, stuff=False, **params) -> tuple[PointLabels, Point
     cloud = PointCloud(np.concatenate(sets).astype(np.float32), colors, 1.0, STEP)
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = (-EYE[0], EYE[1], EYE[2])
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
     rows = np.arange(3, dtype=np.int32)
     before = PointLabels(label, np.ones(len(label)), 9, 0 * rows, rows, np.array([7, 3, 7], np.int32))
     node = np.array([3, 7], np.int32)
     tree = Hierarchy(node, 0 * node, np.ones(2, np.float32), np.array([False, stuff]))
-    return before, part_boards(cloud, cameras, before, tree, params=BoardParams(**params))
+    return before, part_boards(cloud, one_camera(pose), before, tree, params=BoardParams(**params))
 
 
 def test_a_head_on_its_plaque_becomes_two_instances_with_new_ids_and_the_others_keep_theirs():
@@ -125,3 +130,18 @@ def test_both_of_one_colour_stay_one_thing_and_so_does_stuff():
     for before, after in (parted(WOOD), parted(stuff=True), parted(rises=0.9)):
         assert (after.label == before.label).all() and after.match_label.tolist() == before.match_label.tolist()
         assert after.num_labels == before.num_labels
+
+
+def test_instances_that_are_looked_at_side_by_side_are_divided_as_one_after_the_other():
+    threads = set[str]()
+    looked = boards.board_of
+
+    def noted(*given, **settings):
+        threads.add(threading.current_thread().name)
+        return looked(*given, **settings)
+
+    with patch.object(boards, "board_of", noted), running(Surroundings(cores=3)):
+        _, after = parted()
+    assert threads and all(name.startswith("view") for name in threads)
+    _, alone = parted()
+    assert (after.label == alone.label).all() and after.num_labels == alone.num_labels

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 from flat_patches import BROWN, GREY, RED, SHADE, WHITE, Patch, patch, scene
+from labelled_points import labels_of
 
-from ss_flow.tasks.artifacts import PointLabels, Tally
+from ss_flow.tasks.artifacts import Tally
 from ss_flow.tasks.split.casts import find_casts
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
@@ -74,10 +75,9 @@ def test_nothing_casts_nothing():
 @pytest.mark.parametrize(("color", "united"), [(WHITE * SHADE, set()), (BROWN, {4})])
 def test_a_thing_and_its_shadow_are_not_one_though_every_view_shows_them_so(color, united):
     cloud, cameras, label = scene(patch(WHITE, 0, 0, width=2), patch(color, 2, 0, width=0.2), patch(RED, 2.2, 0))
-    nothing, names = np.zeros(0, np.int32), np.arange(1, 4, dtype=np.int32)
-    labels = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing)
+    names = np.arange(1, 4, dtype=np.int32)
     seen, held = np.full(3, 100, np.int32), np.array([[100, 0, 0], [0, 100, 100]], np.int32)
     view = Tally("a", names, seen, held, np.zeros((3, 3), np.int32), np.full(2, 0.9, np.float32))
-    found = hierarchy(cloud, cameras, [], labels, [view], params=HierarchyParams(prior=0.0, convex=0.0))
+    found = hierarchy(cloud, cameras, [], labels_of(label), [view], params=HierarchyParams(prior=0.0, convex=0.0))
     assert set(found.parent.tolist()) - {0} == united
     assert found.stuff.tolist()[:3] == [True, not united, False]

@@ -2,8 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from labelled_points import labels_of
 
-from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally, Visibility
+from ss_flow.tasks.artifacts import Cameras, PointCloud, Tally, Visibility
 from ss_flow.tasks.geometry.cameras import looking
 from ss_flow.tasks.split.edges import convex_edges
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
@@ -98,8 +99,6 @@ def test_an_edge_that_is_short_beside_the_borders_of_both_says_nothing(width, me
 def test_faces_are_one_unless_the_views_deny_it(together, apart, agreement):
     # The masks that hold both hold much else, so that alone they show nothing.
     cloud, cameras, view, label = scene()
-    nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label), np.float32), 3, nothing, nothing, nothing)
     seen = np.full(3, SIDE**2, np.int32)
     views = [[[1, 1, 1]]] * together + [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]] * apart
     tallies = [
@@ -115,7 +114,7 @@ def test_faces_are_one_unless_the_views_deny_it(together, apart, agreement):
     ]
 
     def found(**changes):
-        tree = hierarchy(cloud, cameras, [view], labels, tallies, params=HierarchyParams(**changes))
+        tree = hierarchy(cloud, cameras, [view], labels_of(label), tallies, params=HierarchyParams(**changes))
         rows = zip(tree.node, tree.agreement, strict=True)
         return {tuple(tree.node[tree.parent == node].tolist()): share for node, share in rows}
 

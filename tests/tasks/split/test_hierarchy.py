@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from labelled_points import labels_of, one_camera
 
 from ss_flow.flows.params import Params
-from ss_flow.tasks.artifacts import Cameras, Hierarchy, PointCloud, PointLabels, Tally
+from ss_flow.tasks.artifacts import Hierarchy, PointCloud, Tally
 from ss_flow.tasks.split import hierarchy as module
 from ss_flow.tasks.split.contact import Contact
 from ss_flow.tasks.split.cut import instances_of
@@ -37,12 +38,9 @@ def tree(tallies: list[Tally], labels: int, unused: int = 0, **changes) -> Hiera
     places[:, 0] += 9 * np.repeat(np.arange(labels), 20)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.1)
     label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), 20)
-    nothing = np.zeros(0, np.int32)
-    given = PointLabels(label, np.ones(len(label), np.float32), labels + unused, nothing, nothing, nothing)
-    sizes, intrinsics = np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]])
-    cameras = Cameras(("a",), sizes, intrinsics, np.eye(4)[None], True)
+    given = labels_of(label, labels + unused)
     params = HierarchyParams(**{"prior": 0.0, "contact": 0.0, "apart": 0.0, **changes})
-    return hierarchy(cloud, cameras, [], given, tallies, params=params)
+    return hierarchy(cloud, one_camera(np.eye(4)), [], given, tallies, params=params)
 
 
 def unions(found: Hierarchy) -> dict[frozenset[int], float]:
@@ -186,14 +184,11 @@ def agreement_beside(neighbour: float, alone: float = 0.3) -> float:
         np.float32
     )
     label = np.repeat(np.arange(1, 4, dtype=np.int32), len(half))
-    nothing = np.zeros(0, np.int32)
-    given = PointLabels(label, np.ones(len(label)), 3, nothing, nothing, nothing)
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), np.eye(4)[None], True)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.02)
     views = [tally([({1, 2}, 0.9)], {1, 2, 3}), tally([({1}, 0.9), ({2}, 0.9)], {1, 2, 3})]
     stuff = StuffParams(extent=1.0)  # nothing is
     params = HierarchyParams(prior=0.0, alone=alone, contact=0.0, stuff=stuff)
-    found = hierarchy(cloud, cameras, [], given, views, params=params)
+    found = hierarchy(cloud, one_camera(np.eye(4)), [], labels_of(label), views, params=params)
     return dict(zip(found.node.tolist(), found.agreement.tolist(), strict=True))[4]
 
 

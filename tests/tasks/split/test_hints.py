@@ -9,6 +9,7 @@ import box_scene
 import numpy as np
 import pytest
 from box_scene import HEIGHT, VIEWS, WIDTH, row_of_points
+from labelled_points import labels_of
 
 from ss_flow.tasks.artifacts import Clicks, PointCloud, PointLabels, PromptedMasks, Visibility
 from ss_flow.tasks.capture.views import unit
@@ -143,13 +144,8 @@ def test_objects_that_lie_apart_tell_each_others_masks_where_they_end(monkeypatc
 
 
 def spread_in(seen: Visibility, own: PromptedMasks, label: np.ndarray, model=ABSENT, embedding=NOTHING):
-    none = np.zeros(0, np.int32)
-    share = np.ones(len(label), np.float32)
-    labels = PointLabels(label, share, 3, none, none, none)
-    frame = box_scene.frames()[int(seen.name)]
-    return hints.spread(
-        EmbeddedPhoto(frame, embedding), seen, own, labels, params=RepromptParams(), contained=0.9, model=model
-    )
+    photo = EmbeddedPhoto(box_scene.frames()[int(seen.name)], embedding)
+    return hints.spread(photo, seen, own, labels_of(label, 3), params=RepromptParams(), contained=0.9, model=model)
 
 
 def every_pixel(view: int) -> tuple[np.ndarray, Visibility]:

@@ -2,8 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from labelled_points import labels_of, lying, one_camera
 
-from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
+from ss_flow.tasks.artifacts import PointCloud, Tally
 from ss_flow.tasks.split.mounds import Mounds, find_mounds
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
@@ -11,12 +12,7 @@ STEP = 0.02
 BEIGE, RED = (200, 180, 150), (150, 20, 40)
 
 
-def grid(width: float, depth: float) -> np.ndarray:
-    x, y = np.meshgrid(np.arange(-width / 2, width / 2, STEP), np.arange(-depth / 2, depth / 2, STEP))
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-
-
-SEAT = grid(1.2, 0.8)
+SEAT = lying(1.2, 0.8, step=STEP)
 HOLE = (np.abs(SEAT[:, :2]) < 0.15).all(axis=1)
 
 
@@ -24,18 +20,15 @@ def mounds(
     places: np.ndarray, label: np.ndarray, color: tuple[int, int, int], asked: float, spacing=STEP, noise=0.0
 ) -> Mounds:
     """Of a beige label 1 and label 2 in a colour, which meet each other alone, seen from above."""
-    nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), 2, nothing, nothing, nothing)
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = (0, 0, 2)
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
     both = np.array([1, 2], np.int32)
     beside = np.array([[0, 40], [40, 0]], np.int32)
     seen = Tally("a", both, np.bincount(label)[1:].astype(np.int32), np.zeros((0, 2), np.int32), beside, np.zeros(0))
     cloud = PointCloud(places.astype(np.float32), np.array([BEIGE, color], np.uint8)[label - 1], 1.0, STEP)
-    ends = borders(labels.label, cloud, TouchingParams())
+    ends = borders(label, cloud, TouchingParams())
     cloud = replace(cloud, spacing=spacing, noise=noise)
-    return find_mounds(cloud, cameras, labels, [seen], ends, around=0.8, height=asked)
+    return find_mounds(cloud, one_camera(pose), labels_of(label), [seen], ends, around=0.8, height=asked)
 
 
 def on_seat(
@@ -45,7 +38,7 @@ def on_seat(
 
     asked: share of its extent from which it stands there.
     """
-    top = grid(0.3, 0.3) + np.array([0, 0, height])
+    top = lying(0.3, 0.3, height, STEP)
     steps = np.arange(STEP, height, STEP)
     rim = top[(np.abs(top[:, :2]) > 0.13).any(axis=1)]
     sides = np.concatenate([np.zeros((0, 3)), *(rim * (1, 1, 0) + (0, 0, z) for z in steps)])

@@ -5,6 +5,7 @@ import box_scene
 import numpy as np
 import pytest
 from box_scene import mask_set
+from labelled_points import labels_of
 
 from ss_flow.tasks.artifacts import (
     DRAWN,
@@ -185,8 +186,7 @@ def test_the_masks_of_a_scene_take_the_room_of_the_things():
     image = np.kron(np.arange(1, 26).reshape(5, 5), np.ones((side // 5,) * 2, int))
     pixel = np.arange(0, side * side, 7, dtype=np.int32)
     points = np.arange(len(pixel), dtype=np.int32)
-    none = np.zeros(0, np.int32)
-    labels = PointLabels(image.ravel()[pixel].astype(np.int32), np.ones(len(pixel), np.float32), 25, none, none, none)
+    labels = labels_of(image.ravel()[pixel])
     cloud = PointCloud(np.zeros((len(pixel), 3), np.float32), np.zeros((len(pixel), 3), np.uint8), 1.0, 0.1)
     parts = PointParts(np.zeros(len(pixel), np.int32))
 
@@ -378,8 +378,7 @@ def test_a_drawn_mask_has_no_gaps_in_a_close_view_whose_points_lie_far_apart(apa
     truth[square] = True
     # Around it lies what has no label: the mask must not grow into that, however far it reaches.
     label = truth.ravel()[pixel].astype(np.int32)
-    none = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(pixel), np.float32), 1, none, none, none)
+    labels = labels_of(label)
     places = np.stack([u.ravel(), v.ravel(), np.zeros(pixel.size)], axis=-1).astype(np.float32)
     cloud = PointCloud(places, np.zeros((pixel.size, 3), np.uint8), 1.0, float(apart))
     seen = Visibility("a", np.arange(pixel.size, dtype=np.int32), pixel, np.ones(pixel.size, np.float32), side, side)

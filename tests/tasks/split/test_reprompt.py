@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 from box_scene import mask_set
+from labelled_points import labels_of
 
-from ss_flow.tasks.artifacts import PointLabels, Visibility
+from ss_flow.tasks.artifacts import Visibility
 from ss_flow.tasks.masks.selection import SelectionParams
 from ss_flow.tasks.models.catalogue import Model, find
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
@@ -23,11 +24,8 @@ def box_view(missing):
     ids = box_scene.cast(0)[1]
     every = np.arange(ids.size, dtype=np.int32)
     seen = Visibility("0", every, every, np.ones(ids.size, np.float32), *ids.shape)
-    none = np.zeros(0, np.int32)
-    share = np.ones(ids.size, np.float32)
-    labels = PointLabels(ids.ravel().astype(np.int32), share, 3, none, none, none)
     shown = [ids == i for i in (1, 2, 3) if i not in missing]
-    return ids, seen, mask_set(np.stack(shown), "0"), labels
+    return ids, seen, mask_set(np.stack(shown), "0"), labels_of(ids.ravel(), 3)
 
 
 def test_where_all_labels_have_masks_the_model_is_not_even_opened():

@@ -1,6 +1,7 @@
 import numpy as np
+from labelled_points import labels_of, one_camera
 
-from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import PointCloud
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 
 RNG = np.random.default_rng(0)
@@ -15,13 +16,10 @@ def kinds(*pieces, **values) -> list[bool]:
     """Which of these pieces of a scene, seen from (0, 0, 1.5), are stuff."""
     places = np.concatenate(pieces).astype(np.float32)
     label = np.repeat(np.arange(1, len(pieces) + 1, dtype=np.int32), [len(p) for p in pieces])
-    nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), len(pieces), nothing, nothing, nothing)
     pose = np.eye(4)
     pose[:3, 3] = (0, 0, -1.5)
-    cameras = Cameras(("a",), np.array([[8, 8]], np.int32), np.array([[8.0, 8, 4, 4]]), pose[None], True)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.05)
-    return find_stuff(cloud, cameras, labels, StuffParams(**values)).tolist()
+    return find_stuff(cloud, one_camera(pose), labels_of(label), StuffParams(**values)).tolist()
 
 
 FLOOR = plane((-2, -2, 0), (2, 2, 0.01), 2000)

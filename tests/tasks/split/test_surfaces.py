@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 from flat_patches import BROWN, GREY, RED, SHADE, WHITE, Patch, patch, scene
+from labelled_points import labels_of
 
-from ss_flow.tasks.artifacts import Hierarchy, PointLabels
+from ss_flow.tasks.artifacts import Hierarchy
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
 from ss_flow.tasks.split.looks import Looks
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
@@ -169,11 +170,8 @@ def test_faces_of_one_colour_that_meet_in_an_edge_stay_apart():
 def tree(agreement: float) -> Hierarchy:
     """A floor and a table, both in light and shadow, of which no view has a mask."""
     cloud, cameras, label = scene(*floor(), *table())
-    nothing = np.zeros(0, np.int32)
-    labels = PointLabels(label, np.ones(len(label)), 4, nothing, nothing, nothing)
-    return hierarchy(
-        cloud, cameras, [], labels, [], params=HierarchyParams(shadows=ShadowParams(agreement=agreement, repeats=1))
-    )
+    params = HierarchyParams(shadows=ShadowParams(agreement=agreement, repeats=1))
+    return hierarchy(cloud, cameras, [], labels_of(label), [], params=params)
 
 
 def test_the_tree_unites_what_light_alone_parts():

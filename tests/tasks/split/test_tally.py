@@ -1,19 +1,14 @@
 import numpy as np
+from labelled_points import labels_of
 
-from ss_flow.tasks.artifacts import PointLabels, Visibility
+from ss_flow.tasks.artifacts import Visibility
 from ss_flow.tasks.masks.pool import mask_set
 from ss_flow.tasks.split.tally import tally
 
 
-def labelled(label) -> PointLabels:
-    nothing = np.zeros(0, np.int32)
-    label = np.array(label, np.int32)
-    return PointLabels(label, np.ones(len(label), np.float32), int(label.max()), nothing, nothing, nothing)
-
-
 def test_a_point_counts_under_every_mask_that_holds_it():
     # A row of six pixels, a point on each; points 1 and 5 are not seen, point 4 has no label.
-    labels = labelled([3, 3, 3, 8, 0, 8, 8])
+    labels = labels_of([3, 3, 3, 8, 0, 8, 8])
     seen = np.array([0, 2, 3, 4, 6], np.int32)
     view = Visibility("a", seen, np.array([0, 1, 2, 3, 4], np.int32), np.ones(5, np.float32), 1, 6)
     masks = np.array([[[1, 1, 1, 1, 1, 0]], [[0, 1, 0, 0, 0, 0]]], bool)
@@ -25,7 +20,7 @@ def test_a_point_counts_under_every_mask_that_holds_it():
 
 def test_a_view_without_masks_still_says_what_it_sees():
     view = Visibility("a", np.array([0], np.int32), np.array([0], np.int32), np.ones(1, np.float32), 1, 2)
-    counted = tally(view, mask_set("a", np.zeros((0, 1, 2), bool), np.zeros(0, np.float32), "test"), labelled([1]))
+    counted = tally(view, mask_set("a", np.zeros((0, 1, 2), bool), np.zeros(0, np.float32), "test"), labels_of([1]))
     assert counted.seen.tolist() == [1] and counted.held.shape == (0, 1)
 
 
@@ -34,4 +29,4 @@ def test_borders_are_counted_where_areas_meet():
     pixels = np.arange(9, dtype=np.int32)
     view = Visibility("a", pixels, pixels, np.ones(9, np.float32), 3, 3)
     masks = mask_set("a", np.zeros((0, 3, 3), bool), np.zeros(0, np.float32), "test")
-    assert tally(view, masks, labelled([1, 1, 2, 1, 2, 2, 2, 2, 2])).beside.tolist() == [[0, 4], [4, 0]]
+    assert tally(view, masks, labels_of([1, 1, 2, 1, 2, 2, 2, 2, 2])).beside.tolist() == [[0, 4], [4, 0]]
