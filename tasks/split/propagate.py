@@ -70,8 +70,7 @@ class PropagateParams:
     """Points below which a label is dropped in the end."""
     apart: bool = True
     """Whether pieces of a label that lie apart in space, each with the share of its points that label_clusters keeps,
-    become labels of their own where the views do not show them as one (see at_once.rate), or, if they lie farther apart
-    than the shorter is long, where fewer than min_label_views do."""
+    become labels of their own where the views do not show them as one (see at_once.rate)."""
     min_label_views: Count = 2
     """Views that must show a label by a mask, where as many see at least a tenth of it; else it is dropped in the end.
     1 keeps all."""
@@ -131,7 +130,6 @@ def propagate(
             share=params.label_clusters.keep_share,
             min_points=params.min_label_points,
             rate=params.at_once.rate,
-            min_views=params.min_label_views,
             first=num_labels + 1,
         )
         num_labels = max(num_labels, int(settled.max(initial=0)))

@@ -1,9 +1,7 @@
 """Pieces of a label that lie apart in space, and that the views do not show as one: labels of their own.
 
 A mask of a table's shadow may hold the floor beside it, and one of the face of a box what stands behind it. Where two
-such masks are united, so is what they hold, though most views tell it apart. And where a single view looks over the
-edge of a tote, what lies on the floor behind is in one mask with it, and no other view sees that floor to deny it.
-Beyond Split&Splat.
+such masks are united, so is what they hold, though most views tell it apart. Beyond Split&Splat.
 """
 
 from __future__ import annotations
@@ -14,11 +12,7 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Int32, Observation, PointCloud
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
-from ss_flow.tasks.geometry.shape import box_diagonal
 from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence, membership
-
-_TRIM = 0.02
-"""Share of the points, on every side, that a length leaves out."""
 
 
 def part_labels(
@@ -30,16 +24,14 @@ def part_labels(
     share: float,
     min_points: int,
     rate: float,
-    min_views: int,
     first: int,
 ) -> Int32:
     """Part the labels of points whose pieces the views hold apart: [N].
 
     label: [N] of the cloud's points, 0 = none. reach: distance between two points of a piece, in the world's unit.
     share, min_points: of a label's points that a piece needs to be asked about; smaller ones stay with the largest.
-    rate: as for masks (`votes.at_once`), by whose rule the pieces of a label are clustered. min_views: so many must
-    show pieces as one that lie farther apart than the shorter of them is long. first: the number of the first new
-    label; the largest cluster keeps the old one, and so do those that no view sees together with it.
+    rate: as for masks (`votes.at_once`), by whose rule the pieces of a label are clustered. first: the number of the
+    first new label; the largest cluster keeps the old one, and so do those that no view sees together with it.
     """
     from scipy.sparse import coo_array, csr_array
 
@@ -67,45 +59,10 @@ def part_labels(
     cluster = correlation_clusters(together, said, np.ones(len(pieces), np.int32), rate)
     parted = label.copy()
     for own in rows_by_label(whole).values():
-        one = cluster[own]
-        if len(np.unique(one)) < len(own) and min_views > 1:
-            hangs = hang_together([pieces[row] for row in own], cloud, observations, min_views)
-            one = np.unique(np.stack([one, hangs]), axis=1, return_inverse=True)[1].astype(np.int32)
-        clusters = [own[one == number] for number in np.unique(one)]
+        clusters = [own[cluster[own] == number] for number in np.unique(cluster[own])]
         largest, *others = sorted(clusters, key=lambda rows: -int(size[rows].sum()))
         for rows in others:
             if said[rows].sum(axis=0) @ said[largest].sum(axis=0) > 0:
                 parted[np.concatenate([pieces[row] for row in rows])] = first
                 first += 1
     return parted
-
-
-def hang_together(
-    pieces: Sequence[Int32], cloud: PointCloud, observations: Sequence[Observation], min_views: int
-) -> Int32:
-    """Which pieces hang together: [P] a number for each set of them.
-
-    pieces: P x rows of the cloud's points. Two do, directly or by others, if they lie no farther apart than the shorter
-    of them is long, or if `min_views` views have a mask that shows both: with at least half of what they see of each.
-    """
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
-    places = [cloud.points[rows] for rows in pieces]
-    length = np.array([box_diagonal(own, _TRIM) for own in places])
-    gap = np.array([[tree.query(own)[0].min() for own in places] for tree in map(cKDTree, places)])
-    joined = gap <= np.minimum.outer(length, length)
-    if not joined.all():
-        piece = np.zeros(len(cloud.points), np.int32)
-        for number, rows in enumerate(pieces, 1):
-            piece[rows] = number
-        together = np.zeros_like(gap)
-        # A second copy of a view confirms nothing.
-        for seen in {(one.point_index.tobytes(), one.row.tobytes()): one for one in observations}.values():
-            count = np.bincount(piece[seen.point_index], minlength=len(pieces) + 1)[1:]
-            held = np.array([np.bincount(piece[seen.inside(j)], minlength=len(pieces) + 1)[1:]
-                             for j in range(len(seen.mask))]).reshape(-1, len(pieces))  # fmt: skip
-            shows = (2 * held >= np.maximum(count, 1)).astype(np.float64)
-            together += shows.T @ shows > 0
-        joined |= together >= min_views
-    return np.asarray(connected_components(joined, directed=False)[1], np.int32)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ss_flow.tasks.artifacts import INSIDE, Observation, PointCloud
-from ss_flow.tasks.split.votes.apart import hang_together, part_labels
+from ss_flow.tasks.split.votes.apart import part_labels
 
 TABLE, FLOOR, CRUMB = range(20), range(20, 32), range(32, 34)
 """Points of one label: a piece of a table, one of the floor far below, and too few to ask about."""
@@ -18,7 +18,7 @@ def view(*masks: range | list[int]) -> Observation:
     return Observation("", seen, number, first, row, np.full(len(row), INSIDE, np.uint8))
 
 
-def parted(*views: Observation, label: int = 1, min_views: int = 1) -> list[int]:
+def parted(*views: Observation, label: int = 1) -> list[int]:
     """The labels of table, floor and crumb when they were one."""
     place = np.zeros((34, 3), np.float32)
     place[:, 0] = np.arange(34)
@@ -26,9 +26,7 @@ def parted(*views: Observation, label: int = 1, min_views: int = 1) -> list[int]
         place[list(piece), 2] = height
     cloud = PointCloud(place, np.zeros((34, 3), np.uint8), 1.0, 1.0)
     before = np.full(34, label, np.int32)
-    found = part_labels(
-        before, cloud, views, reach=2.0, share=0.05, min_points=5, rate=0.4, min_views=min_views, first=9
-    )
+    found = part_labels(before, cloud, views, reach=2.0, share=0.05, min_points=5, rate=0.4, first=9)
     assert all(len(set(found[list(piece)].tolist())) == 1 for piece in (TABLE, FLOOR, CRUMB))
     return [int(found[piece[0]]) for piece in (TABLE, FLOOR, CRUMB)]
 
@@ -61,37 +59,3 @@ def test_no_order_of_views_or_masks_matters_and_no_second_copy():
 @pytest.mark.parametrize("views", [(), (APART,) * 3])
 def test_points_without_label_stay_so(views):
     assert parted(*views, label=0) == [0, 0, 0]
-
-
-PART = view([*TABLE, *FLOOR][1:])
-"""Another view that shows both as one."""
-
-
-@pytest.mark.parametrize(("views", "labels"), [((BOTH, view(TABLE)), [1, 9, 1]), ((BOTH, PART), [1, 1, 1])])
-def test_what_lies_far_apart_needs_two_views_that_show_it_as_one(views, labels):
-    # A floor seen over the edge of a tote, by a single view, is in one mask with the tote; no view denies it.
-    assert parted(*views) == [1, 1, 1]
-    assert parted(*views, min_views=2) == labels
-
-
-def test_a_second_copy_of_a_view_confirms_nothing():
-    assert parted(BOTH, BOTH, view(TABLE), view(TABLE), min_views=2) == [1, 9, 1]
-
-
-@pytest.mark.parametrize(("gap", "hangs"), [(4.0, True), (30.0, False)])
-def test_what_lies_no_farther_apart_than_the_shorter_is_long_hangs_together(gap, hangs):
-    place = np.zeros((34, 3), np.float32)
-    place[:, 0] = np.arange(34)
-    place[20:, 0] += gap
-    cloud = PointCloud(place, np.zeros((34, 3), np.uint8), 1.0, 1.0)
-    pieces = [np.arange(20, dtype=np.int32), np.arange(20, 34, dtype=np.int32)]
-    found = hang_together(pieces, cloud, [view(range(34))], 2)
-    assert (found[0] == found[1]) == hangs
-
-
-def test_a_chain_of_pieces_hangs_together():
-    place = np.zeros((30, 3), np.float32)
-    place[:, 0] = np.arange(30) + 6 * (np.arange(30) // 10)
-    cloud = PointCloud(place, np.zeros((30, 3), np.uint8), 1.0, 1.0)
-    pieces = [np.arange(10 * k, 10 * k + 10, dtype=np.int32) for k in range(3)]
-    assert len(set(hang_together(pieces, cloud, [], 2).tolist())) == 1
