@@ -205,7 +205,7 @@ class _Pieces:
             stuff=self.stuff[[members[0] for members in groups]],
             contact=self.contact.joined(joined),
             edges=joined.T @ self.edges @ joined * ~np.eye(len(groups), dtype=bool) > 0,
-            labels=[self._labels_of(members) for members in groups],
+            labels=[tuple(row for piece in members for row in self.labels[piece]) for members in groups],
         )
 
     def best_unions(self) -> list[tuple[Members, float]]:
@@ -314,9 +314,22 @@ class _Pieces:
             parts = {*self.contact.parted(others), *((piece,) for piece in others)} if levels else ()
             for level in levels:
                 for part in parts:
-                    if self.supports.hold(level, self._labels_of(part)):
-                        found.update(part)
+                    found.update(self._standing(level, part))
         return found
+
+    def _standing(self, level: Members, part: Members) -> set[int]:
+        """All pieces of a part that stands on a level surface; or those that stand on it and on what goes on in its
+        plane, as the other pieces of a rug do."""
+        if self.supports.hold(level, self._labels_of(part)):
+            return set(part)
+        ground = tuple(piece for piece in part if self.supports.goes_on(level, self.labels[piece]))
+        rests = self.contact.parted(tuple(piece for piece in part if piece not in ground)) if ground else []
+        return {
+            piece
+            for rest in rests
+            if self.supports.hold(level, self._labels_of(rest), self._labels_of(ground))
+            for piece in rest
+        }
 
     def _labels_of(self, pieces: Members) -> Members:
         return tuple(row for piece in pieces for row in self.labels[piece])

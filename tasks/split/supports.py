@@ -78,7 +78,8 @@ class Supports:
     height: float
     """How far something must rise from a surface to stand on it, as a share of its extent."""
     _planes: dict[Labels, Plane | None] = field(default_factory=dict, init=False)
-    _answers: dict[tuple[Labels, Labels], bool] = field(default_factory=dict, init=False)
+    _answers: dict[tuple[Labels, Labels, Labels], bool] = field(default_factory=dict, init=False)
+    _shares: dict[tuple[Labels, Labels], float] = field(default_factory=dict, init=False)
     """What was found so far: many sets share their pieces."""
 
     def levels(self, labels: Labels) -> list[Labels]:
@@ -86,12 +87,22 @@ class Supports:
         together = [labels] if len(labels) > 1 else []
         return [level for level in (*together, *((row,) for row in labels)) if self._plane_of(level)]
 
-    def hold(self, level: Labels, labels: Labels) -> bool:
-        """Whether labels, taken together, stand on others that `levels` names."""
-        if (level, labels) not in self._answers:
+    def goes_on(self, level: Labels, labels: Labels) -> bool:
+        """Whether labels lie in the plane of others that `levels` names, as the pieces of a rug do."""
+        plane = self._plane_of(level)
+        if plane is None:
+            return False
+        if (level, labels) not in self._shares:
+            on = on_plane(self._places(labels), plane, self._thickness)
+            self._shares[level, labels] = float(on.mean())
+        return self._shares[level, labels] >= _FLAT
+
+    def hold(self, level: Labels, labels: Labels, more: Labels = ()) -> bool:
+        """Whether labels, taken together, stand on others that `levels` names. more: labels in which these go on."""
+        if (level, labels, more) not in self._answers:
             plane = self._plane_of(level)
-            self._answers[level, labels] = plane is not None and self._stands(plane, level, labels)
-        return self._answers[level, labels]
+            self._answers[level, labels, more] = plane is not None and self._stands(plane, (*level, *more), labels)
+        return self._answers[level, labels, more]
 
     def _plane_of(self, labels: Labels) -> Plane | None:
         """The level plane, its normal upwards, in which labels lie, or their top; None where there is neither."""
