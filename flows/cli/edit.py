@@ -67,7 +67,7 @@ def _tell(document: dict[str, Any], folder: Path, out: Console) -> None:
         out.print(
             f"operation {hole['operation']}: of {hole['pixels']} pixels in {hole['views']} views, "
             f"{hole['unmeasured']} have nothing measured behind them, {hole['empty']} are empty"
-            + (f"; after filling {hole['open_after_filling']} are still open" if "cleared" in hole else "")
+            + (f"; after filling {hole['open_after_filling']} are still open" if "open_after_filling" in hole else "")
             + (f"; {hole['cleared']} Gaussians that no view had shaped went too" if hole.get("cleared") else "")
         )
     hits = sum(node["hit"] for node in document["nodes"])

@@ -7,7 +7,7 @@ import numpy as np
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Bool, EditedScene, Float32
-from ss_flow.tasks.edit.holes import SHOWS, Measured, Remains, stayed
+from ss_flow.tasks.edit.holes import SHOWS, Measured, Remains, stays
 from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
 from ss_flow.tasks.gaussians.render import render, shares
@@ -45,8 +45,8 @@ def clear(
     from scipy.spatial import cKDTree
 
     cameras, surface = measured.cameras, Remains.of(measured, gone)
-    stays = ~np.isin(before.instance_id, instances) & np.isin(before.instance_id, after.instance_id)
-    rest = select(before, stays)
+    stayed = stays(before, after, instances)
+    rest = select(before, stayed)
     shown, uncovered = np.zeros(len(before), np.float32), np.zeros(len(rest), np.float32)
     for view, name in enumerate(cameras.names):
         progress(view + 1, len(cameras), name)
@@ -59,7 +59,7 @@ def clear(
     distance, _ = cKDTree(surface.points.points[surface.rows]).query(rest.means, workers=1)
     grown = np.where(distance <= surface.points.spacing, _GROWN_ON_SURFACE, _GROWN)
     goes = np.zeros(len(after), bool)
-    goes[stayed(before, after, instances)] = (uncovered > grown * shown[stays]) & (rest.filled == 0)
+    goes[stays(after, before, instances)] = (uncovered > grown * shown[stayed]) & (rest.filled == 0)
     return select(after, ~goes)
 
 

@@ -17,7 +17,7 @@ from ss_flow.tasks.artifacts import (
     UInt8,
 )
 from ss_flow.tasks.edit.flat_surfaces import FlatSurface, flat_surfaces
-from ss_flow.tasks.edit.holes import HIDES, Measured, Remains, Uncovered, stayed, uncovered
+from ss_flow.tasks.edit.holes import HIDES, Measured, Remains, Uncovered, stays, uncovered
 from ss_flow.tasks.edit.operations import edited
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
@@ -96,7 +96,7 @@ def fill(
         colors[of_plane] = _colors(places[of_plane], points, planes[number].rows)
     filling = _flat(places, colors, plane_of, planes, spacing)
     # What has moved, or come instead, may lie nearer to the floor that it left than the rest of the floor does.
-    return concatenate([after, _with_ids_of(select(after, stayed(before, after, instances)), filling)])
+    return concatenate([after, _with_ids_of(select(after, stays(after, before, instances)), filling)])
 
 
 def _places_left(before: EditedScene, instances: tuple[int, ...], reach: float) -> list[Float64]:
@@ -182,11 +182,11 @@ def _seen_through(
         height, width = known.depth.shape
         camera = camera_of(measured.cameras, view).scaled(width, height)
         rows, column, row, z = pixels_in_view(places, camera)
-        if not len(rows):
-            continue
-        shown = render(before, camera, label_ids=instances)
-        solid = (shown.alpha >= HIDES) & (shown.label_masks.sum(axis=0) < _FAINT)
-        depth = np.where(known.depth > 0, known.depth, np.where(solid, shown.depth / np.maximum(shown.alpha, HIDES), 0))
+        depth = known.depth
+        if not (depth[row, column] > 0).all():
+            shown = render(before, camera, label_ids=instances)
+            solid = (shown.alpha >= HIDES) & (shown.label_masks.sum(axis=0) < _FAINT)
+            depth = np.where(depth > 0, depth, np.where(solid, shown.depth / np.maximum(shown.alpha, HIDES), 0))
         free[rows[depth[row, column] > z + np.maximum(tolerance, _DEPTH_ERROR * z)]] = True
     return free
 

@@ -142,9 +142,10 @@ def holes(
     )
 
 
-def stayed(before: EditedScene, after: EditedScene, instances: tuple[int, ...]) -> Bool:
-    """[N] which rows of the scene after an edit neither belong to what has left its place nor came instead."""
-    return np.isin(after.instance_id, before.instance_id) & ~np.isin(after.instance_id, instances)
+def stays(scene: EditedScene, other: EditedScene, instances: tuple[int, ...]) -> Bool:
+    """[N] which rows of a scene, before or after an edit, are of what the other one has, too, and that has not left its
+    place as these instances have."""
+    return np.isin(scene.instance_id, other.instance_id) & ~np.isin(scene.instance_id, instances)
 
 
 def uncovered(
@@ -152,7 +153,7 @@ def uncovered(
 ) -> Iterator[Uncovered]:
     """The views that show the instances, each cropped to them."""
     own = select(before, np.isin(before.instance_id, instances))
-    put = np.unique(after.instance_id[~stayed(before, after, instances)]).tolist()
+    put = np.unique(after.instance_id[~stays(after, before, instances)]).tolist()
     for view, name in enumerate(cameras.names):
         progress(view + 1, len(cameras), name)
         camera = camera_of(cameras, view)

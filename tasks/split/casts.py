@@ -40,9 +40,7 @@ def find_casts(points: PointCloud, label: Int32, surface: Int32, ends: Borders, 
     of = surface[label]
     names = np.unique(of[of > 0])
     casts = np.zeros(len(names), bool)
-    own, other = (np.searchsorted(names, to) for to in (of[ends.rows[ends.touches[0]]], surface[ends.touches[1]]))
-    point = ends.touches[0][own != other]
-    own, other = own[own != other], other[own != other]
+    own, other, point = ends.of_surfaces(label, surface, names)
     rows_of, brightness = rows_by_label(of), logarithms(points.colors)
     for name in np.unique(own[stuff[other] & ~stuff[own]]).tolist():
         mine = own == name

@@ -128,8 +128,8 @@ def hierarchy(
     surface = lit_surfaces(looks, labels.label, ends, params.shadows)
     is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)
     if params.shadows.agreement:
-        surface = with_tiles(points, labels.label, surface, ends, is_stuff)
-        is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)
+        names, surface = np.unique(surface[leaves]), with_tiles(points, labels.label, surface, ends, is_stuff)
+        is_stuff = is_stuff[np.isin(names, surface[leaves])]
     _, surface_of = np.unique(surface[leaves], return_inverse=True)
     is_stuff = (is_stuff | find_casts(points, labels.label, surface, ends, is_stuff))[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)

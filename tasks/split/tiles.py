@@ -44,9 +44,8 @@ def with_tiles(points: PointCloud, label: Int32, surface: Int32, ends: Borders, 
     places = [points.points[rows_of[name]] for name in names.tolist()]
     size = np.array([len(own) for own in places], np.int64)
     extent = np.array([extent_of(own) for own in places])
-    own, other = (np.searchsorted(names, to) for to in (of[ends.rows[ends.touches[0]]], surface[ends.touches[1]]))
-    touches = np.unique(np.stack([own, other, ends.touches[0]])[:, own != other], axis=1)
-    border = np.bincount(touches[0], minlength=len(names))
+    own, other, _ = np.unique(ends.of_surfaces(label, surface, names), axis=1)
+    border = np.bincount(own, minlength=len(names))
     thickness, ground_of = _THICKNESS * points.spacing, names.copy()
     for ground in sorted(np.flatnonzero(stuff & (size >= _FEW)).tolist(), key=lambda row: (-size[row], row)):
         plane = plane_of_most(thinned(places[ground]), thickness, _ROUNDS)
@@ -55,7 +54,7 @@ def with_tiles(points: PointCloud, label: Int32, surface: Int32, ends: Borders, 
                 if on_plane(thinned(places[row]), plane, thickness).mean() >= _FLAT]  # fmt: skip
         level = stuff.copy()
         level[flat] = True
-        elsewhere = np.bincount(touches[0][~level[touches[1]]], minlength=len(names))
+        elsewhere = np.bincount(own[~level[other]], minlength=len(names))
         pieces = np.array([row for row in flat if elsewhere[row] <= _ELSEWHERE * border[row]], np.intp)
         ordered = np.sort(extent[pieces])
         alike = np.searchsorted(ordered, _ALIKE * ordered, side="right") - np.arange(len(ordered))
