@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ss_flow.control_groups import usable_cores
 from ss_flow.distributions import ABSENT, version
 from ss_flow.errors import InputError
+from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.device import VARIABLE, has_device, wanted
 from ss_flow.tasks.gaussians.library import instruction_set
@@ -26,6 +28,12 @@ from ss_flow.tasks.processor import on_this_processor
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+SMALL, SMALL_PER_CORE = 200 * 200, 13_000
+"""Pixels of a picture. A device takes three milliseconds a step whatever the size, to start its kernels, and no more
+steps a second for several trainings than for one (docs/device.md). Where pictures have fewer pixels than the first, or
+the second for each of its cores, a task with several is faster on these; and fewer than the second for each core of the
+machine, those that have a core each are together."""
 
 
 @dataclass
@@ -119,6 +127,16 @@ def device_here() -> str:
     if missing and wanted() == "cuda":
         raise InputError(f"{VARIABLE} asks for CUDA, but {missing}.")
     return "cpu" if missing else "cuda"
+
+
+def device_for(pixels: float) -> str:
+    """Where pictures of so many pixels are trained or drawn fastest: "cuda" or "cpu".
+
+    A task that has a single core is taken for one of many at once. Raises InputError as `device_here`.
+    """
+    here = device_here()
+    small = max(SMALL, SMALL_PER_CORE * cores()) if cores() > 1 else SMALL_PER_CORE * usable_cores()
+    return "cpu" if pixels < small else here
 
 
 def backend_identity() -> dict[str, str]:

@@ -12,7 +12,7 @@ import numpy as np
 from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
-from ss_flow.tasks.gaussians.rasterize import device_here
+from ss_flow.tasks.gaussians.rasterize import device_for
 from ss_flow.tasks.geometry.cameras import Camera
 
 OPAQUE_LOGIT = 20.0
@@ -55,7 +55,7 @@ def render(
     label_ids: Sequence[int] = (),
     winners: bool = True,
 ) -> Rendering:
-    """Render Gaussians, on CUDA where Gaussians are trained there and it has the memory.
+    """Render Gaussians, on CUDA where pictures of this size are drawn faster there and it has the memory.
 
     opaque: every opacity 1, with the falloff kept (spec P2). label_ids: instance ids, one mask channel each. winners:
     whether `top_contributor` and `max_contribution` are asked for, which take long on CUDA.
@@ -70,11 +70,13 @@ def render(
     labels = channels_of(gaussians.instance_id, label_ids) if len(label_ids) else None
     red, green, blue = background
     settings = Settings((red, green, blue), len(label_ids), gaussians.sh_degree, winners)
-    if _device(gaussians) != "cpu":
+    # Nothing at all is drawn on the CPU.
+    device = device_for(camera.width * camera.height) if len(gaussians) else "cpu"
+    if device != "cpu":
         from ss_flow.tasks.gaussians.torch_render import draw
 
         with suppress(MemoryError):
-            there = draw(_device(gaussians), parameters, labels, camera, settings)
+            there = draw(device, parameters, labels, camera, settings)
             return Rendering(
                 there.rgb.cpu().numpy(),
                 there.alpha.cpu().numpy(),
@@ -115,8 +117,3 @@ def shares(gaussians: Gaussians, camera: Camera, ids: Int32) -> Shares:
     key, place = np.unique(found.astype(np.int64) * len(gaussians) + rows, return_inverse=True)
     one, row = np.divmod(key, max(len(gaussians), 1))
     return Shares(row.astype(np.int32), one.astype(np.int32), np.bincount(place, weights, len(key)).astype(np.float32))
-
-
-def _device(gaussians: Gaussians) -> str:
-    """Where to draw them; nothing at all is drawn on the CPU."""
-    return device_here() if len(gaussians) else "cpu"

@@ -12,7 +12,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.control_groups import usable_cores
 from ss_flow.running import cores, last_try, load_checkpoint, progress, save_checkpoint, warn
 from ss_flow.tasks.artifacts import Float32, Gaussians
 from ss_flow.tasks.gaussians.backends import AdamStep, Backend, backend_for
@@ -22,18 +21,13 @@ from ss_flow.tasks.gaussians.learning_rates import LearningRates
 from ss_flow.tasks.gaussians.native_pass import Settings
 from ss_flow.tasks.gaussians.objective import Objective, Target, Targets
 from ss_flow.tasks.gaussians.optimizer import Parameters
-from ss_flow.tasks.gaussians.rasterize import device_here
+from ss_flow.tasks.gaussians.rasterize import device_for
 from ss_flow.tasks.gaussians.render import channels_of
 from ss_flow.tasks.gaussians.views import TrainView
 from ss_flow.tasks.ranges import Count, Fraction, HarmonicsDegree, Natural, NonNegative, Positive
 
 CHECKPOINT_SECONDS = 60.0
 """How much work a kill may cost."""
-SMALL, SMALL_PER_CORE = 200 * 200, 13_000
-"""Pixels of a view. A device takes three milliseconds a step whatever the size, to start its kernels, and no more steps
-a second for several trainings than for one (docs/device.md). Where views have fewer pixels in the mean than the first,
-or the second for each of its cores, a training with several is faster on these; and fewer than the second for each core
-of the machine, those that have a core each are together."""
 
 
 class TrainingDiverged(RuntimeError):
@@ -117,9 +111,9 @@ def train(
     extent: size of what is trained, world units, or [N] of what each Gaussian is part of: scales the learning rate of
     the means and tells large Gaussians from small. label_ids: instance ids of the mask loss. parts: what some rows of
     `initial` should look like alone, with `part_weight`, where nothing is cloned or split. backend: where it happens;
-    by default, that of `device_here` where views are large, else the CPU, which also takes over in a last try where the
-    device has not enough memory. On the CPU the number of threads changes no byte, and neither does a kill: a later try
-    goes on from the last checkpoint.
+    by default on `device_for` views of their mean size, and on the CPU in a last try where a device has not enough
+    memory. On the CPU the number of threads changes no byte, and neither does a kill: a later try goes on from the last
+    checkpoint.
     Raises ValueError when there are no views or Gaussians, an array does not fit its camera, or rows of parts would
     move, TrainingDiverged when numbers blow up. The result has no Gaussians when all were pruned.
     """
@@ -145,7 +139,7 @@ def train(
 
     if backend is not None:
         return run_on(backend)
-    device = _device(views)
+    device = device_for(sum(view.camera.width * view.camera.height for view in views) / len(views))
     try:
         return run_on(backend_for(device, cores()))
     except MemoryError:
@@ -153,13 +147,6 @@ def train(
             raise
     warn(f"{device} has not enough memory for a training of {len(views)} views: it ran on the CPU.")
     return run_on(backend_for("cpu", cores()))
-
-
-def _device(views: Sequence[TrainView]) -> str:
-    """Where a training of these views is fastest. One that has a single core is taken for one of many at once."""
-    here = device_here()
-    small = max(SMALL, SMALL_PER_CORE * cores()) if cores() > 1 else SMALL_PER_CORE * usable_cores()
-    return "cpu" if sum(view.camera.width * view.camera.height for view in views) < small * len(views) else here
 
 
 class _Training:

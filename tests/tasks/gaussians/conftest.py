@@ -34,4 +34,4 @@ def backend(request, monkeypatch) -> TorchBackend:
 @pytest.fixture
 def native(monkeypatch):
     """Train on the CPU wherever the tests run: only there the same inputs give the same bytes."""
-    monkeypatch.setattr(trainer, "device_here", lambda: "cpu")
+    monkeypatch.setattr(trainer, "device_for", lambda pixels: "cpu")

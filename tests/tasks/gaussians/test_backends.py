@@ -197,9 +197,9 @@ def test_renderings_by_torch_are_the_native_ones(monkeypatch, label_ids):
     )
     made = replace(made, sh=values["sh"], quaternions=values["quaternions"])
     drawing = sys.modules[render.__module__]
-    monkeypatch.setattr(drawing, "_device", lambda gaussians: "cpu")
+    monkeypatch.setattr(drawing, "device_for", lambda pixels: "cpu")
     expected = render(made, target.camera, background=(0.1, 0.2, 0.3), label_ids=label_ids)
-    monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))  # torch's, not "cpu", the native one
+    monkeypatch.setattr(drawing, "device_for", lambda pixels: torch.device("cpu"))  # torch's, not "cpu", the native one
     found = render(made, target.camera, background=(0.1, 0.2, 0.3), label_ids=label_ids)
     for name, image in expected._asdict().items():
         assert getattr(found, name).dtype == image.dtype and np.array_equal(getattr(found, name), image), name

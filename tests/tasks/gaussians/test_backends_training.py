@@ -117,7 +117,7 @@ def test_what_a_device_has_no_memory_for_is_trained_on_the_cpu_in_the_last_try(m
     full = TorchBackend("cpu")
     full.descent = no_memory
     training = sys.modules[train.__module__]
-    monkeypatch.setattr(training, "_device", lambda views: "small")
+    monkeypatch.setattr(training, "device_for", lambda pixels: "small")
     monkeypatch.setattr(training, "backend_for", lambda device, threads: full if device == "small" else NATIVE)
     params = TrainParams(iterations=3, densify="none")
     with pytest.raises(MemoryError):
@@ -133,9 +133,9 @@ def test_what_a_device_has_no_memory_for_is_drawn_on_the_cpu(monkeypatch):
     made = initialise(np.array([[0, 0, 2.0]]), np.full((1, 3), 200, np.uint8), 1, 1.0)
     camera = Camera(32, 24, 30, 30, 16, 12, np.eye(4))
     drawing = sys.modules[render.__module__]
-    monkeypatch.setattr(drawing, "_device", lambda gaussians: "cpu")
+    monkeypatch.setattr(drawing, "device_for", lambda pixels: "cpu")
     expected = render(made, camera)
-    monkeypatch.setattr(drawing, "_device", lambda gaussians: torch.device("cpu"))
+    monkeypatch.setattr(drawing, "device_for", lambda pixels: torch.device("cpu"))
     by_torch = sys.modules["ss_flow.tasks.gaussians.torch_render"]
     monkeypatch.setattr(by_torch, "_drawn", no_memory)
     for name, image in expected._asdict().items():

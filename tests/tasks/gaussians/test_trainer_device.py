@@ -1,4 +1,4 @@
-"""Where a training runs, on the CPU or on the device."""
+"""Where a training runs, and a picture is drawn: on the CPU or on the device."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import pytest
 from ray_cast_ball import ball_points, ball_view
 
 from ss_flow.running import Surroundings, running
-from ss_flow.tasks.gaussians import trainer
+from ss_flow.tasks.gaussians import rasterize, torch_render, trainer
 from ss_flow.tasks.gaussians.backends import NativeBackend
+from ss_flow.tasks.gaussians.render import render
 from ss_flow.tasks.gaussians.trainer import TrainParams, train
 from ss_flow.tasks.gaussians.views import TrainView
-from ss_flow.tasks.geometry.cameras import Camera
 
 
 def test_small_views_are_trained_on_the_cpu_and_large_ones_on_the_device(monkeypatch):
     asked = []
-    monkeypatch.setattr(trainer, "device_here", lambda: "cuda")
+    monkeypatch.setattr(rasterize, "device_here", lambda: "cuda")
     monkeypatch.setattr(trainer, "backend_for", lambda device, threads: asked.append(device) or NativeBackend(threads))
     for side in (199, 200):
         view = ball_view(0.0)
@@ -40,13 +40,22 @@ def test_small_views_are_trained_on_the_cpu_and_large_ones_on_the_device(monkeyp
     ],
 )  # fmt: skip
 def test_the_more_cores_or_trainings_at_once_the_larger_are_those_for_the_cpu(monkeypatch, machine, own, small):
-    monkeypatch.setattr(trainer, "device_here", lambda: "cuda")
-    monkeypatch.setattr(trainer, "usable_cores", lambda: machine)
-
-    def view(pixels: int) -> TrainView:
-        camera = Camera(pixels // 100, 100, 60.0, 60.0, 0.0, 0.0, np.eye(4))
-        return TrainView(camera, *(np.zeros(0),) * 4)
+    monkeypatch.setattr(rasterize, "device_here", lambda: "cuda")
+    monkeypatch.setattr(rasterize, "usable_cores", lambda: machine)
 
     with running(Surroundings(cores=own)):
-        assert trainer._device([view(small - 1000), view(small)]) == "cpu"
-        assert trainer._device([view(small - 1000), view(small + 1000)]) == "cuda"
+        assert rasterize.device_for(small - 1) == "cpu"
+        assert rasterize.device_for(small) == "cuda"
+
+
+def test_small_pictures_are_drawn_on_the_cpu_and_large_ones_on_the_device(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(rasterize, "device_here", lambda: "cuda")
+    monkeypatch.setattr(rasterize, "usable_cores", lambda: 4)
+    monkeypatch.setattr(torch_render, "draw", lambda device, parameters, labels, camera, settings: drawn.append(camera))
+    view = ball_view(0.0).camera
+    small, large = replace(view, width=259, height=200), replace(view, width=260, height=200)
+    assert render(ball_points(), small).rgb.shape == (200, 259, 3)
+    with pytest.raises(AttributeError):  # of the stand-in, which draws nothing
+        render(ball_points(), large)
+    assert drawn == [large]
