@@ -17,7 +17,6 @@ import numpy as np
 from ss_flow.control_groups import usable_cores
 from ss_flow.distributions import ABSENT, version
 from ss_flow.errors import InputError
-from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Gaussians
 from ss_flow.tasks.device import VARIABLE, has_device, wanted
 from ss_flow.tasks.gaussians.library import instruction_set
@@ -30,10 +29,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SMALL, SMALL_PER_CORE = 200 * 200, 13_000
-"""Pixels of a picture. A device takes three milliseconds a step whatever the size, to start its kernels, and no more
-steps a second for several trainings than for one (docs/device.md). Where pictures have fewer pixels than the first, or
-the second for each of its cores, a task with several is faster on these; and fewer than the second for each core of the
-machine, those that have a core each are together."""
+"""Pixels of a picture. A device takes three milliseconds a step whatever the size, to start its kernels, no more steps
+a second for several trainings than for one, and some seconds in each process that starts it (docs/device.md). Where
+pictures have fewer pixels than the first, or the second for each core of the machine, its cores are faster together."""
 
 
 @dataclass
@@ -130,13 +128,9 @@ def device_here() -> str:
 
 
 def device_for(pixels: float) -> str:
-    """Where pictures of so many pixels are trained or drawn fastest: "cuda" or "cpu".
-
-    A task that has a single core is taken for one of many at once. Raises InputError as `device_here`.
-    """
+    """Where pictures of so many pixels are trained or drawn fastest: "cuda" or "cpu". Raises as `device_here`."""
     here = device_here()
-    small = max(SMALL, SMALL_PER_CORE * cores()) if cores() > 1 else SMALL_PER_CORE * usable_cores()
-    return "cpu" if pixels < small else here
+    return "cpu" if pixels < max(SMALL, SMALL_PER_CORE * usable_cores()) else here
 
 
 def backend_identity() -> dict[str, str]:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from ray_cast_ball import ball_points, ball_view
 
-from ss_flow.running import Surroundings, running
 from ss_flow.tasks.gaussians import rasterize, torch_render, trainer
 from ss_flow.tasks.gaussians.backends import NativeBackend
 from ss_flow.tasks.gaussians.render import render
@@ -19,6 +18,7 @@ from ss_flow.tasks.gaussians.views import TrainView
 def test_small_views_are_trained_on_the_cpu_and_large_ones_on_the_device(monkeypatch):
     asked = []
     monkeypatch.setattr(rasterize, "device_here", lambda: "cuda")
+    monkeypatch.setattr(rasterize, "usable_cores", lambda: 2)
     monkeypatch.setattr(trainer, "backend_for", lambda device, threads: asked.append(device) or NativeBackend(threads))
     for side in (199, 200):
         view = ball_view(0.0)
@@ -27,25 +27,16 @@ def test_small_views_are_trained_on_the_cpu_and_large_ones_on_the_device(monkeyp
         large = TrainView(
             camera, np.zeros((side, side, 3), np.float32), ~blank, blank, np.zeros(blank.shape, np.float32)
         )
-        with running(Surroundings(cores=2)):
-            train(ball_points(), [large], params=TrainParams(iterations=1), extent=1.6, seed=1)
+        train(ball_points(), [large], params=TrainParams(iterations=1), extent=1.6, seed=1)
     assert asked == ["cpu", "cuda"]
 
 
-@pytest.mark.parametrize(
-    ("machine", "own", "small"),
-    [
-        (2, 2, 40_000), (16, 3, 40_000), (4, 4, 52_000), (16, 16, 208_000),
-        (1, 1, 13_000), (4, 1, 52_000), (16, 1, 208_000),
-    ],
-)  # fmt: skip
-def test_the_more_cores_or_trainings_at_once_the_larger_are_those_for_the_cpu(monkeypatch, machine, own, small):
+@pytest.mark.parametrize(("cores", "small"), [(1, 40_000), (3, 40_000), (4, 52_000), (16, 208_000)])
+def test_the_more_cores_the_larger_are_the_pictures_for_them(monkeypatch, cores, small):
     monkeypatch.setattr(rasterize, "device_here", lambda: "cuda")
-    monkeypatch.setattr(rasterize, "usable_cores", lambda: machine)
-
-    with running(Surroundings(cores=own)):
-        assert rasterize.device_for(small - 1) == "cpu"
-        assert rasterize.device_for(small) == "cuda"
+    monkeypatch.setattr(rasterize, "usable_cores", lambda: cores)
+    assert rasterize.device_for(small - 1) == "cpu"
+    assert rasterize.device_for(small) == "cuda"
 
 
 def test_small_pictures_are_drawn_on_the_cpu_and_large_ones_on_the_device(monkeypatch):
