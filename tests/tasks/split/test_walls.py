@@ -104,6 +104,12 @@ def test_a_piece_of_either_of_two_walls_that_are_one_label_is_one():
     ) == [2, 3]
 
 
+def test_what_may_be_of_two_walls_is_of_the_larger():
+    other = lying(3.0, 3.0, step=STEP) + np.array([6.0, 0, 0])
+    colors = np.where((other[:, 0] < 6)[:, None], RED, GREY)
+    assert one_with_the_first((FLOOR, checkered()), (other, colors), (piece(9), GREY), stuff=(1, 2)) == [3]
+
+
 def test_pieces_of_a_piece_that_is_stuff_itself_are_the_walls():
     """A part of the floor in the shade has the colour of what is left of it, and the lit part has some shade."""
     other = lying(3.0, 3.0, step=STEP) + np.array([6.0, 0, 0])
