@@ -43,6 +43,7 @@ from ss_flow.tasks.split.reproject import ReprojectParams
 from ss_flow.tasks.split.reprompt import RepromptParams
 from ss_flow.tasks.split.segment import SegmentParams
 from ss_flow.tasks.split.segment_rgbd import SegmentRgbdParams
+from ss_flow.tasks.split.walls import WallParams
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ class SplitParams:
     """How far pieces are put together: those that more than this share of the views show as one thing are one instance.
     1 leaves every part on its own, 0.3 gives groups of things."""
     boards: BoardParams = field(default_factory=BoardParams)
+    walls: WallParams = field(default_factory=WallParams)
     reprompt: RepromptParams = field(default_factory=RepromptParams)
     reproject: ReprojectParams = field(default_factory=ReprojectParams)
 

@@ -42,6 +42,7 @@ from ss_flow.tasks.split.segment_rgbd import segment_rgbd
 from ss_flow.tasks.split.tally import tally
 from ss_flow.tasks.split.visibility import visibility
 from ss_flow.tasks.split.visible_by_color import visible_by_color
+from ss_flow.tasks.split.walls import join_walls
 
 
 @dataclass(frozen=True)
@@ -274,11 +275,14 @@ def _divided(
     segmenter: Model | None,
     params: SplitParams,
 ) -> PointLabels:
-    """The instances after what masks cannot tell: boards apart from what rises from them, then the user's corrections
-    (beyond the paper). Things come back as they are where there is neither."""
+    """The instances after what masks cannot tell: boards apart from what rises from them, the pieces of a wall as one,
+    then the user's corrections (beyond the paper). Things come back as they are where there is none of these."""
     labels = things
-    if params.boards.rises and capture.masks is None and capture.clicks is None:  # what the user showed stays
-        labels = part_boards(points, capture.cameras, labels, tree, params=params.boards)
+    if capture.masks is None and capture.clicks is None:  # what the user showed stays
+        if params.boards.rises:
+            labels = part_boards(points, capture.cameras, labels, tree, params=params.boards)
+        if params.walls.colors:
+            labels = join_walls(points, labels, tree, params=params.walls, stuff=params.hierarchy.stuff)
     if capture.corrections is not None:
         by_clicks: list[PointLabels] = []
         if segmenter is not None:

@@ -149,7 +149,8 @@ def part_masks(
 
 @task(name="split.corrected_tree")
 def corrected_tree(tree: Hierarchy, before: PointLabels, after: PointLabels) -> Hierarchy:
-    """The tree with the instances that `correct` or `part_boards` made of others, as nodes without children.
+    """The tree with the instances that `part_boards`, `join_walls` or `correct` made of others, as nodes without
+    children.
 
     before, after: the instances before and since. A new one is stuff where more than half of its points were, and part
     of the group that all it is made of were part of. Where there is no new one the tree comes back as it is.

@@ -42,7 +42,6 @@ from ss_flow.tasks.split.sheets import Sheets, find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 from ss_flow.tasks.split.supports import Supports, find_supports
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
-from ss_flow.tasks.split.tiles import with_tiles
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 Members = tuple[int, ...]
@@ -117,19 +116,15 @@ def hierarchy(
 ) -> Hierarchy:
     """The tree of what the labels make up.
 
-    visibility, tallies: one of each a view; labels: of `points`. What light alone or nothing parts is united first, and
-    tiles with their floor. Then, round by round, the sets of pieces with the highest agreement are, each piece once a
-    round, until none reaches `min_agreement`; a thing and stuff never are. The order of the views does not matter, nor
-    that of the masks.
+    visibility, tallies: one of each a view; labels: of `points`. What light alone or nothing parts is united first.
+    Then, round by round, the sets of pieces with the highest agreement are, each piece once a round, until none reaches
+    `min_agreement`; a thing and stuff never are. The order of the views does not matter, nor that of the masks.
     """
     leaves = np.unique(labels.label[labels.label > 0]).astype(np.int32)
     ends = borders(labels.label, points, TouchingParams())
     looks = Looks(points, cameras, visibility)
     surface = lit_surfaces(looks, labels.label, ends, params.shadows)
     is_stuff = find_stuff(points, cameras, replace(labels, label=surface[labels.label]), params.stuff)
-    if params.shadows.agreement:
-        names, surface = np.unique(surface[leaves]), with_tiles(points, labels.label, surface, ends, is_stuff)
-        is_stuff = is_stuff[np.isin(names, surface[leaves])]
     _, surface_of = np.unique(surface[leaves], return_inverse=True)
     is_stuff = (is_stuff | find_casts(points, labels.label, surface, ends, is_stuff))[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)

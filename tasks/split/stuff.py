@@ -62,20 +62,19 @@ def find_stuff(points: PointCloud, cameras: Cameras, labels: PointLabels, params
     stuff = np.zeros(len(names), bool)
     for row, name in enumerate(names.tolist()):
         own = thinned(points.points[rows_of[name]], _ENOUGH)
-        # What lies evenly on a plane reaches so much farther than its middle does.
-        extent = box_diagonal(own, _STRAY) / (1 - 2 * _STRAY)
+        extent = _extent(own)
         if extent < least or len(own) < _FEW:
             continue
-        thickness = params.thickness * extent
-        planes = _planes(own, thickness, params)
+        thickness, planes = params.thickness * extent, planes_of(own, params)
         in_front = [(scene - centre) @ towards(normal, centre, eye) for centre, normal in planes]
         stuff[row] = bool(planes) and all((ahead < -2 * thickness).mean() <= params.behind for ahead in in_front)
     return stuff
 
 
-def _planes(places: Float64, thickness: float, params: StuffParams) -> list[Plane]:
-    """The planes that enough of some points [N, 3] lie on: one, or else one after the other, each with as many as it
-    can of those that are left; none if there would have to be too many."""
+def planes_of(places: Float64, params: StuffParams) -> list[Plane]:
+    """The planes that enough of the points of stuff [N, 3] lie on: one, or else one after the other, each with as many
+    as it can of those that are left; none if there would have to be too many."""
+    thickness = params.thickness * _extent(places)
     one = plane_of_most(places, thickness, _ROUNDS)
     if on_plane(places, one, thickness).mean() >= params.flat:
         return [one]
@@ -85,6 +84,11 @@ def _planes(places: Float64, thickness: float, params: StuffParams) -> list[Plan
         planes.append(_largest_plane(rest, thickness))
         rest = rest[~on_plane(rest, planes[-1], thickness)]
     return planes if len(rest) <= (1 - params.flat) * len(places) else []
+
+
+def _extent(places: Float64) -> float:
+    # What lies evenly on a plane reaches so much farther than its middle does.
+    return box_diagonal(places, _STRAY) / (1 - 2 * _STRAY)
 
 
 def _largest_plane(places: Float64, thickness: float) -> Plane:
