@@ -248,6 +248,7 @@ def _frames(scene: SceneFiles, reference: Reference, params: CaptureParams) -> t
         valid=all_of(reference, scene.valid),
         lenses=scene.lenses,
         skipped=scene.skipped,
+        why_skipped=scene.why_skipped if scene.skipped else "",
         black_borders=scene.black_borders,
         params=params.ingest,
     )

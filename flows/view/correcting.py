@@ -23,7 +23,7 @@ class Correcting:
     """
 
     def __init__(self, server: viser.ViserServer, begin: Callable[[], Corrections]) -> None:
-        """begin: opens the corrections, when a point is first asked for. Raises InputError."""
+        """begin: opens the corrections, when they are first asked for. Raises InputError."""
         self._server, self._begin = server, begin
         self._corrections: Corrections | None = None
         self._marks: dict[Pick, viser.IcosphereHandle] = {}
@@ -38,6 +38,11 @@ class Correcting:
         if self._corrections is None:
             self._corrections = self._begin()
         return self._corrections
+
+    def checked(self) -> None:
+        """Open the corrections with the box, since their file may hold points. Raises InputError as these do."""
+        if self.box.value:
+            _ = self.corrections
 
     def show(self) -> None:
         """Show the points, and what they will do."""

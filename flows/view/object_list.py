@@ -41,7 +41,7 @@ class _Row:
 
 
 class ObjectList:
-    """Objects page by page, the largest first, or those first that a text means.
+    """Objects page by page, the largest first, or those first that a text means: by name, then by what they look like.
 
     Its parts are viser's: `text`, `tau`, `answer`, the buttons of the `rows` that are shown, and `turn`, those below
     them.
@@ -54,6 +54,8 @@ class ObjectList:
         self._gui, self._session, self._search, self._choose = gui, session, search, choose
         self._pictures: dict[int, str] = {}
         self._found: QueryResult | None = None
+        self._named: tuple[int, ...] = ()
+        """Objects that are meant by their name."""
         self._page = 0
         self._lock = threading.RLock()
         self.text = gui.add_text("Search", "", hint="What to look for, such as: red mug, not the lamp")
@@ -103,9 +105,9 @@ class ObjectList:
         objects, pieces = self._session.state.objects, self._session.state.pieces
         by_size = sorted(objects.entries, key=lambda i: -len(pieces[i].rows) if i in pieces else 0)
         if self._found is None:
-            return by_size + ([BACKGROUND] if BACKGROUND in pieces else [])
-        ranked = [i for i in self._found.instance_id.tolist() if i in objects.entries]
-        return ranked + [i for i in by_size if i not in ranked]
+            by_size += [BACKGROUND] if BACKGROUND in pieces else []
+        ranked = [] if self._found is None else [i for i in self._found.instance_id.tolist() if i in objects.entries]
+        return list(dict.fromkeys([*self._named, *ranked, *by_size]))
 
     def _row(self, instance: int, place: int) -> _Row:
         """The row of an object, shown at a place of the list: 0 is the first."""
@@ -142,28 +144,40 @@ class ObjectList:
             return _SELECTED
         if instance in self._session.hidden:
             return _HIDDEN
-        return _MATCHED if self._found is not None and instance in self._found.matches() else _OTHER
+        return _MATCHED if instance in self._matches() else _OTHER
+
+    def _matches(self) -> tuple[int, ...]:
+        """The objects that the text means, those that bear it as their name first."""
+        return tuple(dict.fromkeys([*self._named, *(self._found.matches() if self._found is not None else ())]))
 
     def _ask(self) -> None:
         """Search anew. Letters that came meanwhile are answered at once, by who comes last."""
         with self._lock:
             text, tau = self.text.value.strip(), float(self.tau.value)
-            self._page, self._found = 0, None
+            self._page, self._found, self._named = 0, None, ()
             answer = ""
             if text and self._search is not None and tau > 0:
                 try:
                     self._found = self._search(text, tau)
-                    matches = len(self._found.matches())
-                    answer = f"{matches} match" if self._found.accepted else "Nothing in the scene matches."
+                    self._named = self._called(text, whole=True)
+                    matches = len(self._matches())
+                    answer = f"{matches} match" if matches else "Nothing in the scene matches."
                     answer = "\n\n".join(filter(None, [answer, words_left_out(self._found)]))
                 except InputError as error:
-                    answer = str(error)
+                    self._named = self._called(text, whole=False)
+                    answer = f"{len(self._named)} by name" if self._named else str(error)
             self.answer.content = answer
             self.show()
 
+    def _called(self, text: str, *, whole: bool) -> tuple[int, ...]:
+        """The objects whose name is a text, or has it in it; upper and lower case are one."""
+        objects, asked = self._session.state.objects, text.casefold()
+        called = {i: objects.name(i).casefold() for i in objects.entries}
+        return tuple(i for i, name in called.items() if (name == asked if whole else asked in name))
+
     def _turned(self, event: Any) -> None:
         if event.target.value == "Select matches":
-            self._choose(tuple(self._found.matches()) if self._found is not None else ())
+            self._choose(self._matches())
             return
         self._page = max(0, self._page + (1 if event.target.value == "Next" else -1))
         self.show()

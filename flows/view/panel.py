@@ -77,9 +77,9 @@ class Panel:
         self._build_actions(gui)
         self.correcting: Correcting | None = None
         if corrections is not None:
-            self.correcting = Correcting(server, corrections)
-            self.correcting.box.on_update(lambda event: self._attempt(event.client, lambda: None))
-            self._group(gui, "Points", self._corrections_actions(self.correcting))
+            self.correcting = correcting = Correcting(server, corrections)
+            correcting.box.on_update(lambda event: self._attempt(event.client, correcting.checked))
+            self._group(gui, "Points", self._corrections_actions(correcting))
         self._colors = gui.add_dropdown("Colours", ("photos", "objects"))
         self._colors.on_update(lambda event: self._attempt(event.client, lambda: None))
         server.scene.on_click()(lambda event: self._clicked(event, more=False))

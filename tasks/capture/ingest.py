@@ -46,6 +46,7 @@ def frames(
     valid: tuple[FileRef | None, ...] = (),
     lenses: tuple[Lens, ...] | None = None,
     skipped: tuple[str, ...] = (),
+    why_skipped: str = "",
     black_borders: bool = False,
     params: IngestParams = IngestParams(),
 ) -> tuple[Frame, ...]:
@@ -55,11 +56,11 @@ def frames(
     if they refer to the turned one, which their size tells, or else their principal point. Pixels that the lens does
     not reach after undistortion become invalid, as do those that an alpha channel does not show. Warns of photos of 16
     bits that are nearly black.
-    skipped: views of the capture that are not among these, of which the run is to warn. black_borders: whether borders
-    of the photos that are black become invalid, too.
+    skipped: views of the capture that are not among these, of which the run is to warn, and why_skipped, as of
+    `SceneFiles`. black_borders: whether borders of the photos that are black become invalid, too.
     Raises InputError when a photo is damaged, or its size or that of its valid mask is not the stated one.
     """
-    warn_of_skipped(skipped, "without a readable photo, a pose or a depth map")
+    warn_of_skipped(skipped, why_skipped)
     result = []
     sizes: dict[Lens, tuple[int, int, str]] = {}
     dim: list[str] = []

@@ -96,6 +96,7 @@ def open_colmap(root: Path) -> SceneFiles:
         poses=tuple(v.pose for v in views),
         sparse=sparse,
         skipped=tuple(called[p] for p in unregistered),
+        why_skipped="which the model did not register",
         all_names=tuple(dict.fromkeys(called[p] for p in everything)),
     )
 

@@ -76,6 +76,7 @@ def open_nerfstudio(path: Path) -> SceneFiles:
         poses=poses,
         metric=bool(with_depth),
         skipped=tuple(called[p] for p in missing),
+        why_skipped="whose photo is not there",
         all_names=tuple(called[photo or place_of(root, frame["file_path"])] for frame, photo in places),
     )
 

@@ -47,6 +47,7 @@ def open_photos(path: Path) -> SceneFiles | None:
         names=tuple(p.stem for p in photos),
         photos=tuple(photos),
         skipped=tuple(file.name for file in unread),
+        why_skipped="whose format is not read",
         all_names=tuple(called[file] for file in listed if file in called),
     )
 

@@ -68,6 +68,7 @@ def open_scannet(root: Path) -> SceneFiles:
         poses=None if unposed else tuple(poses),
         metric=True,
         skipped=tuple(skipped),
+        why_skipped="without a pose",
         all_names=tuple(stem for stem, _ in photos),
     )
 

@@ -51,6 +51,7 @@ def open_tum(root: Path) -> SceneFiles:
         poses=None if unposed else tuple(_pose(t, root / "groundtruth.txt", photo) for photo, t, _ in kept if t),
         metric=True,
         skipped=tuple(skipped),
+        why_skipped="without a pose or a depth map of the same time",
         all_names=tuple(Path(words[0]).stem for _, words in photos),
     )
 

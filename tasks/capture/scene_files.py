@@ -114,6 +114,8 @@ class SceneFiles:
     """Whether 0 in them means "not annotated"; otherwise it is background."""
     skipped: tuple[str, ...] = ()
     """Views of the capture that are left out, for lack of a photo that can be read, a pose or a depth map."""
+    why_skipped: str = "without a photo, a pose or a depth map"
+    """The same of this layout, in words that follow "are left out, "."""
     remarks: tuple[str, ...] = ()
     """What is to be said of other files that a run does not read."""
     all_names: tuple[str, ...] = ()

@@ -44,9 +44,13 @@ _FAINT = 0.05
 """Share of a pixel below which it does not show what has left."""
 _LENDERS = 2000
 """At least so many points of a plane, and less than twice as many, lend filled places their colours."""
+_LIES = 0.2
+"""Share of an instance's points near the place that lie in a plane at least, or it only touches this."""
 _AT_ONCE = 1000
 """Places whose colours are found together."""
 _OPACITY = 0.95
+_SOLID = 0.1
+"""Opacity below which a Gaussian is faint, and lends no ids."""
 
 
 @task(name="edit.fill", resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=backend_identity)
@@ -65,9 +69,11 @@ def fill(
     followed to the first plane behind them. It counts where it meets the plane inside the convex hull of its points, so
     that nothing is continued beyond what was seen; further than 1.5 spacings from any of them; where nothing that is
     still there hides it; and where no view looked through it, by its depth map or, where this knows nothing, by what
-    the scene showed. One such place in each cube of the points' spacing becomes a Gaussian, with the mean colour of the
-    plane's points, each weighed by the inverse cube of its distance (Shepard 1968), and the ids of the nearest Gaussian
-    of all that stayed. What was filled before stays, and no place within a spacing of it is filled a second time.
+    the scene showed. One such place in each cube of the points' spacing becomes a Gaussian. The plane's points,
+    but for those of what only touches the plane, weigh by the inverse cube of their distance (Shepard 1968). The place
+    is of the instance with the most weight; its colour is their mean, each weighed once more by the share of its
+    instance, so that carpet beside boards stays a carpet's, and yet no border is seen inside. What was filled before
+    stays, and no place within a spacing of it is filled a second time.
 
     after: without what only came to light (`clear`), as that would hide the surfaces behind.
     gone: labels of the dense points that are no longer there, those of the instances among them.
@@ -81,22 +87,24 @@ def fill(
     arounds = [_around(remains, box) for box in _places_left(before, instances, _TOUCHING * spacing)]
     near = points.points[np.concatenate(arounds)].astype(np.float64)
     thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))
-    planes = [plane for around in arounds for plane in flat_surfaces(points, around, thickness)]
+    found = [(plane, around) for around in arounds for plane in flat_surfaces(points, around, thickness)]
+    planes = [plane for plane, _ in found]
     places, plane_of = _behind(views, planes, spacing, thickness)
-    solid = ~_seen_through(places, before, instances, measured, thickness)
-    places, plane_of = places[solid], plane_of[solid]
+    hidden = ~_seen_through(places, before, instances, measured, thickness)
+    places, plane_of = places[hidden], plane_of[hidden]
     chosen = _one_a_cube(places, spacing)
     chosen = chosen[~_within(places[chosen], after.means[after.filled > 0], spacing)]
     places, plane_of = places[chosen], plane_of[chosen]
     if not len(places):
         return after
-    colors = np.zeros((len(places), 3), np.uint8)
-    for number in np.unique(plane_of).tolist():
-        of_plane = plane_of == number
-        colors[of_plane] = _colors(places[of_plane], points, planes[number].rows)
-    filling = _flat(places, colors, plane_of, planes, spacing)
     # What has moved, or come instead, may lie nearer to the floor that it left than the rest of the floor does.
-    return concatenate([after, _with_ids_of(select(after, stays(after, before, instances)), filling)])
+    solid = select(after, stays(after, before, instances) & (after.opacities >= _SOLID))
+    fillings = [
+        _continued(places[plane_of == number], plane, points, _lying(plane.rows, around, measured.labels.label), solid)
+        for number, (plane, around) in enumerate(found)
+        if (plane_of == number).any()
+    ]
+    return concatenate([after, *fillings])
 
 
 def _places_left(before: EditedScene, instances: tuple[int, ...], reach: float) -> list[Float64]:
@@ -205,36 +213,53 @@ def _one_a_cube(places: Float64, side: float) -> Int32:
     return np.sort(first).astype(np.int32)
 
 
-def _colors(places: Float64, points: PointCloud, rows: Int32) -> UInt8:
-    """Smooth over the whole place, and at its border nearly those of the surface beside it."""
+def _lying(rows: Int32, around: Int32, labels: Int32) -> Int32:
+    """The rows of a plane's points whose instances lie in it, all of them where none does: what stands on a floor or
+    leans at a wall has some points in its plane, too, but most of them elsewhere."""
+    in_plane, near = (np.bincount(labels[some], minlength=int(labels[around].max()) + 1) for some in (rows, around))
+    lie: Int32 = rows[(in_plane >= _LIES * near)[labels[rows]]]
+    return lie if len(lie) else rows
+
+
+def _continued(
+    places: Float64, plane: FlatSurface, points: PointCloud, lenders: Int32, solid: EditedScene
+) -> EditedScene:
+    """Gaussians at places [M, 3] of a plane, of the instance that has most weight there, and in its colours.
+
+    lenders: rows of the points that these come from. solid: what stayed and is not faint; each lender is of the
+    instance and the part of what is nearest to it there. (What is nearest to a place may be what lay on the thing that
+    has left: it hangs above the floor now.)
+    """
+    from scipy.spatial import cKDTree
     from scipy.spatial.distance import cdist
 
-    lenders = rows[:: max(1, len(rows) // _LENDERS)]
+    lenders = lenders[:: max(1, len(lenders) // _LENDERS)]
+    lent, colors_lent = points.points[lenders], points.colors[lenders]
+    ids = parts = np.zeros(len(lenders), np.int32)
+    if len(solid):
+        near = cKDTree(solid.means).query(lent, workers=1)[1]
+        ids, parts = solid.instance_id[near], solid.part_id[near]
+    known, which = np.unique(ids, return_inverse=True)
+    votes = np.eye(len(known))[which]
     colors = np.zeros((len(places), 3))
+    heaviest = np.zeros(len(places), np.int32)
     for first in range(0, len(places), _AT_ONCE):
-        near = (cdist(places[first : first + _AT_ONCE], points.points[lenders]) + points.spacing) ** -3
-        colors[first : first + _AT_ONCE] = near @ points.colors[lenders] / near.sum(axis=1, keepdims=True)
-    return np.rint(colors).astype(np.uint8)
+        some = slice(first, first + _AT_ONCE)
+        weights = (cdist(places[some], lent) + points.spacing) ** -3
+        shares = weights @ votes
+        heaviest[some] = np.where(which == shares.argmax(axis=1)[:, None], weights, 0).argmax(axis=1)
+        weights *= shares[:, which]
+        colors[some] = weights @ colors_lent / weights.sum(axis=1, keepdims=True)
+    flat = _flat(places, np.rint(colors).astype(np.uint8), plane, points.spacing)
+    return replace(flat, instance_id=ids[heaviest], part_id=parts[heaviest])
 
 
-def _flat(places: Float64, colors: UInt8, plane_of: Int32, planes: list[FlatSurface], spacing: float) -> EditedScene:
-    """Gaussians that lie in their planes: a spacing wide (one standard deviation), a fifth of it thick."""
+def _flat(places: Float64, colors: UInt8, plane: FlatSurface, spacing: float) -> EditedScene:
+    """Gaussians that lie in a plane: a spacing wide (one standard deviation), a fifth of it thick."""
     from scipy.spatial.transform import Rotation
 
     made = initialise(places.astype(np.float32), colors, 0, 0.0, opacity=_OPACITY)
-    turns = [np.stack([*plane.axes, np.cross(*plane.axes)], axis=1) for plane in planes]
-    quaternions = np.array([Rotation.from_matrix(turn).as_quat(scalar_first=True) for turn in turns], np.float32)
+    turn = Rotation.from_matrix(np.stack([*plane.axes, np.cross(*plane.axes)], axis=1)).as_quat(scalar_first=True)
     widths = np.log(spacing * np.array([1, 1, 0.2]))
-    log_scales = np.tile(widths.astype(np.float32), (len(places), 1))
-    return edited(replace(made, quaternions=quaternions[plane_of], log_scales=log_scales), filled=1)
-
-
-def _with_ids_of(scene: EditedScene, filling: EditedScene) -> EditedScene:
-    """The filling with the ids of the scene's nearest Gaussian that is not faint; of the background without any."""
-    from scipy.spatial import cKDTree
-
-    solid = select(scene, scene.opacities >= 0.1)
-    if not len(solid):
-        return filling
-    _, near = cKDTree(solid.means).query(filling.means, workers=1)
-    return replace(filling, instance_id=solid.instance_id[near], part_id=solid.part_id[near])
+    quaternions, log_scales = (np.tile(row.astype(np.float32), (len(places), 1)) for row in (turn, widths))
+    return edited(replace(made, quaternions=quaternions, log_scales=log_scales), filled=1)

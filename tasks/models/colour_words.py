@@ -21,7 +21,7 @@ TERMS = ("black", "white", "red", "green", "yellow", "blue", "brown", "purple", 
 _SHADES = {
     "black": ("000000", "141414", "1c1c22", "303034", "404044"),
     "white": ("ffffff", "f4f4f4", "faf6ee", "d8d8d6", "bebebc"),
-    "red": ("ff0000", "c81e1e", "a01218", "7d0a10", "dc143c", "e0453c"),
+    "red": ("ff0000", "c81e1e", "a01218", "7d0a10", "4b0a12", "dc143c", "e0453c"),
     "green": ("00ff00", "1e9632", "0a5a1e", "78c850", "3a6e3a", "556b2f", "98dc96", "20a080", "14503c", "008080"),
     "yellow": ("ffff00", "f0d21e", "ffe678", "c8b414", "fffaa0", "a8942a", "86741c", "60541a"),
     "blue": ("0000ff", "1e50c8", "50a0dc", "00bedc", "a0c8f0", "4682b4", "28466e", "0a1446", "008ca0", "5a7890"),

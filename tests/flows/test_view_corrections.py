@@ -129,6 +129,17 @@ def test_a_joined_pair_is_parted_and_a_broken_thing_joined_and_only_what_depends
     assert not gone_on.unsaved and gone_on.told() == [] and gone_on.thing == 4
 
 
+def test_points_that_a_file_holds_show_as_soon_as_the_box_is_checked(faulty, viewer, tmp_path):
+    panel = viewer.panel
+    first = Corrections(faulty.finished(), tmp_path / "out.hints.json")
+    first.pick(TABLE, np.array(first._cloud.points[first._seen & (first._instance.label == TABLE)][0], float))
+    first.save()
+    panel.correcting.box.value = True
+    assert "1 point; now on thing 2" in panel.correcting._told.content and len(panel.correcting._marks) == 1
+    panel.correcting.box.value = False
+    assert not panel.correcting._marks
+
+
 def test_points_are_undone_and_things_named_by_what_they_lie_on(faulty, tmp_path):
     run = faulty.finished()
     corrections = Corrections(run, tmp_path / "h.json")

@@ -46,6 +46,25 @@ def test_what_is_typed_is_answered_as_by_the_command(viewer: Viewer, tiny) -> No
     assert "nothing follows" in objects.answer.content or "empty" in objects.answer.content
 
 
+def test_an_object_is_found_by_its_name_too(viewer: Viewer) -> None:
+    panel, objects = viewer.panel, viewer.panel.objects
+    last = _listed(objects)[-1] or _listed(objects)[-2]
+    panel.session.do({"op": "relabel", "instance": last, "name": "Tool box"})
+    panel.refresh()
+    objects.text.value = "tool"  # no colour word
+    assert _listed(objects)[0] == last and objects.answer.content == "1 by name"
+    objects.turn.value = "Select matches"
+    assert panel.session.selected == (last,)
+    objects.text.value = "toolbag"
+    assert "names no colour" in objects.answer.content and _listed(objects)[0] != last
+    objects.text.value = "red"
+    ranked = _listed(objects)
+    panel.session.do({"op": "relabel", "instance": ranked[-1], "name": "Red"})
+    objects.text.value = "red "
+    objects.text.value = "red"
+    assert _listed(objects) == [ranked[-1], *ranked[:-1]]
+
+
 @pytest.mark.parametrize("hidden", [False, True])
 def test_what_cannot_be_copied_is_said_to_be_so(viewer: Viewer, hidden: bool) -> None:
     panel = viewer.panel

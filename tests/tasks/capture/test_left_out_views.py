@@ -33,6 +33,8 @@ def test_photos_that_a_colmap_model_lacks_or_that_are_not_read_are_skipped(tmp_p
     loose = made.photos(tmp_path / "loose")
     (next(loose.rglob("2.*")).parent / "IMG_3.DNG").write_bytes(b"")
     assert open_scene(loose).skipped == ("IMG_3.DNG",)
+    whys = [open_scene(place).why_skipped for place in (tmp_path / "colmap", loose)]
+    assert whys == ["which the model did not register", "whose format is not read"]
 
 
 def test_every_second_view_keeps_everything_aligned(tmp_path):
@@ -98,8 +100,14 @@ def test_frames_of_a_transforms_json_whose_photo_is_missing_are_left_out_with_a_
     scene = open_scene(tmp_path)
     assert scene.skipped == ("10",) and scene.names == tuple(name for name in whole.names if name != "10")
     files = tuple(FileRef(photo, "") for photo in scene.photos)
-    with pytest.warns(UserWarning, match="1 view is left out, without a readable photo, a pose or a depth map: 10."):
-        ingest.frames(names=scene.names, photos=files, lenses=scene.lenses, skipped=scene.skipped)
+    with pytest.warns(UserWarning, match="1 view is left out, whose photo is not there: 10."):
+        ingest.frames(
+            names=scene.names,
+            photos=files,
+            lenses=scene.lenses,
+            skipped=scene.skipped,
+            why_skipped=scene.why_skipped,
+        )
 
 
 def test_photos_that_a_colmap_model_did_not_register_are_skipped_by_name(tmp_path):

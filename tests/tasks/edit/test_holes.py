@@ -162,6 +162,46 @@ def test_of_things_far_apart_each_is_filled_with_the_surface_that_it_stood_on(mo
         assert under.sum() > 0.5 * (high[0] - low[0]) * (high[1] - low[1]) / SPACING**2
 
 
+def test_the_floor_under_a_thing_is_not_what_lies_on_that_thing_and_stays(monkeypatch):
+    table, on_the_table = [[-0.9, -0.7, 0.0], [-0.1, 0.1, 0.12]], [[-0.7, -0.5, 0.12], [-0.3, -0.1, 0.5]]
+    monkeypatch.setattr(box_scene, "BOXES", np.array([table, on_the_table]))
+    measured, scene = box_scene.measured(SPACING)
+    after = fill(scene, operations.remove(scene, instances=(1,)), measured, instances=(1,), gone=(1,))
+    new = after.filled > 0
+    under = ((after.means[:, :2] > [-0.7, -0.5]) & (after.means[:, :2] < [-0.3, -0.1])).all(axis=1)
+    assert (new & under).sum() > 0.3 * 0.4 * 0.4 / SPACING**2 and (after.instance_id[new] == 0).all()
+
+
+def test_a_hole_in_a_carpet_beside_boards_is_filled_with_carpet(seen):
+    measured, scene = seen
+    carpet, boards, border = np.uint8([40, 80, 180]), np.uint8([220, 150, 60]), box_scene.BOXES[BOX - 1, 0, 0] - 0.1
+    on_boards = (measured.labels.label == 0) & (measured.points.points[:, 0] < border)
+    two = replace(
+        measured,
+        points=replace(measured.points, colors=np.where(on_boards[:, None], boards, carpet)),
+        labels=replace(measured.labels, label=np.where(on_boards, 7, measured.labels.label).astype(np.int32)),
+    )
+    ids = np.where((scene.instance_id == 0) & (scene.means[:, 0] < border), 7, scene.instance_id)
+    now = replace(scene, instance_id=ids.astype(np.int32))
+    after = fill(now, operations.remove(now, instances=(BOX,)), two, instances=(BOX,), gone=(BOX,))
+    new = after.filled > 0
+    off = 255 * (0.5 + 0.28209479 * after.sh[new, 0]) - carpet
+    mixed = off @ (boards - carpet.astype(float)) / np.sum((boards - carpet.astype(float)) ** 2)
+    assert (after.instance_id[new] == 0).mean() > 0.98 and np.median(mixed) < 0.05
+
+
+def test_what_stands_on_a_floor_lends_no_colour_to_it(seen, removed):
+    measured, scene = seen
+    standing = np.isin(measured.labels.label, (1, 3))
+    red = replace(measured.points, colors=np.where(standing[:, None], np.uint8([255, 0, 0]), measured.points.colors))
+    plain, beside_red = (
+        fill(scene, removed, replace(measured, points=points), instances=(BOX,), gone=(BOX,))
+        for points in (measured.points, red)
+    )
+    assert len(plain.sh) == len(beside_red.sh) > len(removed.sh)
+    assert np.array_equal(plain.sh[plain.filled > 0], beside_red.sh[plain.filled > 0])
+
+
 def test_where_nothing_is_left_nothing_is_filled(seen):
     measured, scene = seen
     nothing = operations.remove(scene, instances=(0, 1, 2, 3))
