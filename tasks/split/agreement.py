@@ -71,12 +71,12 @@ def _content(tally: Tally) -> tuple[object, ...]:
 
 
 def agreement_of(
-    views: Sequence[View], member: Float32, *, doubt: float, prior: float, prior_agreement: float
+    views: Sequence[View], member: Float32, *, doubt: float, silent: float, prior: float, prior_agreement: float
 ) -> Float64:
     """[S] share of the views that show each set of pieces as one, of those that see at least two of them: the mean of
     the share's posterior, as a beta distribution with the prior.
 
-    member: [S, G] 1 for the pieces of each set, else 0. doubt, prior, prior_agreement: as in `HierarchyParams`.
+    member: [S, G] 1 for the pieces of each set, else 0. doubt, silent, prior, prior_agreement: as in `HierarchyParams`.
     """
     agreed, asked = np.zeros(len(member)), np.zeros(len(member))
     for view in views:
@@ -84,12 +84,16 @@ def agreement_of(
         total, largest = seen.sum(axis=1), seen.max(axis=1)
         weight = np.minimum((1 - largest / np.maximum(total, 1)) / _BALANCED, 1)
         rows = np.flatnonzero((total > 0) & (weight > 0))
+        if not rows.size:
+            continue
+        size, inside = view.held.sum(axis=1), member[rows] @ view.held.T
+        speaks = ((inside >= 0.5 * size) & (member[rows] @ view.shows.T > 0)).any(axis=1)
+        weight[rows] *= np.where(speaks, 1, silent)
         asked[rows] += weight[rows]
-        if not rows.size or not len(view.held):
+        if not len(view.held):
             continue
         total, largest, seen = total[rows, None], largest[rows, None], seen[rows]
-        inside = member[rows] @ view.held.T
-        iou = inside / np.maximum(view.held.sum(axis=1) + total - inside, 1)
+        iou = inside / np.maximum(size + total - inside, 1)
         rest = (inside - view.held[:, seen.argmax(axis=1)].T) / (total - largest)
         surest_piece = np.where(seen > 0, view.own, 0).max(axis=1)
         less_sure = (surest_piece[:, None] - view.quality) / max(doubt, 1e-9)

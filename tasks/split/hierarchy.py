@@ -65,6 +65,9 @@ class HierarchyParams:
     doubt: Fraction = 0.2
     """By how much the segmenter may be surer of a piece than of the whole (predicted IoU times stability) before the
     whole no longer counts; from nothing to this, it counts less and less."""
+    silent: Fraction = 0.3
+    """How much a view counts that says nothing of the pieces: none of its masks lies mostly on them and holds half of
+    one. Small things have none from afar, neither as one nor in pieces. 1 = as much as one that shows them apart."""
     prior: NonNegative = 1.0
     """So many views more are taken to have been asked about each union, so that one view alone does not decide."""
     prior_agreement: Fraction = 0.2
@@ -229,7 +232,12 @@ class _Pieces:
             member[row, list(members)] = 1
         params = self.params
         agreement = agreement_of(
-            self.counted, member, doubt=params.doubt, prior=params.prior, prior_agreement=params.prior_agreement
+            self.counted,
+            member,
+            doubt=params.doubt,
+            silent=params.silent,
+            prior=params.prior,
+            prior_agreement=params.prior_agreement,
         )
         agreement += (1 - agreement) * params.alone * self.contact.alone(member, self.stuff)
         agreement = np.minimum(agreement * (1 + params.contact * (2 * self.contact.own(member) - 1)), 1)

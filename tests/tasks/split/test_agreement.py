@@ -13,9 +13,9 @@ def view(*masks: tuple[tuple[int, int, int], float], seen: tuple[int, int, int] 
     return View(np.array(seen, np.float32), held, np.array([quality for _, quality in masks]))
 
 
-def agreement(*views: View) -> float:
+def agreement(*views: View, silent: float = 0.3) -> float:
     pair = np.array([[1, 1, 0]], np.float32)
-    return float(agreement_of(views, pair, doubt=0.2, prior=0.0, prior_agreement=0.0)[0])
+    return float(agreement_of(views, pair, doubt=0.2, silent=silent, prior=0.0, prior_agreement=0.0)[0])
 
 
 @pytest.mark.parametrize(("beside", "expected"), [(30, 0.25), (40, 1.0)])
@@ -35,6 +35,27 @@ def test_a_view_that_sees_little_of_a_piece_counts_little(points, weight):
 def test_a_mask_shows_two_pieces_the_better_the_more_it_holds_of_the_smaller(held, expected):
     # 60 of 100 points are three quarters of the way from 30 to 70; the IoU of 160 / 200 is enough, that of 0.7 is not.
     assert agreement(view(((100, held, 0), 0.9))) == pytest.approx(expected)
+
+
+SILENT = {
+    "no mask": (),
+    "a mask of all things": (((100, 100, 201), 0.9),),
+    "a mask of less than half of each": (((49, 49, 0), 0.9),),
+    "a mask of something else": (((0, 0, 100), 0.9),),
+}
+SPEAKS = {
+    "a piece's own": (((100, 0, 0), 0.9),),
+    "half of a piece": (((0, 50, 0), 0.9),),
+    "one and as much beside it": (((100, 0, 100), 0.9),),
+}
+
+
+@pytest.mark.parametrize("masks", [*SILENT.values(), *SPEAKS.values()], ids=[*SILENT, *SPEAKS])
+def test_a_view_without_a_mask_that_lies_on_the_pieces_says_little_against_them(masks):
+    shows, weight = view(((100, 100, 0), 0.9)), 0.3 if masks in SILENT.values() else 1.0
+    assert agreement(shows, view(*masks)) == pytest.approx(1 / (1 + weight))
+    assert agreement(shows, view(*masks), silent=1.0) == pytest.approx(1 / 2)
+    assert agreement(view(*masks)) == 0  # that none says anything makes nothing one
 
 
 def tally(label: list[int], seen: list[int], held: list[list[int]], quality: list[float]) -> Tally:
