@@ -1,4 +1,4 @@
-"""Which instance a click meets: that of the Gaussian which weighs most in the clicked pixel."""
+"""Which instance a click meets: the one that weighs most in the clicked pixel."""
 
 from __future__ import annotations
 
@@ -30,21 +30,24 @@ class Picker:
         self._sigma = np.exp(self._scene.log_scales.max(axis=1)) if self._scene is not None else np.zeros(0)
 
     def met(self, pixel: Camera) -> tuple[int, Float64] | None:
-        """The instance of the Gaussian with the largest weight in a picture's pixel, and the place [3] on the ray,
-        world, that is as deep as the middle of this Gaussian; None where nothing is.
+        """The instance with the largest weight in a picture's pixel, and the place [3] on the ray, world, that is as
+        deep as the middle of its Gaussian with the largest; None where nothing is.
 
         pixel: the picture's camera, cropped to the one pixel: what is drawn in it does not depend on the others.
         """
         if self._scene is None:
             return None
         near = select(self._scene, self._rows_near(pixel))
-        row = int(render(near, pixel).top_contributor[0, 0])
-        if row < 0:
+        ids = np.unique(near.instance_id)
+        drawn = render(near, pixel, label_ids=ids.tolist())
+        if not drawn.max_contribution.any():
             return None
+        instance = int(ids[drawn.label_masks[:, 0, 0].argmax()])
+        row = int(np.where(near.instance_id == instance, drawn.max_contribution, -1).argmax())
         turn = pixel.world_to_camera[:3, :3]
         depth = turn[2] @ near.means[row] + pixel.world_to_camera[2, 3]
         ray = np.array([(0.5 - pixel.cx) / pixel.fx, (0.5 - pixel.cy) / pixel.fy, 1.0])
-        return int(near.instance_id[row]), pixel.center + depth * (ray @ turn)
+        return instance, pixel.center + depth * (ray @ turn)
 
     def _rows_near(self, pixel: Camera) -> NDArray[np.intp]:
         """The rows that may reach the pixel: all others are spared the rendering.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.running import progress
@@ -16,7 +17,7 @@ from ss_flow.tasks.artifacts import Float32, Gaussians, UInt8
 from ss_flow.tasks.deliver.export.content import FileContent
 from ss_flow.tasks.deliver.palette import paint_ids, turbo
 from ss_flow.tasks.gaussians.rasterize import backend_identity
-from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.render import render, weights_by_instance
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import encode_png
 
@@ -32,24 +33,34 @@ _FARTHEST = np.iinfo(np.uint16).max
 def picture(gaussians: Gaussians, camera: Camera, *, what: What, width: int, depth_unit: float) -> FileContent:
     """A rendering as a PNG file.
 
-    "colour": RGB over white. "labels": uint16 instance ids, that of the Gaussian that weighs most in each pixel.
+    "colour": RGB over white. "labels": uint16 instance ids, that of the instance that weighs most in each pixel.
     "depth": uint16, the expected depth in steps of `depth_unit` world units, 0 where there is none. "alpha": uint8.
     width: of the picture, pixels; 0 = the camera's own.
     """
     if width:
         camera = camera.scaled(width, max(1, round(camera.height * width / camera.width)))
-    seen = render(gaussians, camera, background=_PAPER, winners=what == "labels")
+    if what == "labels":
+        return FileContent(encode_png(_ids_shown(gaussians, camera)))
+    seen = render(gaussians, camera, background=_PAPER, winners=False)
     if what == "colour":
         pixels: np.ndarray = np.rint(255 * seen.rgb.clip(0, 1)).astype(np.uint8)
     elif what == "alpha":
         pixels = np.rint(255 * seen.alpha.clip(0, 1)).astype(np.uint8)
-    elif what == "labels":
-        ids = np.append(gaussians.instance_id, 0)[seen.top_contributor]  # -1, none there, takes the 0
-        pixels = np.where(seen.alpha > _SOLID, ids, 0).astype(np.uint16)
     else:
         depth = np.where(seen.alpha > _SOLID, seen.depth / np.maximum(seen.alpha, 1e-6), 0)
         pixels = np.rint(depth / depth_unit).clip(0, _FARTHEST).astype(np.uint16)
     return FileContent(encode_png(pixels))
+
+
+def _ids_shown(gaussians: Gaussians, camera: Camera) -> NDArray[np.uint16]:
+    """[H, W] the instance that weighs most, 0 where that is the background, or little is there."""
+    ids, heaviest = np.zeros((camera.height, camera.width), np.uint16), np.zeros((), np.float32)
+    alpha, weights = weights_by_instance(gaussians, camera)
+    for instance, weight in weights:
+        ids[weight > heaviest] = instance
+        heaviest = np.maximum(heaviest, weight)
+    ids[alpha <= _SOLID] = 0
+    return ids
 
 
 @task(name="deliver.pictures.side_by_side")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,12 +11,15 @@ import numpy as np
 
 from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
+from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.native_pass import PARAMETERS, NativePass, Settings
 from ss_flow.tasks.gaussians.rasterize import device_for
 from ss_flow.tasks.geometry.cameras import Camera
 
 OPAQUE_LOGIT = 20.0
 """Opacity 1 in float32."""
+_MASK_BYTES = 100_000_000
+"""Of the mask images that are held at once: fewer take more renderings, each of which bins all Gaussians again."""
 
 
 class Rendering(NamedTuple):
@@ -90,6 +93,28 @@ def render(
     none = np.full(done.alpha.shape, -1, np.int32), np.zeros(len(gaussians), np.float32)
     top, strongest = none if done.top is None or done.strongest is None else (done.top, done.strongest)
     return Rendering(done.rgb, done.alpha, done.depth, done.masks, top, done.radii > 0, strongest)
+
+
+def weights_by_instance(gaussians: Gaussians, camera: Camera) -> tuple[Float32, Iterator[tuple[int, Float32]]]:
+    """What shows anything in a view, [H, W] alpha; and how much of that each instance does, by its id, 0 among them,
+    ascending: [H, W], the sum of its Gaussians' weights T * alpha.
+
+    Many instances are rendered some at a time, in as little memory as that takes.
+    """
+    present = np.unique(gaussians.instance_id)
+    at_once = max(1, _MASK_BYTES // (4 * camera.width * camera.height))
+    few = len(present) <= at_once  # so that one rendering shows them all
+    whole = render(gaussians, camera, label_ids=present.tolist() if few else (), winners=False)
+
+    def weights() -> Iterator[tuple[int, Float32]]:
+        shown = gaussians if few else select(gaussians, whole.visible)
+        ids = np.unique(shown.instance_id).tolist()
+        for start in range(0, len(ids), at_once):
+            some = ids[start : start + at_once]
+            drawn = whole if few else render(shown, camera, label_ids=some, winners=False)
+            yield from zip(some, drawn.label_masks, strict=True)
+
+    return whole.alpha, weights()
 
 
 class Shares(NamedTuple):

@@ -12,16 +12,13 @@ import numpy as np
 
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import DepthMap, Frame, Gaussians, LabelMap
-from ss_flow.tasks.gaussians.initialise import select
 from ss_flow.tasks.gaussians.rasterize import backend_identity
-from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.render import weights_by_instance
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid, near_border, resampled
 from ss_flow.tasks.ranges import Fraction
 from ss_flow.tasks.splat.photo_borders import settled_by_photo
 
-_MASK_BYTES = 100_000_000
-"""Of the mask images that are held at once: fewer take more renderings, each of which bins all Gaussians again."""
 _SOLID = 0.5
 """Alpha from which a pixel shows anything."""
 _BENEFIT = 0.5
@@ -93,22 +90,14 @@ def _ids_of_view(scene: Gaussians, camera: Camera, known: np.ndarray, share: flo
     """[H, W] uint16."""
     ids = np.zeros((camera.height, camera.width), np.uint16)
     heaviest, of_known = np.zeros(ids.shape, np.float32), np.zeros(ids.shape, np.float32)
-    at_once = max(1, _MASK_BYTES // heaviest.nbytes)
-    present = np.unique(scene.instance_id)
-    few = len(present) <= at_once  # so that one rendering shows them all
-    whole = render(scene, camera, label_ids=present.tolist() if few else (), winners=False)
-    shown = scene if few else select(scene, whole.visible)
-    present = np.unique(shown.instance_id)
-    for start in range(0, len(present), at_once):
-        labels = present[start : start + at_once]
-        drawn = whole if few else render(shown, camera, label_ids=labels.tolist(), winners=False)
-        for label, weight in zip(labels, drawn.label_masks, strict=True):
-            ids[weight > heaviest] = label
-            np.maximum(heaviest, weight, out=heaviest)
-            np.copyto(of_known, weight, where=known == label)
-    ids[whole.alpha < _SOLID] = 0
+    alpha, weights = weights_by_instance(scene, camera)
+    for label, weight in weights:
+        ids[weight > heaviest] = label
+        np.maximum(heaviest, weight, out=heaviest)
+        np.copyto(of_known, weight, where=known == label)
+    ids[alpha < _SOLID] = 0
     keeps = (of_known > 0) & (of_known >= _BENEFIT * heaviest)
-    keeps |= (ids > 0) & (heaviest < share * whole.alpha)
+    keeps |= (ids > 0) & (heaviest < share * alpha)
     return np.where(keeps, known, ids)
 
 

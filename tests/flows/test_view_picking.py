@@ -41,8 +41,10 @@ def test_a_click_meets_exactly_what_a_picture_shows_at_that_pixel(seed):
     pose, center = np.eye(4), np.array([0.1, 0.2, -0.3])
     pose[:3, :3] = Rotation.from_quat(wxyz, scalar_first=True).as_matrix().T
     pose[:3, 3] = -pose[:3, :3] @ center
-    top = render(scene, Camera(64, 48, FOCAL, FOCAL, 32, 24, pose)).top_contributor
-    picker, shown = Picker(session.visible()), np.where(top < 0, -1, scene.instance_id[top])
+    ids = np.unique(scene.instance_id)
+    drawn = render(scene, Camera(64, 48, FOCAL, FOCAL, 32, 24, pose), label_ids=ids.tolist())
+    top, together = drawn.top_contributor, ids[drawn.label_masks.argmax(axis=0)]
+    picker, shown = Picker(session.visible()), np.where(top < 0, -1, together)
     for v in range(0, 48, 3):
         for u in range(0, 64, 3):
             ray = pose[:3, :3].T @ np.array([(u + 0.5 - 32) / FOCAL, (v + 0.5 - 24) / FOCAL, 1])
@@ -51,6 +53,7 @@ def test_a_click_meets_exactly_what_a_picture_shows_at_that_pixel(seed):
             found = instance_at(picker, pixel)
             assert (-1 if found is None else found) == shown[v, u]
     assert len(np.unique(shown)) > 2
+    assert (scene.instance_id[top] != together)[top >= 0].any()  # one Gaussian alone does not tell
 
 
 def test_a_ray_that_points_away_from_the_picture_meets_no_pixel():

@@ -53,6 +53,20 @@ def test_labels_are_ids_where_the_scene_is_solid():
     assert ids.dtype == np.uint16 and ids[48, 48] == 7 and ids[0, 0] == 0
 
 
+@pytest.mark.parametrize(("front", "label"), [(0.45, 7), (0.55, 0)])
+def test_a_label_is_of_the_instance_that_weighs_most_not_of_the_heaviest_gaussian(front, label):
+    """A Gaussian of the background before two of an instance, which make up .28 and .22 of a pixel, or .23 and .18."""
+    three = select(disc(), np.zeros(3, int))
+    opacity = np.array([front, 0.5, 0.8], np.float32)
+    scene = replace(
+        three,
+        means=np.outer([0, 0.05, 0.1], CAMERA.world_to_camera[2, :3]).astype(np.float32),
+        opacity_logits=np.log(opacity / (1 - opacity)),
+        instance_id=np.array([0, 7, 7], np.int32),
+    )
+    assert pixels_of(shown(scene, "labels"))[48, 48] == label
+
+
 def test_depth_is_in_thousandths_and_zero_where_there_is_none():
     depth = pixels_of(shown(disc(), "depth"))
     assert depth.dtype == np.uint16 and abs(int(depth[48, 48]) - 3200) <= 1 and depth[0, 0] == 0
