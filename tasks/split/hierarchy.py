@@ -65,7 +65,7 @@ class HierarchyParams:
     doubt: Fraction = 0.2
     """By how much the segmenter may be surer of a piece than of the whole (predicted IoU times stability) before the
     whole no longer counts; from nothing to this, it counts less and less."""
-    silent: Fraction = 0.3
+    silent: Fraction = 0.5
     """How much a view counts that says nothing of the pieces: none of its masks lies mostly on them and holds half of
     one. Small things have none from afar, neither as one nor in pieces. 1 = as much as one that shows them apart."""
     prior: NonNegative = 1.0
