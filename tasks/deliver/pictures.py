@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.running import progress
@@ -17,7 +16,7 @@ from ss_flow.tasks.artifacts import Float32, Gaussians, UInt8
 from ss_flow.tasks.deliver.export.content import FileContent
 from ss_flow.tasks.deliver.palette import paint_ids, turbo
 from ss_flow.tasks.gaussians.rasterize import backend_identity
-from ss_flow.tasks.gaussians.render import render, weights_by_instance
+from ss_flow.tasks.gaussians.render import render, shown_instances
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import encode_png
 
@@ -40,7 +39,8 @@ def picture(gaussians: Gaussians, camera: Camera, *, what: What, width: int, dep
     if width:
         camera = camera.scaled(width, max(1, round(camera.height * width / camera.width)))
     if what == "labels":
-        return FileContent(encode_png(_ids_shown(gaussians, camera)))
+        shown = shown_instances(gaussians, camera)
+        return FileContent(encode_png(np.where(shown.alpha > _SOLID, shown.ids, np.uint16(0))))
     seen = render(gaussians, camera, background=_PAPER, winners=False)
     if what == "colour":
         pixels: np.ndarray = np.rint(255 * seen.rgb.clip(0, 1)).astype(np.uint8)
@@ -50,17 +50,6 @@ def picture(gaussians: Gaussians, camera: Camera, *, what: What, width: int, dep
         depth = np.where(seen.alpha > _SOLID, seen.depth / np.maximum(seen.alpha, 1e-6), 0)
         pixels = np.rint(depth / depth_unit).clip(0, _FARTHEST).astype(np.uint16)
     return FileContent(encode_png(pixels))
-
-
-def _ids_shown(gaussians: Gaussians, camera: Camera) -> NDArray[np.uint16]:
-    """[H, W] the instance that weighs most, 0 where that is the background, or little is there."""
-    ids, heaviest = np.zeros((camera.height, camera.width), np.uint16), np.zeros((), np.float32)
-    alpha, weights = weights_by_instance(gaussians, camera)
-    for instance, weight in weights:
-        ids[weight > heaviest] = instance
-        heaviest = np.maximum(heaviest, weight)
-    ids[alpha <= _SOLID] = 0
-    return ids
 
 
 @task(name="deliver.pictures.side_by_side")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Gaussians, Int32
@@ -95,26 +96,42 @@ def render(
     return Rendering(done.rgb, done.alpha, done.depth, done.masks, top, done.radii > 0, strongest)
 
 
-def weights_by_instance(gaussians: Gaussians, camera: Camera) -> tuple[Float32, Iterator[tuple[int, Float32]]]:
-    """What shows anything in a view, [H, W] alpha; and how much of that each instance does, by its id, 0 among them,
-    ascending: [H, W], the sum of its Gaussians' weights T * alpha.
+class ShownInstances(NamedTuple):
+    """What a view shows of the instances; an instance's weight is the sum of its Gaussians' weights T * alpha."""
 
-    Many instances are rendered some at a time, in as little memory as that takes.
+    ids: NDArray[np.uint16]
+    """[H, W] the one with the largest weight, 0 = the background, or nothing is there."""
+    weight: Float32
+    """[H, W] its weight."""
+    of_known: Float32
+    """[H, W] that of the instance which is known in each pixel; zeros where none was given."""
+    alpha: Float32
+    """[H, W] of all together."""
+
+
+def shown_instances(gaussians: Gaussians, camera: Camera, known: NDArray[np.uint16] | None = None) -> ShownInstances:
+    """The instance that weighs most in each pixel.
+
+    known: [H, W] ids that are asked about besides. Many instances are rendered some at a time, in as little memory as
+    that takes.
     """
+    ids = np.zeros((camera.height, camera.width), np.uint16)
+    heaviest, of_known = np.zeros(ids.shape, np.float32), np.zeros(ids.shape, np.float32)
+    at_once = max(1, _MASK_BYTES // heaviest.nbytes)
     present = np.unique(gaussians.instance_id)
-    at_once = max(1, _MASK_BYTES // (4 * camera.width * camera.height))
     few = len(present) <= at_once  # so that one rendering shows them all
     whole = render(gaussians, camera, label_ids=present.tolist() if few else (), winners=False)
-
-    def weights() -> Iterator[tuple[int, Float32]]:
-        shown = gaussians if few else select(gaussians, whole.visible)
-        ids = np.unique(shown.instance_id).tolist()
-        for start in range(0, len(ids), at_once):
-            some = ids[start : start + at_once]
-            drawn = whole if few else render(shown, camera, label_ids=some, winners=False)
-            yield from zip(some, drawn.label_masks, strict=True)
-
-    return whole.alpha, weights()
+    shown = gaussians if few else select(gaussians, whole.visible)
+    present = np.unique(shown.instance_id)
+    for start in range(0, len(present), at_once):
+        some = present[start : start + at_once].tolist()
+        drawn = whole if few else render(shown, camera, label_ids=some, winners=False)
+        for instance, weight in zip(some, drawn.label_masks, strict=True):
+            ids[weight > heaviest] = instance
+            np.maximum(heaviest, weight, out=heaviest)
+            if known is not None:
+                np.copyto(of_known, weight, where=known == instance)
+    return ShownInstances(ids, heaviest, of_known, whole.alpha)
 
 
 class Shares(NamedTuple):

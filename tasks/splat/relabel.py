@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ss_flow.tasks.artifacts import Gaussians, LabelMap
-from ss_flow.tasks.gaussians.render import render
+from ss_flow.tasks.gaussians.render import shown_instances
 from ss_flow.tasks.gaussians.views import SceneViews, Views
 from ss_flow.tasks.geometry.images import decode_valid, resampled, size_within
 
@@ -32,14 +32,12 @@ def shown_masks(views: Views, scene: Gaussians, masks: Sequence[LabelMap]) -> li
 
     masks: exclusive label maps of all views.
     """
-    labels = np.unique(scene.instance_id)
     found = []
     for frame, camera, known in zip(views.frames, views.cameras, masks, strict=True):
         small = camera.scaled(*size_within(MOST_PIXELS, camera.width, camera.height))
-        drawn = render(scene, small, label_ids=labels.tolist(), winners=False)
-        ids = labels[drawn.label_masks.argmax(axis=0)].astype(np.uint16)
-        sure = (drawn.alpha >= SOLID) & (drawn.label_masks.max(axis=0) >= SOLID * drawn.alpha)
-        ids, sure = (resampled(image, camera.height, camera.width) for image in (ids, sure))
+        shown = shown_instances(scene, small)
+        sure = (shown.alpha >= SOLID) & (shown.weight >= SOLID * shown.alpha)
+        ids, sure = (resampled(image, camera.height, camera.width) for image in (shown.ids, sure))
         found.append(LabelMap(known.name, np.where(sure & decode_valid(frame), ids, known.ids)))
     return found
 

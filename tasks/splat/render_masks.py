@@ -13,7 +13,7 @@ import numpy as np
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import DepthMap, Frame, Gaussians, LabelMap
 from ss_flow.tasks.gaussians.rasterize import backend_identity
-from ss_flow.tasks.gaussians.render import weights_by_instance
+from ss_flow.tasks.gaussians.render import shown_instances
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.images import at_diagonal, decode_rgb, decode_valid, near_border, resampled
 from ss_flow.tasks.ranges import Fraction
@@ -88,16 +88,10 @@ def render_masks(
 
 def _ids_of_view(scene: Gaussians, camera: Camera, known: np.ndarray, share: float) -> np.ndarray:
     """[H, W] uint16."""
-    ids = np.zeros((camera.height, camera.width), np.uint16)
-    heaviest, of_known = np.zeros(ids.shape, np.float32), np.zeros(ids.shape, np.float32)
-    alpha, weights = weights_by_instance(scene, camera)
-    for label, weight in weights:
-        ids[weight > heaviest] = label
-        np.maximum(heaviest, weight, out=heaviest)
-        np.copyto(of_known, weight, where=known == label)
-    ids[alpha < _SOLID] = 0
-    keeps = (of_known > 0) & (of_known >= _BENEFIT * heaviest)
-    keeps |= (ids > 0) & (heaviest < share * alpha)
+    shown = shown_instances(scene, camera, known)
+    ids = np.where(shown.alpha < _SOLID, np.uint16(0), shown.ids)
+    keeps = (shown.of_known > 0) & (shown.of_known >= _BENEFIT * shown.weight)
+    keeps |= (ids > 0) & (shown.weight < share * shown.alpha)
     return np.where(keeps, known, ids)
 
 

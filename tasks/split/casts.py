@@ -40,7 +40,9 @@ def find_casts(points: PointCloud, label: Int32, surface: Int32, ends: Borders, 
     of = surface[label]
     names = np.unique(of[of > 0])
     casts = np.zeros(len(names), bool)
-    own, other, point = ends.of_surfaces(label, surface, names)
+    row, touched = ends.touches
+    own, other = (np.searchsorted(names, to) for to in (of[ends.rows[row]], surface[touched]))
+    own, other, point = np.stack([own, other, row])[:, own != other]
     rows_of, brightness = rows_by_label(of), logarithms(points.colors)
     for name in np.unique(own[stuff[other] & ~stuff[own]]).tolist():
         mine = own == name

@@ -203,7 +203,7 @@ class _Pieces:
             stuff=self.stuff[[members[0] for members in groups]],
             contact=self.contact.joined(joined),
             edges=joined.T @ self.edges @ joined * ~np.eye(len(groups), dtype=bool) > 0,
-            labels=[tuple(row for piece in members for row in self.labels[piece]) for members in groups],
+            labels=[self._labels_of(members) for members in groups],
         )
 
     def best_unions(self) -> list[tuple[Members, float]]:

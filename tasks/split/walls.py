@@ -75,9 +75,9 @@ def join_walls(
             ):
                 wall_of[piece] = wall_of.get(wall, wall)
     new = np.arange(labels.num_labels + 1, dtype=np.int32)
-    joined = sorted(set(wall_of.values()))
-    for number, wall in enumerate(joined, labels.num_labels + 1):
-        new[[wall, *(piece for piece, of in wall_of.items() if of == wall)]] = number
+    number = {wall: n for n, wall in enumerate(sorted(set(wall_of.values())), labels.num_labels + 1)}
+    for piece, wall in wall_of.items():
+        new[[wall, piece]] = number[wall]
     return replace(
-        labels, label=new[labels.label], num_labels=labels.num_labels + len(joined), match_label=new[labels.match_label]
+        labels, label=new[labels.label], num_labels=labels.num_labels + len(number), match_label=new[labels.match_label]
     )

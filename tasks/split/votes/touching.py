@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, PointCloud
@@ -98,15 +97,6 @@ class Borders(NamedTuple):
     """[2, T] which of the R touches which other label."""
     smooth: Int32
     """[2, S] which does so without an edge."""
-
-    def of_surfaces(self, label: Int32, surface: Int32, names: Int32) -> NDArray[np.intp]:
-        """[3, T] which surface touches which other one, by their places among the `names`, and at which of the R.
-
-        label: [N] of the points; surface: [L + 1] of each label, 0 of 0; names: of all surfaces, ascending.
-        """
-        row, touched = self.touches
-        own, other = (np.searchsorted(names, to) for to in (surface[label[self.rows[row]]], surface[touched]))
-        return np.stack([own, other, row])[:, own != other]
 
 
 def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> Borders:
