@@ -192,7 +192,7 @@ def _placed(
         return registered(frames, cameras), cameras, sensed
     cameras = _given_cameras(scene, reference, frames)
     if params.refine_poses == "always":
-        cameras = refined_poses(frames, cameras, params)
+        cameras = refined_poses(frames, cameras, sensed, params)
     elif compares_poses(scene, params) and has_pycolmap():
         cameras = fitting_poses(frames, cameras, sensed, params)
     return frames, cameras, sensed

@@ -54,10 +54,20 @@ def poses_by_depth(
     )
 
 
-def refined_poses(frames: tuple[Frame, ...], cameras: Cameras, params: CaptureParams) -> Cameras:
-    """Add the nodes that refine the poses of the frames, which came with the capture."""
+def refined_poses(
+    frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...] | None, params: CaptureParams
+) -> Cameras:
+    """Add the nodes that refine the poses of the frames, which came with the capture; depths: what a sensor measured,
+    if one did."""
     found, _, matches = compared(frames, params.sfm, None)
-    return refined_cameras(found, cameras, matches, params=params.refine, insist=params.refine_poses == "always")
+    return refined_cameras(
+        found,
+        cameras,
+        matches,
+        gather([]) if depths is None else depths,
+        params=params.refine,
+        insist=params.refine_poses == "always",
+    )
 
 
 def fitting_poses(
@@ -88,7 +98,7 @@ def fitting_poses(
                 return look(place + 1, count)
             if not fit.distance > params.pose_fit.least_distance:
                 return cameras
-            refined = refined_poses(frames, cameras, params)
+            refined = refined_poses(frames, cameras, depths, params)
             after = pose_fit(refined, looks[place], photos, matches, known)
             return better_poses(cameras, refined, before, after, params=params.pose_fit)
 

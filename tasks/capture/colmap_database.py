@@ -26,7 +26,7 @@ def fill_database(photos: Sequence[Features], matches: Sequence[Matches], lens: 
     with pycolmap.DatabaseTransaction(database):
         for row in range(len(photos)):
             photo = photos[row]
-            kept.append(Features(photo.name, photo.width, photo.height, photo.points, photo.descriptors[:0]))
+            kept.append(photo.light())
             shared, camera = lens(photo, row)
             if shared not in cameras:
                 cameras[shared] = len(cameras) + 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,10 @@ class Features:
     """[N, 128] RootSIFT, of length 512."""
     focal: float = 0.0
     """That of the frame."""
+
+    def light(self) -> Features:
+        """Without descriptors, which take most of the memory."""
+        return replace(self, descriptors=self.descriptors[:0])
 
 
 @task(name="capture.features")

@@ -11,18 +11,22 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, Float64
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
 from ss_flow.tasks.capture.colmap import SEED, load_pycolmap
 from ss_flow.tasks.capture.colmap_database import fill_database
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.matches import Matches
+from ss_flow.tasks.capture.placing import places
 from ss_flow.tasks.geometry.cameras import centers_of
 from ss_flow.tasks.ranges import Count, Positive
+from ss_flow.tasks.words import first_of
 
 _LEAST_POINTS = 100
 """Fewer common points say nothing about the poses of a whole capture."""
 _LEAST_SCALE = 1e-6
 """Refinement starts from the given poses and hardly leaves their scale; a smaller one means that they do not differ."""
+_LEAST_MATCHES = 10
+"""So many points that the sensor measured place a photo, whose own depth has a say."""
 _LEAST_PHOTOS = 3
 """Fewer refined photos do not tell how their world lies in the given one."""
 
@@ -36,7 +40,7 @@ class RefinePosesParams:
     last_error: Positive = 3.0
     """The same in the last round."""
     min_points: Count = 30
-    """A photo that sees fewer points keeps its given pose."""
+    """A photo that sees fewer points is not adjusted by them."""
     intrinsics: bool = False
     """Whether focal lengths are refined too."""
 
@@ -46,19 +50,28 @@ def refined_cameras(
     photos: Sequence[Features],
     cameras: Cameras,
     matches: tuple[Matches, ...],
+    depths: Sequence[DepthMap] = (),
     *,
     params: RefinePosesParams = RefinePosesParams(),
     insist: bool = True,
 ) -> Cameras:
     """The cameras with poses under which the photos' common points agree best (`adjusted`).
 
-    How far the poses moved, and the median reprojection error of the same points before and after, is told as a
-    warning.
-    insist: whether it is an error when the photos have too little in common; else the given cameras are returned.
-    Raises InputError then.
+    A photo that sees too few of them would keep a pose that is as wrong as the others were. It is placed by what a
+    depth sensor measured in them, where one did (`places`), and all are adjusted once more. How far the poses moved,
+    and the median reprojection error of the same points before and after, is told as a warning.
+    depths: none, or of each photo. insist: whether it is an error when the photos have too little in common; else the
+    given cameras are returned. Raises InputError then.
     """
     try:
         found = adjusted(photos, cameras, matches, params)
+        known = {row: found.cameras.world_to_camera[row] for row in found.rows}
+        if len(depths) and len(known) < len(photos):
+            poses = places(photos, depths, cameras, matches, min_matches=_LEAST_MATCHES, known=known)
+            start = cameras.world_to_camera.copy()
+            start[list(poses)] = list(poses.values())
+            if len(poses) > len(known):
+                found = adjusted(photos, cameras, matches, params, start)
     except Unrefinable as error:
         if insist:
             raise InputError(
@@ -80,7 +93,7 @@ class Adjusted:
 
     cameras: Cameras
     rows: list[int]
-    """Those that it moved."""
+    """Those that see points enough."""
     error_before: float
     """Median distance of the points of the adjustment from where they are seen, under the cameras as they were ..."""
     error_after: float
@@ -88,17 +101,23 @@ class Adjusted:
 
 
 def adjusted(
-    photos: Sequence[Features], cameras: Cameras, matches: Sequence[Matches], params: RefinePosesParams
+    photos: Sequence[Features],
+    cameras: Cameras,
+    matches: Sequence[Matches],
+    params: RefinePosesParams,
+    start: Float64 | None = None,
 ) -> Adjusted:
     """Cameras with poses under which the common points of their photos agree best.
 
-    Points are triangulated with the given poses; then poses and points are adjusted together, in rounds that let ever
-    smaller errors count. Photos tell neither the scale nor the place of the world: the result is brought onto the given
-    cameras by the best similarity. Sparse points are those of the last round.
-    photos: of the cameras, in their order. matches: those with other photos do not count.
+    Points are triangulated with the poses to start from; then poses and points are adjusted together, in rounds that
+    let ever smaller errors count. Photos tell neither the scale nor the place of the world: the result is brought back
+    onto where it started by the best similarity. Sparse points are those of the last round.
+    photos: of the cameras, in their order. matches: those with other photos do not count. start: [K, 4, 4]
+    world-to-camera to start from, which a photo keeps that sees too few points; the cameras' own if not given.
     Raises Unrefinable when the photos have too little in common.
     """
     pycolmap = load_pycolmap()
+    start = cameras.world_to_camera if start is None else start
 
     def lens(photo: Features, row: int) -> tuple[tuple[float, ...], Any]:
         numbers = [*cameras.intrinsics[row].tolist()]
@@ -109,7 +128,7 @@ def adjusted(
     cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
     model = pycolmap.Reconstruction()
     model.load(cache)
-    for row, pose in enumerate(cameras.world_to_camera):
+    for row, pose in enumerate(start):
         if model.exists_frame(row + 1):
             model.frame(row + 1).rig_from_world = pycolmap.Rigid3d(pose[:3])
             model.register_frame(row + 1)
@@ -137,10 +156,10 @@ def adjusted(
     if len(rows) < _LEAST_PHOTOS:
         raise Unrefinable(f"fewer than {_LEAST_PHOTOS} photos see {params.min_points} points in common with others")
     poses = np.stack([np.vstack([model.image(row + 1).cam_from_world().matrix(), (0, 0, 0, 1)]) for row in rows])
-    onto_given = _similarity(poses, cameras.world_to_camera[rows])
-    if onto_given is None:
+    back = _similarity(poses, start[rows])
+    if back is None:
         raise Unrefinable("the cameras stand in one place, which tells no scale")
-    return _result(pycolmap, model, cameras, rows, onto_given)
+    return _result(pycolmap, model, cameras, rows, start, back)
 
 
 def _limits(pycolmap: Any, error: float, focal: float) -> tuple[Any, Any]:
@@ -172,10 +191,10 @@ def _adjust(pycolmap: Any, model: Any, *, poses: bool, intrinsics: bool) -> None
     pycolmap.create_default_bundle_adjuster(options, scope, model).solve()
 
 
-def _result(pycolmap: Any, model: Any, given: Cameras, rows: list[int], onto_given: Float64) -> Adjusted:
+def _result(pycolmap: Any, model: Any, given: Cameras, rows: list[int], start: Float64, back: Float64) -> Adjusted:
     after = _median_error(model)
-    model.transform(pycolmap.Sim3d(onto_given))
-    world_to_camera, intrinsics = given.world_to_camera.copy(), given.intrinsics.copy()
+    model.transform(pycolmap.Sim3d(back))
+    world_to_camera, intrinsics = start.copy(), given.intrinsics.copy()
     for row in rows:
         world_to_camera[row, :3] = model.image(row + 1).cam_from_world().matrix()
         intrinsics[row] = model.image(row + 1).camera.params
@@ -203,7 +222,9 @@ def _similarity(poses: Float64, given: Float64) -> Float64 | None:
 
 
 def _tell(given: Cameras, found: Adjusted) -> None:
-    rows, refined = found.rows, found.cameras.world_to_camera
+    refined = found.cameras.world_to_camera
+    differs = (refined != given.world_to_camera).any(axis=(1, 2))
+    rows = np.flatnonzero(differs)
     moved = np.linalg.norm(centers_of(refined) - centers_of(given.world_to_camera), axis=1)[rows]
     turn = refined[rows, :3, :3] @ given.world_to_camera[rows, :3, :3].transpose(0, 2, 1)
     turned = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
@@ -211,8 +232,16 @@ def _tell(given: Cameras, found: Adjusted) -> None:
         f"Bundle adjustment moves the given poses of {len(rows)} of {len(given)} views by {np.median(moved):.3g} "
         f"{'m' if given.metric else 'units'} (at most {moved.max():.3g}) and turns them by {np.median(turned):.2f} "
         f"degrees (at most {turned.max():.2f}); points are seen {found.error_after:.2f} pixels off their place instead "
-        f"of {found.error_before:.2f} (medians)."
+        f"of {found.error_before:.2f} (medians).{_kept(given, np.flatnonzero(~differs))}"
     )
+
+
+def _kept(given: Cameras, rows: Int32) -> str:
+    """A sentence on photos that keep their poses."""
+    if not len(rows):
+        return ""
+    names = first_of([given.names[row] for row in rows.tolist()])
+    return f" Photos with too little in common with others keep theirs: {names}."
 
 
 def _points(model: Any, number: int) -> int:

@@ -2,7 +2,7 @@
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
                                           [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | ...]
-                                          [--photos] [--lying] [--store DIR] [--look DIR]
+                                          [--photos] [--lying] [--shaken MM,DEG [--drift]] [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
 whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
@@ -13,7 +13,8 @@ shades) and prediction of some views. With --sensor, rooms have the depth of a c
 of small things on a table, in few near views of a depth sensor; with --bedroom, a bedroom, with --kitchen, a kitchen,
 with --shelf, a shelf of goods, with --walk, a table in a garden, with --tote, goods in a heap, with --office, a work
 place instead (`tests/support/generated_*.py`). With --photos, from the photos alone: without depth and poses. With
---lying, photos lie on their side, as a phone stores them.
+--lying, photos lie on their side, as a phone stores them. With --shaken, poses are off by so many millimetres and
+degrees (root mean square), each for itself, or, with --drift, each farther off than the one before.
 """
 
 from __future__ import annotations
@@ -125,6 +126,24 @@ def lying(upright: Path) -> Path:
     return folder
 
 
+def shaken(exact: Path, off: str, drift: bool) -> Path:
+    """A capture whose poses are not exact. off: millimetres and degrees, with a comma between them."""
+    folder = exact.with_name(f"{exact.name}-{'drift' if drift else 'shaken'}-{off}")
+    if folder.exists():
+        return folder
+    shutil.copytree(exact, folder)
+    metres, angle = np.array([float(number) for number in off.split(",")]) / (1000, 180 / np.pi) / np.sqrt(3)
+    turned, moved, noise = np.eye(3), np.zeros(3), np.random.default_rng(7)
+    for file in sorted(folder.glob("pose/*.txt")):
+        turn, step = cv2.Rodrigues(angle * noise.normal(size=3))[0], metres * noise.normal(size=3)
+        turned, moved = (turn @ turned, moved + step) if drift else (turn, step)
+        pose = np.loadtxt(file)
+        pose[:3, :3] @= turned
+        pose[:3, 3] += moved
+        np.savetxt(file, pose)
+    return folder
+
+
 def outcome(folder: Path, params: Params, store: Store, photos: bool = False) -> Outcome:
     """Run Split on a capture, or on its photos alone, and read what came of it."""
     scene = open_scene(folder / "color" if photos else folder)
@@ -182,6 +201,8 @@ def main() -> None:
         scene.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=f"a {kind}, not a room")
     parser.add_argument("--photos", action="store_true", help="from the photos alone")
     parser.add_argument("--lying", action="store_true", help="photos that lie on their side")
+    parser.add_argument("--shaken", help="how far poses are off, as in 15,1: millimetres, degrees")
+    parser.add_argument("--drift", action="store_true", help="each pose farther than the one before")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
     args = parser.parse_args()
@@ -191,6 +212,7 @@ def main() -> None:
             room = replace(ROOM, seed=seed, gripper=args.gripper)
             folder = other_of(args.kind, seed, Path(kept)) if args.kind else folder_of(room, Path(kept), args.sensor)
             folder = lying(folder) if args.lying else folder
+            folder = shaken(folder, args.shaken, args.drift) if args.shaken else folder
             found = outcome(folder, params, Store(Path(kept)), args.photos)
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]

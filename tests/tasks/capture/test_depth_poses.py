@@ -9,7 +9,6 @@ from numpy.testing import assert_array_equal
 
 from ss_flow.errors import InputError
 from ss_flow.tasks.artifacts import DepthMap
-from ss_flow.tasks.capture import depth_poses
 from ss_flow.tasks.capture.depth_poses import placed_by_depth
 from ss_flow.tasks.capture.features import features
 from ss_flow.tasks.capture.matches import match
@@ -79,16 +78,6 @@ def test_a_pose_that_the_depth_of_its_frame_contradicts_is_not_taken(scene):
     found = placed_by_depth(photos, unposed(true), elsewhere, matches, **ASKED)
     assert found.names == tuple(name for row, name in enumerate(true.names) if row != 5)
     assert errors(found, true)[1] < 1.0
-
-
-def test_depth_between_two_surfaces_or_among_unknown_pixels_counts_as_unknown():
-    depth = np.full((9, 9), 2, np.float32)
-    depth[:, 4:] = 3
-    depth[4, 1] = 0
-    depth[6:, :3] = 0
-    depth[8, 0] = 2
-    points = np.array([(2.5, 2.5), (3.5, 4.5), (6.2, 4.5), (1.5, 4.5), (1.5, 7.5)])
-    assert_array_equal(depth_poses._depth_at(points, depth), [2, np.nan, 3, 2, np.nan])
 
 
 @pytest.mark.parametrize("lacking", ["matches", "depth"])

@@ -7,6 +7,7 @@ import pytest
 from generated_views import jittered, views
 
 from ss_flow.errors import InputError
+from ss_flow.tasks.artifacts import DepthMap
 from ss_flow.tasks.capture import refine_poses
 from ss_flow.tasks.capture.features import Features, features
 from ss_flow.tasks.capture.matches import match
@@ -88,6 +89,28 @@ def test_a_photo_that_shares_nothing_keeps_its_given_pose(scene):
         refined = refined_cameras([*photos, empty], given, matches)
     np.testing.assert_array_equal(refined.world_to_camera[8], given.world_to_camera[8])
     assert np.abs(refined.world_to_camera[:8] - given.world_to_camera[:8]).max() > 0.01
+
+
+def test_a_photo_that_sees_few_points_is_placed_by_the_depth_of_a_sensor(scene):
+    photos, true, _ = scene
+    _, _, exact = views(EYES, width=320, height=240, focal=300.0)
+    depths = [DepthMap(name, z.astype(np.float32), "sensor") for name, z in zip(true.names, exact, strict=True)]
+    few = replace(photos[7], points=photos[7].points[:45], descriptors=photos[7].descriptors[:45])
+    photos = [*photos[:7], few]
+    matches = tuple(match(photo, photos[:row]) for row, photo in enumerate(photos))
+    given = jittered(true, 0.03, 1.0)
+    with pytest.warns(UserWarning, match=r"of 7 of 8 views.* Photos with too little in common .* keep theirs: view7\."):
+        without = refined_cameras(photos, given, matches)
+    with pytest.warns(UserWarning, match=r"of 8 of 8 views by .*medians\)\.$"):
+        refined = refined_cameras(photos, given, matches, depths)
+    np.testing.assert_array_equal(without.world_to_camera[7], given.world_to_camera[7])
+
+    def off(cameras):
+        """Of the last view, as seen from the one before it."""
+        one, other = (c.world_to_camera[7] @ np.linalg.inv(c.world_to_camera[6]) for c in (cameras, true))
+        return np.linalg.norm(one[:3, 3] - other[:3, 3])
+
+    assert off(refined) < 0.02 < 0.04 < off(without)
 
 
 def test_a_wrong_focal_length_is_refined_when_asked_for(scene):
