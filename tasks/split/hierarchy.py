@@ -54,6 +54,8 @@ on it."""
 _TOGETHER = 0.5
 """Share of the views which see two pieces that must hold them under one mask, whatever else it holds, so that a convex
 edge between them makes them faces of one thing."""
+_CRUMB = 0.02
+"""Share of its points below which what is added to a piece tells less and less of the whole: few views see it."""
 _MOST_SETS = 2000
 """Sets of pieces that are weighed in a round: those that the most masks show."""
 
@@ -139,7 +141,9 @@ def hierarchy(
         edges = convex_edges(points, cameras, visibility, labels.label, ends)
     inlays = find_inlays(looks, labels.label, ~is_stuff & (params.inlaid > 0))
     own: list[Members] = [(row,) for row in range(len(leaves))]
-    pieces = _Pieces(views_of(leaves, tallies), is_stuff, contact, edges, own, mounds, sheets, supports, inlays, params)
+    size, sure = np.bincount(labels.label)[leaves].astype(np.float64), np.ones(len(leaves))
+    views = views_of(leaves, tallies)
+    pieces = _Pieces(views, is_stuff, size, sure, contact, edges, own, mounds, sheets, supports, inlays, params)
     node, parent, agreement, stuff = leaves.tolist(), [0] * len(leaves), [1.0] * len(leaves), is_stuff.tolist()
     top = list(range(len(leaves)))  # the tree's row of each piece
     lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
@@ -155,7 +159,7 @@ def hierarchy(
                 parent[top[piece]] = node[row]
             top.append(row)
         left = sorted(set(range(len(top))) - {piece for members, _ in united for piece in members})
-        pieces = pieces.united([members for members, _ in united])
+        pieces = pieces.united(united)
         top = [top[piece] for piece in left]
         united = pieces.best_unions()
     return Hierarchy(
@@ -171,6 +175,10 @@ class _Pieces:
     """K."""
     stuff: Bool
     """[G]."""
+    size: Float64
+    """[G] points of each."""
+    agreement: Float64
+    """[G] on each being one; of a label 1."""
     contact: Contact
     edges: Bool
     """[G, G] which meet in a convex edge."""
@@ -189,11 +197,13 @@ class _Pieces:
         least, share = self.params.min_points, self.params.min_visible
         return [view.only((view.seen >= least) & (view.seen >= share * most)) for view in self.views]
 
-    def united(self, unions: list[Members]) -> _Pieces:
-        """What is left when each of these sets has become one piece: the others first, then the unions."""
+    def united(self, unions: list[tuple[Members, float]]) -> _Pieces:
+        """What is left when each of these sets has become one piece, with this agreement: the others first, then the
+        unions."""
         count = len(self.stuff)
-        gone = {piece for members in unions for piece in members}
-        groups: list[Members] = [*((piece,) for piece in range(count) if piece not in gone), *unions]
+        gone = {piece for members, _ in unions for piece in members}
+        left = [piece for piece in range(count) if piece not in gone]
+        groups: list[Members] = [*((piece,) for piece in left), *(members for members, _ in unions)]
         joined = np.zeros((count, len(groups)), np.float32)
         for column, members in enumerate(groups):
             joined[list(members), column] = 1
@@ -201,6 +211,8 @@ class _Pieces:
             self,
             views=[view.joined(joined) for view in self.views],
             stuff=self.stuff[[members[0] for members in groups]],
+            size=self.size @ joined,
+            agreement=np.array([*self.agreement[left], *(agreement for _, agreement in unions)]),
             contact=self.contact.joined(joined),
             edges=joined.T @ self.edges @ joined * ~np.eye(len(groups), dtype=bool) > 0,
             labels=[self._labels_of(members) for members in groups],
@@ -214,7 +226,7 @@ class _Pieces:
         if not sets:
             return []
         least = [presumed.get(members, 0.0) for members in sets]
-        agreement = np.maximum(self._agreements(sets, groups), least).astype(np.float64).round(6)
+        agreement = self._with_crumbs(sets, np.maximum(self._agreements(sets, groups), least)).round(6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
@@ -224,6 +236,16 @@ class _Pieces:
                 chosen.append((sets[row], float(agreement[row])))
             taken |= set(sets[row])
         return chosen
+
+    def _with_crumbs(self, sets: list[Members], agreement: Float64) -> Float64:
+        """The agreements on sets [S], but on a piece and a crumb hardly more than on that piece: of the views that see
+        it, few were asked about the crumb."""
+        rest, before = np.zeros((2, len(sets)))
+        for row, members in enumerate(sets):
+            size = self.size[list(members)]
+            rest[row] = 1 - size.max() / size.sum()
+            before[row] = self.agreement[members[int(size.argmax())]]
+        return agreement - np.maximum(agreement - before, 0) * np.maximum(1 - rest / _CRUMB, 0)
 
     def _agreements(self, sets: list[Members], groups: dict[Members, tuple[Members, ...]]) -> Float64:
         """How far the views agree on each set, less or more by what its places tell: [S]. groups: as of `_sets`."""

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -30,14 +32,14 @@ def tally(masks: list[tuple[set[int], float]], sees: set[int], points: int = SEE
     )
 
 
-def tree(tallies: list[Tally], labels: int, unused: int = 0, **changes) -> Hierarchy:
-    """Labels 1.., each a ball of points far from the others, so that none is flat; higher ones are unused. What touches
-    what does not count, if not asked for."""
+def tree(tallies: list[Tally], labels: int, unused: int = 0, sizes: tuple[int, ...] = (), **changes) -> Hierarchy:
+    """Labels 1.., each a ball of 20 points (`sizes`) far from the others, so that none is flat; higher ones are unused.
+    What touches what does not count, if not asked for."""
     rng = np.random.default_rng(0)
-    places = rng.normal(size=(20 * labels, 3)).astype(np.float32)
-    places[:, 0] += 9 * np.repeat(np.arange(labels), 20)
+    label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), sizes or 20)
+    places = rng.normal(size=(len(label), 3)).astype(np.float32)
+    places[:, 0] += 9 * (label - 1)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.1)
-    label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), 20)
     given = labels_of(label, labels + unused)
     params = HierarchyParams(**{"prior": 0.0, "contact": 0.0, "apart": 0.0, **changes})
     return hierarchy(cloud, one_camera(np.eye(4)), [], given, tallies, params=params)
@@ -116,6 +118,15 @@ def test_a_set_waits_for_a_better_one_that_it_shares_a_piece_with_though_that_on
 def test_what_no_view_shows_as_one_stays_apart_though_no_agreement_is_asked_for():
     masks = [({1, 2}, 0.5), ({1}, 0.95), ({2}, 0.95)]
     assert unions(tree([tally(masks, {1, 2})], 2, min_agreement=0.0)) == {}
+
+
+@pytest.mark.parametrize(("points", "agreement"), [(4, 0.5 + 0.5 * 4 / 404 / 0.02), (20, 1.0)])
+def test_the_view_that_sees_a_crumb_does_not_speak_for_all_that_see_the_rest(points, agreement):
+    views = [tally([({1, 2}, 0.9)], {1, 2}), tally([({1}, 0.9)], {1, 2}, 99), tally([({2}, 0.9)], {1, 2}, 98)]
+    all_of_it, few = tally([({1, 2, 3}, 0.9)], {1, 2, 3}), np.array([SEES, SEES, SEES // 10], np.int32)
+    views.append(replace(all_of_it, seen=few, held=few[None]))
+    found = tree(views, 3, sizes=(200, 200, points))
+    assert unions(found) == {frozenset({1, 2}): 0.5, frozenset({1, 2, 3}): agreement}
 
 
 def test_nodes_are_numbered_after_all_labels_whether_points_carry_them_or_not():
