@@ -14,6 +14,7 @@ from ss_flow.flows.depths import (
     fitting_depth,
     measured,
     presumed_depth,
+    scaled_depth,
     without_sensor,
 )
 from ss_flow.flows.params import CaptureParams
@@ -126,7 +127,8 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         compared = params.registration.in_use(advise=advise)
         placing = registration(frames, cameras, sensed, advise=advise, params=compared)
         fitting = fitting_depth(frames, cameras, sensed, placing, params)
-        depths = completed_depth(frames, cameras, fitting, names, params)
+        scaled = scaled_depth(cameras, fitting, names, params)
+        depths = completed_depth(frames, cameras, scaled, names, params)
     elif params.calibrate == "depth":
         raise InputError(
             f"{scene.root} is to be run with depth that no sensor measured (capture.depth={source}), and only a "

@@ -16,6 +16,7 @@ from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, Gaussians, Registr
 from ss_flow.tasks.capture import depth as steps
 from ss_flow.tasks.capture import recordings, sensor_depth, views
 from ss_flow.tasks.capture.completion import Gaps, completed, gaps, sized
+from ss_flow.tasks.capture.depth_scale import DepthScale, depth_scale, rescaled
 from ss_flow.tasks.capture.given_scene import rendered_depth
 from ss_flow.tasks.capture.mono import mono
 from ss_flow.tasks.capture.neighbors import Neighbors, neighbors
@@ -73,6 +74,18 @@ def fitting_depth(
         placing,
         lambda found: calibrated(frames, cameras, depths, placing) if found.moves and found.gain >= least else depths,
     )
+
+
+def scaled_depth(cameras: Cameras, depths: Depths, names: tuple[str, ...] | None, params: CaptureParams) -> Depths:
+    """The sensor's depth in the unit of the poses, where that is clearly another one."""
+    if params.calibrate == "none":
+        return depths
+    scale = depth_scale(cameras, depths)
+
+    def scaling(found: DepthScale) -> Depths:
+        return each(depths, names=names, build=lambda depth: rescaled(depth, scale)) if found.counts else depths
+
+    return expand(scale, scaling)
 
 
 @dataclass(frozen=True)

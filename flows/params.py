@@ -61,7 +61,7 @@ class CaptureParams:
     ("rendered"), else several views (mvs)."""
     calibrate: Literal["auto", "none", "depth"] = "auto"
     """"depth" scales and shifts the sensor's depth so that its edges fit the photos, where that is found to be better;
-    "auto" where it is clearly better."""
+    "auto" where it is clearly better. Both multiply it by the factor by which it clearly fits the poses."""
     refine_poses: Literal["auto", "always", "never"] = "auto"
     """Whether poses that come with the capture are first refined by bundle adjustment; "auto" does so where photos do
     not fit the given ones, and uses what it finds where photos then fit better and measured depth no worse."""

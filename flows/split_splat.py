@@ -29,6 +29,8 @@ LEADS_TO = {
     "agree": "depth",
     "gaps": "depth",
     "sized": "depth",
+    "depth_scale": "depth",
+    "rescaled": "depth",
     "completed": "depth",
     "exclusive": "merge",
     "retrain": "merge",

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
 from ss_flow.running import progress, warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Int32
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64
 from ss_flow.tasks.capture.colmap import SEED, load_pycolmap
 from ss_flow.tasks.capture.colmap_database import fill_database
 from ss_flow.tasks.capture.features import Features
@@ -236,7 +237,7 @@ def _tell(given: Cameras, found: Adjusted) -> None:
     )
 
 
-def _kept(given: Cameras, rows: Int32) -> str:
+def _kept(given: Cameras, rows: NDArray[np.intp]) -> str:
     """A sentence on photos that keep their poses."""
     if not len(rows):
         return ""

@@ -69,6 +69,20 @@ def test_calibrated_depth_gives_better_instances_and_depth_that_fits_stays_to_th
     assert miou(better) > miou(right) - 0.1
 
 
+def test_depth_of_another_scale_than_the_poses_is_brought_to_theirs_unless_it_is_to_stay(scenes, tmp_path):
+    room = generate(RoomParams(objects=4, views=16, width=96, height=72, held_out=0))
+    write_scene(replace(room, depth=np.float32(1.04) * room.depth), tmp_path / "large", masks="truth")
+    store, until = tmp_path / "store", ("--until", "depth")
+    called = run_tiny(tmp_path / "large", store, *until)
+    assert called.computed()["capture.rescaled"] == 16
+    assert any(text.startswith("The depth was multiplied by 0.9") for text in warnings(called))
+    assert "so that it fits the poses" in called.err
+    kept = run_tiny(tmp_path / "large", store, *until, "--calibrate", "none")
+    assert not {"capture.depth_scale", "capture.rescaled"} & kept.computed().keys()
+    assert "capture.rescaled" not in run_tiny(scenes[0], store, *until).computed()
+    assert run_tiny(tmp_path / "large", store, "--until", "rescaled").computed() == {}
+
+
 def test_the_flag_is_the_parameter(scenes, tmp_path):
     one = run_tiny(scenes[1], tmp_path / "store", "--until", "depth", "--calibrate", "depth")
     other = run_tiny(scenes[1], tmp_path / "store", "--until", "depth", "--set", "capture.calibrate=depth")
