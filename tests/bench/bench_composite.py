@@ -2,7 +2,8 @@
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
                                           [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | ...]
-                                          [--photos] [--lying] [--shaken MM,DEG [--drift]] [--store DIR] [--look DIR]
+                                          [--photos] [--lying] [--shaken MM,DEG [--drift]] [--larger FACTOR]
+                                          [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
 whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
@@ -14,7 +15,8 @@ of small things on a table, in few near views of a depth sensor; with --bedroom,
 with --shelf, a shelf of goods, with --walk, a table in a garden, with --tote, goods in a heap, with --office, a work
 place instead (`tests/support/generated_*.py`). With --photos, from the photos alone: without depth and poses. With
 --lying, photos lie on their side, as a phone stores them. With --shaken, poses are off by so many millimetres and
-degrees (root mean square), each for itself, or, with --drift, each farther off than the one before.
+degrees (root mean square), each for itself, or, with --drift, each farther off than the one before. With --larger,
+depth is so many times as large as it should be.
 """
 
 from __future__ import annotations
@@ -144,6 +146,18 @@ def shaken(exact: Path, off: str, drift: bool) -> Path:
     return folder
 
 
+def enlarged(exact: Path, factor: float) -> Path:
+    """A capture whose depth has another scale than its poses."""
+    folder = exact.with_name(f"{exact.name}-larger-{factor}")
+    if folder.exists():
+        return folder
+    shutil.copytree(exact, folder)
+    for file in folder.glob("depth/*.png"):
+        depth = _ids(file)
+        cv2.imwrite(str(file), np.rint(depth * factor).astype(depth.dtype))
+    return folder
+
+
 def outcome(folder: Path, params: Params, store: Store, photos: bool = False) -> Outcome:
     """Run Split on a capture, or on its photos alone, and read what came of it."""
     scene = open_scene(folder / "color" if photos else folder)
@@ -203,6 +217,7 @@ def main() -> None:
     parser.add_argument("--lying", action="store_true", help="photos that lie on their side")
     parser.add_argument("--shaken", help="how far poses are off, as in 15,1: millimetres, degrees")
     parser.add_argument("--drift", action="store_true", help="each pose farther than the one before")
+    parser.add_argument("--larger", type=float, help="factor on all depth")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
     args = parser.parse_args()
@@ -213,6 +228,7 @@ def main() -> None:
             folder = other_of(args.kind, seed, Path(kept)) if args.kind else folder_of(room, Path(kept), args.sensor)
             folder = lying(folder) if args.lying else folder
             folder = shaken(folder, args.shaken, args.drift) if args.shaken else folder
+            folder = enlarged(folder, args.larger) if args.larger else folder
             found = outcome(folder, params, Store(Path(kept)), args.photos)
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]
