@@ -80,12 +80,12 @@ def scaled_depth(cameras: Cameras, depths: Depths, names: tuple[str, ...] | None
     """The sensor's depth in the unit of the poses, where that is clearly another one."""
     if params.calibrate == "none":
         return depths
-    scale = depth_scale(cameras, depths)
 
     def scaling(found: DepthScale) -> Depths:
-        return each(depths, names=names, build=lambda depth: rescaled(depth, scale)) if found.counts else depths
+        factor = found.factor  # alone: a photo more changes how well it fits, and seldom the factor
+        return each(depths, names=names, build=lambda depth: rescaled(depth, factor=factor)) if found.counts else depths
 
-    return expand(scale, scaling)
+    return expand(depth_scale(cameras, depths), scaling)
 
 
 @dataclass(frozen=True)

@@ -45,9 +45,8 @@ class DepthScale:
 
 @task(name="capture.depth_scale")
 def depth_scale(cameras: Cameras, depths: Sequence[DepthMap]) -> DepthScale:
-    """The factor on all depth maps by which neighbours' depth differs least, within a tenth; 1 where nothing tells.
-
-    Says so where it counts.
+    """The factor on all depth maps by which neighbours' depth differs least, within a tenth; 1 where nothing tells, or
+    where it lies farther off: that is another unit, and no error. Says so where it counts.
     """
     errors = []
     for view in np.unique(np.linspace(0, len(cameras) - 1, min(_VIEWS, len(cameras))).astype(int)).tolist():
@@ -59,6 +58,8 @@ def depth_scale(cameras: Cameras, depths: Sequence[DepthMap]) -> DepthScale:
         return DepthScale(1.0, np.nan, np.nan)
     curve = np.median(errors, axis=0)
     best = int(curve.argmin())
+    if best in (0, len(curve) - 1):
+        return DepthScale(1.0, np.nan, np.nan)
     result = DepthScale(float(_FACTORS[best]), float(curve[len(curve) // 2]), float(curve[best]))
     if result.counts:
         warn(
@@ -70,9 +71,9 @@ def depth_scale(cameras: Cameras, depths: Sequence[DepthMap]) -> DepthScale:
 
 
 @task(name="capture.rescaled")
-def rescaled(depth: DepthMap, scale: DepthScale) -> DepthMap:
-    """A depth map times the factor."""
-    return replace(depth, depth=depth.depth * np.float32(scale.factor))
+def rescaled(depth: DepthMap, *, factor: float) -> DepthMap:
+    """A depth map times a factor."""
+    return replace(depth, depth=depth.depth * np.float32(factor))
 
 
 def _seen(cameras: Cameras, depths: Sequence[DepthMap], row: int) -> tuple[Camera, Float32]:

@@ -311,7 +311,7 @@ def test_a_change_that_size_and_time_hide_is_found_and_by_verify_where_nothing_t
     write_depth_uncompressed(depth, values)
     before = depth.stat()
     assert run_tiny(scene, store, "--until", "depth").code == 0
-    first_steps = {"capture.sensor_depth": 1, "capture.registration": 1}
+    first_steps = {"capture.sensor_depth": 1, "capture.registration": 1, "capture.depth_scale": 1}
 
     def change() -> None:
         values[0, 0] += 1

@@ -30,7 +30,7 @@ def test_the_scale_of_the_poses_is_found_and_said(scene, off):
         found = depth_scale(cameras, wrong)
     assert found.counts
     assert found.factor == pytest.approx(1 / off, rel=0.006)
-    np.testing.assert_allclose(rescaled(wrong[0], found).depth, right[0].depth, rtol=0.006)
+    np.testing.assert_allclose(rescaled(wrong[0], factor=found.factor).depth, right[0].depth, rtol=0.006)
 
 
 def test_depth_of_the_right_scale_stays_without_a_word(scene, recwarn):
@@ -46,6 +46,13 @@ def test_views_of_which_no_other_shows_the_same_tell_nothing(scene, recwarn):
     for given in (blind, [*depths[:1], *blind[1:]]):
         found = depth_scale(cameras, given)
         assert (found.factor, found.counts) == (1.0, False)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("unit", [0.5, 1.2, 1000])
+def test_another_unit_is_left_alone(scene, unit, recwarn):
+    cameras, depths = scene
+    assert not depth_scale(cameras, [replace(d, depth=d.depth * np.float32(unit)) for d in depths]).counts
     assert not recwarn.list
 
 
