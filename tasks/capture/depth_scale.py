@@ -14,15 +14,14 @@ import numpy as np
 from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64
-from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
+from ss_flow.tasks.capture.pose_fit import depth_differences
+from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views
 
 _FACTORS = np.exp(0.0025 * np.arange(-40, 41))
 _VIEWS, _NEIGHBOURS = 24, 2
 """So many views, evenly chosen, are compared with so many neighbours each."""
 _MOST_PIXELS, _LEAST_PIXELS = 4000, 200
 """So many pixels of a view are carried, evenly chosen, and so many must be met in the other."""
-_OCCLUDED = 0.25
-"""Relative difference of depth beyond which something else stands in front."""
 _LEAST_PAIRS = 3
 _GAIN = 0.08
 """Share of the difference that a factor must take away to count. Where depth and poses have one scale, at most .06
@@ -91,10 +90,7 @@ def _differences(first: Camera, depth: Float32, second: Camera, measured: Float3
     ahead = replace(second, world_to_camera=second.world_to_camera @ np.linalg.inv(first.world_to_camera))
     result = np.full(len(_FACTORS), np.nan)
     for row, factor in enumerate(_FACTORS):
-        _, column, line, z = pixels_in_view(local * factor, ahead)
-        there = measured[line, column] * factor
-        off = np.abs(z[there > 0] / there[there > 0] - 1)
-        off = off[off < _OCCLUDED]
+        off = depth_differences(local * factor, ahead, measured, factor)
         if len(off) >= _LEAST_PIXELS:
             result[row] = np.median(off)
     return result

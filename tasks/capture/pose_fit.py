@@ -13,11 +13,11 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float64, Int32
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Int32
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.lens import found_lens, undistorted
 from ss_flow.tasks.capture.matches import MAX_ERROR, Matches
-from ss_flow.tasks.geometry.cameras import backproject, camera_of, nearest_views, pixels_in_view
+from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
 
 _FEW_PAIRS, _MOST_PAIRS = 4, 12
@@ -218,7 +218,14 @@ def _depth_difference(cameras: Cameras, views: tuple[int, int], depths: tuple[De
     """The median relative difference between the first view's depth in the second and what was measured there."""
     (first, second) = (depth.depth for depth in depths)
     points = backproject(first, camera_of(cameras, views[0]).scaled(*first.shape[::-1]))[first.ravel() > 0]
-    _, column, row, z = pixels_in_view(points, camera_of(cameras, views[1]).scaled(*second.shape[::-1]))
-    measured = second[row, column]
-    off = np.abs(z[measured > 0] / measured[measured > 0] - 1)
-    return float(np.median(off[off < _OCCLUDED])) if (off < _OCCLUDED).any() else np.nan
+    off = depth_differences(points, camera_of(cameras, views[1]).scaled(*second.shape[::-1]), second)
+    return float(np.median(off)) if len(off) else np.nan
+
+
+def depth_differences(points: Float64, camera: Camera, measured: Float32, factor: float = 1.0) -> Float64:
+    """Relative differences between the depth of points [N, 3] in a view (their frame is that of its pose) and what was
+    measured there, times a factor, where something was and nothing else stands in front."""
+    _, column, row, z = pixels_in_view(points, camera)
+    there = factor * measured[row, column]
+    off = np.abs(z[there > 0] / there[there > 0] - 1)
+    return off[off < _OCCLUDED]
