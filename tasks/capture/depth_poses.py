@@ -36,7 +36,8 @@ def placed_by_depth(
     Photos without a place are missing from the result. Raises InputError when fewer than `min_registered` of all, or
     fewer than 3, find theirs.
     """
-    poses = places(photos, depths, unposed, matches, min_matches=min_matches)
+    light = [photo.light() for photo in photos]
+    poses = places(light, depths, unposed, matches, min_matches=min_matches)
     if len(poses) < max(3, min_registered * len(photos)):
         raise InputError(
             f"only {len(poses)} of {len(photos)} frames found their place by what the depth sensor measured; frames "
@@ -51,7 +52,7 @@ def placed_by_depth(
         world_to_camera=np.stack([poses[row] for row in rows]),
     )
     try:
-        return adjusted([photos[row].light() for row in rows], placed, matches, params).cameras
+        return adjusted([light[row] for row in rows], placed, matches, params).cameras
     except Unrefinable as error:
         warn(f"Poses stay as the depth sensor gave them, without an adjustment of all together: {error}.")
         return placed

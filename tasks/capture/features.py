@@ -45,7 +45,7 @@ class Features:
 
     def light(self) -> Features:
         """Without descriptors, which take most of the memory."""
-        return replace(self, descriptors=self.descriptors[:0])
+        return replace(self, descriptors=self.descriptors[:0].copy())  # a view would keep them all
 
 
 @task(name="capture.features")

@@ -37,8 +37,9 @@ def places(
 
     One after the other, the photo with the most matches to points that placed ones measured is placed by these
     (perspective n points, Fischler and Bolles 1981).
-    cameras: the photos' lenses; its poses are not looked at. min_matches: so many points must confirm a pose. known:
-    poses from which to go on; without them the world is the frame of the photo that has most in common with others.
+    photos: their descriptors are not looked at. cameras: the photos' lenses; its poses are not looked at. min_matches:
+    so many points must confirm a pose. known: poses from which to go on; without them the world is the frame of the
+    photo that has most in common with others.
     """
     pycolmap = load_pycolmap()
     seen = [_Seen.of(*one) for one in zip(photos, depths, cameras.intrinsics, strict=True)]
@@ -75,7 +76,6 @@ class _Seen:
     """What a photo's features are known to be, and what is known of them from placed photos."""
 
     photo: Features
-    """Without descriptors."""
     intrinsics: Float64
     measured: Float64
     """[N, 3] the features in the camera's frame; nan where the sensor knows none, or two surfaces meet."""
@@ -89,7 +89,7 @@ class _Seen:
         scale = np.divide(depth.depth.shape[::-1], (photo.width, photo.height), dtype=np.float64)
         z = _depth_at(photo.points.astype(np.float64) * scale, depth.depth)
         rays = (photo.points - intrinsics[2:]) / intrinsics[:2]
-        return cls(photo.light(), intrinsics, np.column_stack([rays, np.ones(len(rays))]) * z[:, None])
+        return cls(photo, intrinsics, np.column_stack([rays, np.ones(len(rays))]) * z[:, None])
 
     @property
     def known(self) -> int:

@@ -64,15 +64,16 @@ def refined_cameras(
     depths: none, or of each photo. insist: whether it is an error when the photos have too little in common; else the
     given cameras are returned. Raises InputError then.
     """
+    light = [photo.light() for photo in photos]
     try:
-        found = adjusted(photos, cameras, matches, params)
-        known = {row: found.cameras.world_to_camera[row] for row in found.rows}
-        if len(depths) and len(known) < len(photos):
-            poses = places(photos, depths, cameras, matches, min_matches=_LEAST_MATCHES, known=known)
-            start = cameras.world_to_camera.copy()
-            start[list(poses)] = list(poses.values())
+        found = adjusted(light, cameras, matches, params)
+        if len(depths) and len(found.rows) < len(light):
+            known = {row: found.cameras.world_to_camera[row] for row in found.rows}
+            poses = places(light, depths, cameras, matches, min_matches=_LEAST_MATCHES, known=known)
             if len(poses) > len(known):
-                found = adjusted(photos, cameras, matches, params, start)
+                start = cameras.world_to_camera.copy()
+                start[list(poses)] = list(poses.values())
+                found = adjusted(light, cameras, matches, params, start)
     except Unrefinable as error:
         if insist:
             raise InputError(

@@ -22,6 +22,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
     Bool,
     Cameras,
+    Float32,
     Float64,
     Hierarchy,
     PointCloud,
@@ -226,7 +227,11 @@ class _Pieces:
         if not sets:
             return []
         least = [presumed.get(members, 0.0) for members in sets]
-        agreement = self._with_crumbs(sets, np.maximum(self._agreements(sets, groups), least)).round(6)
+        member = np.zeros((len(sets), len(self.stuff)), np.float32)
+        for row, members in enumerate(sets):
+            member[row, list(members)] = 1
+        agreement = np.maximum(self._agreements(sets, member, groups), least)
+        agreement = self._with_crumbs(member, agreement).round(6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
@@ -237,21 +242,16 @@ class _Pieces:
             taken |= set(sets[row])
         return chosen
 
-    def _with_crumbs(self, sets: list[Members], agreement: Float64) -> Float64:
+    def _with_crumbs(self, member: Float32, agreement: Float64) -> Float64:
         """The agreements on sets [S], but on a piece and a crumb hardly more than on that piece: of the views that see
-        it, few were asked about the crumb."""
-        rest, before = np.zeros((2, len(sets)))
-        for row, members in enumerate(sets):
-            size = self.size[list(members)]
-            rest[row] = 1 - size.max() / size.sum()
-            before[row] = self.agreement[members[int(size.argmax())]]
+        it, few were asked about the crumb. member: [S, G] 1 for the pieces of each set, else 0."""
+        size = member * self.size
+        rest, before = 1 - size.max(axis=1) / size.sum(axis=1), self.agreement[size.argmax(axis=1)]
         return agreement - np.maximum(agreement - before, 0) * np.maximum(1 - rest / _CRUMB, 0)
 
-    def _agreements(self, sets: list[Members], groups: dict[Members, tuple[Members, ...]]) -> Float64:
-        """How far the views agree on each set, less or more by what its places tell: [S]. groups: as of `_sets`."""
-        member = np.zeros((len(sets), len(self.stuff)), np.float32)
-        for row, members in enumerate(sets):
-            member[row, list(members)] = 1
+    def _agreements(self, sets: list[Members], member: Float32, groups: dict[Members, tuple[Members, ...]]) -> Float64:
+        """How far the views agree on each set, less or more by what its places tell: [S]. member: [S, G] 1 for the
+        pieces of each, else 0; groups: as of `_sets`."""
         params = self.params
         agreement = agreement_of(
             self.counted,

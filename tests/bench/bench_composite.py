@@ -28,6 +28,7 @@ import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -106,12 +107,17 @@ def other_of(kind: str, seed: int, place: Path) -> Path:
     return folder
 
 
-def lying(upright: Path) -> Path:
-    """A capture whose photos, and all else, lie on their right side."""
-    folder = upright.with_name(f"{upright.name}-lying")
-    if folder.exists():
-        return folder
-    shutil.copytree(upright, folder)
+def altered(capture: Path, name: str, change: Callable[[Path], None]) -> Path:
+    """A copy of a capture, changed where it lies; it is made first where it is not there."""
+    folder = capture.with_name(f"{capture.name}-{name}")
+    if not folder.exists():
+        shutil.copytree(capture, folder)
+        change(folder)
+    return folder
+
+
+def lay_down(folder: Path) -> None:
+    """Turn photos, and all else, on their right side."""
     for file in (*folder.rglob("*.jpg"), *folder.rglob("*.png")):
         quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if file.suffix == ".jpg" else []
         cv2.imwrite(str(file), np.ascontiguousarray(np.rot90(_ids(file), -1)), quality)
@@ -125,15 +131,10 @@ def lying(upright: Path) -> Path:
         width = _ids(next((folder / file.stem.removeprefix("intrinsic_")).iterdir())).shape[1]
         matrix[:2, :3] = (fy, 0, width - 1 - cy), (0, fx, cx)
         np.savetxt(file, matrix)
-    return folder
 
 
-def shaken(exact: Path, off: str, drift: bool) -> Path:
-    """A capture whose poses are not exact. off: millimetres and degrees, with a comma between them."""
-    folder = exact.with_name(f"{exact.name}-{'drift' if drift else 'shaken'}-{off}")
-    if folder.exists():
-        return folder
-    shutil.copytree(exact, folder)
+def shake(folder: Path, off: str, drift: bool) -> None:
+    """Make poses inexact. off: millimetres and degrees, with a comma between them."""
     metres, angle = np.array([float(number) for number in off.split(",")]) / (1000, 180 / np.pi) / np.sqrt(3)
     turned, moved, noise = np.eye(3), np.zeros(3), np.random.default_rng(7)
     for file in sorted(folder.glob("pose/*.txt")):
@@ -143,19 +144,13 @@ def shaken(exact: Path, off: str, drift: bool) -> Path:
         pose[:3, :3] @= turned
         pose[:3, 3] += moved
         np.savetxt(file, pose)
-    return folder
 
 
-def enlarged(exact: Path, factor: float) -> Path:
-    """A capture whose depth has another scale than its poses."""
-    folder = exact.with_name(f"{exact.name}-larger-{factor}")
-    if folder.exists():
-        return folder
-    shutil.copytree(exact, folder)
+def enlarge(folder: Path, factor: float) -> None:
+    """Give depth another scale than the poses have."""
     for file in folder.glob("depth/*.png"):
         depth = _ids(file)
         cv2.imwrite(str(file), np.rint(depth * factor).astype(depth.dtype))
-    return folder
 
 
 def outcome(folder: Path, params: Params, store: Store, photos: bool = False) -> Outcome:
@@ -226,9 +221,13 @@ def main() -> None:
         for seed in args.seeds:
             room = replace(ROOM, seed=seed, gripper=args.gripper)
             folder = other_of(args.kind, seed, Path(kept)) if args.kind else folder_of(room, Path(kept), args.sensor)
-            folder = lying(folder) if args.lying else folder
-            folder = shaken(folder, args.shaken, args.drift) if args.shaken else folder
-            folder = enlarged(folder, args.larger) if args.larger else folder
+            if args.lying:
+                folder = altered(folder, "lying", lay_down)
+            if args.shaken:
+                how = "drift" if args.drift else "shaken"
+                folder = altered(folder, f"{how}-{args.shaken}", lambda copy: shake(copy, args.shaken, args.drift))
+            if args.larger:
+                folder = altered(folder, f"larger-{args.larger}", lambda copy: enlarge(copy, args.larger))
             found = outcome(folder, params, Store(Path(kept)), args.photos)
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]

@@ -50,3 +50,11 @@ def test_features_of_a_photo_scaled_down_are_in_pixels_of_the_frame(frame):
     everything = features(frame).points
     off = np.linalg.norm(small.points[:20, None] - everything, axis=-1).min(axis=1)
     assert np.median(off) < 1.0
+
+
+def test_light_features_do_not_keep_descriptors_in_memory(frame):
+    found = features(frame)
+    light = found.light()
+    assert light.descriptors.shape == (0, 128)
+    assert light.descriptors.base is None
+    assert light.points is found.points
