@@ -146,7 +146,7 @@ def _dense_points(capture: Capture, params: SplitParams) -> PointCloud:
         return dense_splatting(
             *views, capture.depths, capture.unit, capture.colours, params=params.dense, splatting=params.splatting
         )
-    return dense(*views, capture.presumed, capture.unit, params=params.dense)
+    return dense(*views, capture.presumed, capture.unit, capture.colours, params=params.dense)
 
 
 def _seen(capture: Capture, points: PointCloud, params: SplitParams) -> tuple[Visibility, ...]:
@@ -159,14 +159,15 @@ def _seen(capture: Capture, points: PointCloud, params: SplitParams) -> tuple[Vi
     )
     if capture.completed or not params.visible_color:
         return seen
+    looks, color = capture.colours, params.visible_color
     return each(
-        capture.by_view,
         capture.presumed,
         capture.frames,
         seen,
+        INDEX,
         names=capture.names,
-        build=lambda camera, depth, frame, visible: visible_by_color(
-            points, camera, depth, frame, visible, color=params.visible_color
+        build=lambda depth, frame, visible, view: visible_by_color(
+            points, capture.by_view[view], depth, frame, visible, (looks[view],) if looks else (), color=color
         ),
     )
 

@@ -81,7 +81,7 @@ def colours(
     reference = int(np.abs(to_photo - np.eye(4)[:3]).sum(axis=(1, 2)).argmin())
     in_scene = _square(to_photo[reference]) @ np.linalg.inv(_square(to_photo))
     warn(
-        f"Exposure or white balance change from photo to photo: Gaussians are trained in the colours of photo "
+        f"Exposure or white balance change from photo to photo: points and Gaussians get the colours of photo "
         f"{frames[reference].name}, which takes {gained:.0%} of the differences away. "
         "capture.colours.transform=none leaves photos as they are."
     )

@@ -63,6 +63,14 @@ def transformed(image: Float32, colours: ColourTransform) -> Float32:
     return image @ matrix[:, :3].T + matrix[:, 3]
 
 
+def scene_rgb(frame: Frame, colours: ColourTransform | None = None) -> UInt8:
+    """The photo of a frame in the colours of the scene, where these are another thing: [H, W, 3] uint8 RGB."""
+    photo = decode_rgb(frame)
+    if colours is None or not colours.reference:
+        return photo
+    return np.rint(255 * transformed(photo.astype(np.float32) / 255, colours)).clip(0, 255).astype(np.uint8)
+
+
 def suffix_of(frame: Frame) -> str:
     """What the name of a file with a frame's bytes ends in: "jpg" or "png"."""
     return "jpg" if frame.encoded[:2].tobytes() == b"\xff\xd8" else "png"

@@ -11,11 +11,11 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import in_threads, progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64, Frame, PointCloud, SceneUnit
+from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Float64, Frame, PointCloud, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_noise, sum_by_voxel
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, resampled
+from ss_flow.tasks.geometry.images import decode_valid, resampled, scene_rgb
 from ss_flow.tasks.ranges import Count, NonNegative, Positive, Range
 
 SIDES_PER_OCTAVE = 8
@@ -47,12 +47,19 @@ class DenseParams:
 
 @task(resources=Resources(cores=1, most_cores=8))
 def dense(
-    frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...], unit: SceneUnit, *, params: DenseParams
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    unit: SceneUnit,
+    colours: tuple[ColourTransform, ...] = (),
+    *,
+    params: DenseParams,
 ) -> PointCloud:
     """Dense points P_dense, by back-projection of all depth maps (spec S2, row 11).
 
     Known depth pixels that their frame does not mask out become world points; the points of one voxel are averaged;
-    those that other views contradict are dropped (see `consistent_points`). The points are ordered by voxel.
+    those that other views contradict are dropped (see `consistent_points`). The points are ordered by voxel, and have
+    the colours of the scene where photos differ (`colours`).
 
     Raises InputError when no two views agree, or the scene lies too far from the world's origin for float32.
     """
@@ -64,7 +71,8 @@ def dense(
             yield view
 
     def sums(view: int) -> VoxelSums:
-        return sum_by_voxel([depth_samples(frames[view], cameras, view, depths[view])], voxel)
+        look = colours[view] if colours else None
+        return sum_by_voxel([depth_samples(frames[view], cameras, view, depths[view], look)], voxel)
 
     summed = sum_by_voxel(in_threads(sums, views()), voxel)
     cloud = consistent_cloud(summed, cameras, depths, voxel=voxel, unit=unit, params=params)
@@ -146,8 +154,11 @@ def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
     return float(np.median(sides)) if sides else np.inf
 
 
-def depth_samples(frame: Frame, cameras: Cameras, view: int, depth: DepthMap) -> VoxelSums:
-    """The known depth pixels of one view as points with the colours of its photo, in cubes of a pixel's size at least.
+def depth_samples(
+    frame: Frame, cameras: Cameras, view: int, depth: DepthMap, colours: ColourTransform | None
+) -> VoxelSums:
+    """The known depth pixels of one view as points with the colours of its photo, or those of the scene there, in cubes
+    of a pixel's size at least.
 
     In smaller ones each pixel of each view would be a point of its own, and far walls would leave hardly any of
     `max_points` to what is near.
@@ -156,6 +167,6 @@ def depth_samples(frame: Frame, cameras: Cameras, view: int, depth: DepthMap) ->
     known = ((depth.depth > 0) & resampled(decode_valid(frame), height, width)).ravel()
     camera = camera_of(cameras, view).scaled(width, height)
     points = backproject(depth.depth, camera)[known]
-    colors = resampled(decode_rgb(frame), height, width).reshape(-1, 3)[known].astype(np.float64)
+    colors = resampled(scene_rgb(frame, colours), height, width).reshape(-1, 3)[known].astype(np.float64)
     sides = depth.depth.ravel()[known].astype(np.float64) / camera.fx
     return VoxelSums(points, colors, np.ones(len(points)), sides)

@@ -10,10 +10,21 @@ import math
 import numpy as np
 
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Bool, DepthMap, Float32, Float64, Frame, Int32, PointCloud, UInt8, Visibility
+from ss_flow.tasks.artifacts import (
+    Bool,
+    ColourTransform,
+    DepthMap,
+    Float32,
+    Float64,
+    Frame,
+    Int32,
+    PointCloud,
+    UInt8,
+    Visibility,
+)
 from ss_flow.tasks.geometry.cameras import Camera, pixels_in_view
 from ss_flow.tasks.geometry.fusion import depth_at
-from ss_flow.tasks.geometry.images import decode_rgb, decode_valid
+from ss_flow.tasks.geometry.images import decode_valid, scene_rgb
 
 _BEHIND = 0.02
 """Share of the depth by which a point may lie behind the nearest one around."""
@@ -23,14 +34,21 @@ _SPACINGS = 2.0
 
 @task()
 def visible_by_color(
-    points: PointCloud, camera: Camera, depth: DepthMap, frame: Frame, seen: Visibility, *, color: float
+    points: PointCloud,
+    camera: Camera,
+    depth: DepthMap,
+    frame: Frame,
+    seen: Visibility,
+    colours: tuple[ColourTransform, ...] = (),
+    *,
+    color: float,
 ) -> Visibility:
     """What a view sees, with the points that fall where its depth is unknown and that it shows in their own colour.
 
-    camera, depth, frame: of this view; seen: the points that it sees by its depth. A point counts when nothing that
-    the view sees, or may see, lies in front of it, its pixel is valid, and the photo differs by less than `color`
-    (CIELAB) from the point's colour there or at a pixel beside it. What is hidden behind a surface that the view does
-    not measure still counts where both have one colour.
+    camera, depth, frame: of this view; seen: the points that it sees by its depth; colours: the photo's transform to
+    the colours of the points, if any. A point counts when nothing that the view sees, or may see, lies in front of it,
+    its pixel is valid, and the photo differs by less than `color` (CIELAB) from the point's colour there or at a pixel
+    beside it. What is hidden behind a surface that the view does not measure still counts where both have one colour.
     """
     rows, column, row, z = pixels_in_view(points.points, camera)
     unknown = depth_at(depth, column, row, camera.width, camera.height) <= 0
@@ -41,7 +59,7 @@ def visible_by_color(
     if not asked.any():
         return seen
     rows, column, row, z = rows[asked], column[asked], row[asked], z[asked]
-    shown = _differences(decode_rgb(frame), column, row, points.colors[rows]) < color
+    shown = _differences(scene_rgb(frame, *colours), column, row, points.colors[rows]) < color
     found = np.concatenate([seen.point_index, rows[shown]])
     order = np.argsort(found, kind="stable")
     pixel = (row * camera.width + column)[shown].astype(np.int32)

@@ -92,7 +92,7 @@ def test_photos_of_a_room_in_changing_light_come_to_the_colours_of_the_reference
     gains = np.random.default_rng(6).uniform(0.55, 1.0, (8, 1)) * np.array([1.0, 0.97, 0.94])
     frames, cameras, depths = captured(gains)
     even, _, _ = captured(np.ones((8, 3)))
-    with pytest.warns(UserWarning, match="change from photo to photo: Gaussians are trained") as told:
+    with pytest.warns(UserWarning, match="change from photo to photo: points and Gaussians") as told:
         found = colours(frames, cameras, depths, SceneUnit(1.0), params=ColourParams())
     assert [t.name for t in found] == list(cameras.names)
     (reference,) = {t.reference for t in found}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ss_flow.errors import InputError
-from ss_flow.tasks.artifacts import DepthMap, SceneUnit
+from ss_flow.tasks.artifacts import ColourTransform, DepthMap, SceneUnit
 from ss_flow.tasks.capture.views import unit
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.split.dense import DenseParams, dense, voxel_side
@@ -25,6 +25,19 @@ def test_dense_points_lie_on_the_surfaces_with_their_colours():
     top = np.abs(cloud.points[:, 2] - 0.7) < 0.004
     assert top.sum() > 50
     np.testing.assert_array_equal(np.median(cloud.colors[top], axis=0), box_scene.COLORS[2])
+
+
+def test_points_have_the_colours_of_the_scene_where_photos_differ():
+    frames, cameras, depths = box_scene.frames(), box_scene.cameras(), box_scene.depths()
+    half = np.concatenate([0.5 * np.eye(3), np.zeros((3, 1))], axis=1)
+    dark = tuple(ColourTransform(frame.name, frames[0].name, half) for frame in frames)
+    same = tuple(ColourTransform(frame.name, "", np.eye(4)[:3]) for frame in frames)
+    given, halved, kept = (
+        dense(frames, cameras, depths, SceneUnit(1.0), looks, params=DenseParams()) for looks in ((), dark, same)
+    )
+    np.testing.assert_array_equal(kept.colors, given.colors)
+    np.testing.assert_array_equal(halved.points, given.points)
+    np.testing.assert_allclose(halved.colors, given.colors / 2, atol=1)
 
 
 def test_points_are_spaced_by_the_voxel():

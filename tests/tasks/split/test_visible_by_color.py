@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame, PointCloud
+from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Frame, PointCloud
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -23,11 +23,11 @@ def looks():
     photo[:, :8], photo[:, 8:] = RED, GREEN
     frame = Frame("a", WIDTH, HEIGHT, encode_png(photo), np.zeros(0, np.uint8), WIDTH, HEIGHT)
 
-    def look(points, colors, depth=None, color=8.0, frame=frame):
+    def look(points, colors, depth=None, color=8.0, frame=frame, colours=()):
         cloud = PointCloud(np.asarray(points, np.float32), np.asarray(colors, np.uint8), 1.0, SPACING)
         known = DepthMap("a", np.zeros((HEIGHT, WIDTH), np.float32) if depth is None else depth, "sensor")
         seen = visibility(cloud, camera, known, params=VisibilityParams())
-        return visible_by_color(cloud, camera, known, frame, seen, color=color)
+        return visible_by_color(cloud, camera, known, frame, seen, colours, color=color)
 
     return look
 
@@ -46,6 +46,13 @@ def test_nearly_its_colour_is_enough(looks):
     other = np.add(RED, [6, 0, 0])
     assert len(looks([LEFT], [other], color=8.0).pixel) == 1
     assert len(looks([LEFT], [other], color=1.0).pixel) == 0
+
+
+def test_a_darker_photo_is_compared_in_the_colours_of_the_scene(looks):
+    brighter = ColourTransform("a", "b", np.concatenate([1.2 * np.eye(3), np.zeros((3, 1))], axis=1))
+    scene = np.multiply(RED, 1.2)
+    assert len(looks([LEFT], [scene]).pixel) == 0
+    assert len(looks([LEFT], [scene], colours=(brighter,)).pixel) == 1
 
 
 def test_one_pixel_beside_its_colour_is_enough(looks):
