@@ -96,6 +96,9 @@ class SplitParams:
 
     segmenter: str = "auto"
     """The network that makes the masks: a name of the catalogue, "auto", or "none" for colour, depth and normals."""
+    noise: NonNegative = 0.65
+    """Standard deviation of a photo's noise from pixel to pixel, of 255 grey values, above which the segmenter sees it
+    smoothed; 0 = never."""
     segment: SegmentParams = field(default_factory=SegmentParams)
     rgbd: SegmentRgbdParams = field(default_factory=SegmentRgbdParams)
     dense_source: Literal["depth", "splatting"] = "depth"

@@ -95,7 +95,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
         embeddings = each(
             capture.frames,
             names=capture.names,
-            build=lambda frame: embed(frame, model=segmenter, turns=capture.turns),
+            build=lambda frame: embed(frame, model=segmenter, turns=capture.turns, noise=params.noise),
         )
     seen = _seen(capture, points, params)
     masks, hinted = _masks(capture, embeddings, points, seen, segmenter, params)

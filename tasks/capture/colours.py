@@ -41,8 +41,8 @@ class ColourParams:
     """How the exposure and white balance of photos are evened out."""
 
     transform: Literal["affine", "none"] = "affine"
-    """What each photo's colours go through before Gaussians are trained on them: "none", as in the paper, or "affine",
-    a 3 x 4 matrix, where photos differ (min_gain)."""
+    """What each photo's colours go through before Split's points get them and Gaussians are trained on them: "none", as
+    in the paper, or "affine", a 3 x 4 matrix, where photos differ (min_gain)."""
     points: Count = 10_000
     """Surface points that are looked up in the photos."""
     prior: Positive = 1e-2

@@ -68,7 +68,7 @@ def scene_rgb(frame: Frame, colours: ColourTransform | None = None) -> UInt8:
     photo = decode_rgb(frame)
     if colours is None or not colours.reference:
         return photo
-    return np.rint(255 * transformed(photo.astype(np.float32) / 255, colours)).clip(0, 255).astype(np.uint8)
+    return np.rint(255 * transformed(photo.astype(np.float32) / np.float32(255), colours)).clip(0, 255).astype(np.uint8)
 
 
 def suffix_of(frame: Frame) -> str:

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ss_flow.running import warn
 from ss_flow.task import Bundle
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Frame, Int32, UInt8
+from ss_flow.tasks.geometry.noise import noise_of, without_noise
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import open_session, run
 from ss_flow.tasks.models.sam_cells import SIDE
@@ -83,21 +85,27 @@ class Sam:
         self._encoder = open_session(model.file("encoder"), inputs=("input",))
         self._decoder = open_decoder(model.file("decoder"), model.names_inside)
 
-    def encode(self, rgb: UInt8, turns: int = 0) -> Embedding:
-        """The embedding of an image [H, W, 3] uint8, turned first by so many quarters counterclockwise."""
+    def encode(self, rgb: UInt8, turns: int = 0, noise: float = 0.0) -> Embedding:
+        """The embedding of an image [H, W, 3] uint8, turned first by so many quarters counterclockwise.
+
+        noise: of 255 grey values; what has more of it is smoothed before; 0: nothing is.
+        """
         import cv2
 
         rgb = np.rot90(rgb, turns)
         height, width = rgb.shape[:2]
         scale = FRAME / max(height, width)
         inner_height, inner_width = round(height * scale), round(width * scale)
-        small = cv2.resize(
-            rgb,
-            (inner_width, inner_height),
-            interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR,
-        )
+        seen = rgb
+        if scale < 1:  # which takes noise away, too
+            seen = cv2.resize(rgb, (inner_width, inner_height), interpolation=cv2.INTER_AREA)
+        if noise and noise_of(seen) > noise:
+            warn("Photos are noisy: the segmenter sees them smoothed. split.noise=0 shows them as they are.")
+            seen = without_noise(seen)
+        if scale >= 1:
+            seen = cv2.resize(seen, (inner_width, inner_height), interpolation=cv2.INTER_LINEAR)
         padded = np.zeros((1, 3, FRAME, FRAME), np.float32)
-        padded[0, :, :inner_height, :inner_width] = ((small - _MEAN) / _DEVIATION).transpose(2, 0, 1)
+        padded[0, :, :inner_height, :inner_width] = ((seen - _MEAN) / _DEVIATION).transpose(2, 0, 1)
         return Embedding(run(self._encoder, {"input": padded})[0], height, width, turns)
 
     def image(self, embedding: Embedding, *, few: bool = False) -> PromptedImage:

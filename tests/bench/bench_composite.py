@@ -3,6 +3,7 @@
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
                                           [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | ...]
                                           [--photos] [--lying] [--shaken MM,DEG [--drift]] [--larger FACTOR]
+                                          [--dark] [--uneven]
                                           [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
@@ -16,7 +17,8 @@ with --shelf, a shelf of goods, with --walk, a table in a garden, with --tote, g
 place instead (`tests/support/generated_*.py`). With --photos, from the photos alone: without depth and poses. With
 --lying, photos lie on their side, as a phone stores them. With --shaken, poses are off by so many millimetres and
 degrees (root mean square), each for itself, or, with --drift, each farther off than the one before. With --larger,
-depth is so many times as large as it should be.
+depth is so many times as large as it should be. With --dark, photos are half as bright, blurred and noisy; with
+--uneven, each has an exposure and a white balance of its own.
 """
 
 from __future__ import annotations
@@ -24,11 +26,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +38,7 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from altered_captures import altered, darken, enlarge, expose_each, lay_down, shake
 from depth_sensor import sensed
 from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
@@ -107,52 +108,6 @@ def other_of(kind: str, seed: int, place: Path) -> Path:
     return folder
 
 
-def altered(capture: Path, name: str, change: Callable[[Path], None]) -> Path:
-    """A copy of a capture, changed where it lies; it is made first where it is not there."""
-    folder = capture.with_name(f"{capture.name}-{name}")
-    if not folder.exists():
-        shutil.copytree(capture, folder)
-        change(folder)
-    return folder
-
-
-def lay_down(folder: Path) -> None:
-    """Turn photos, and all else, on their right side."""
-    for file in (*folder.rglob("*.jpg"), *folder.rglob("*.png")):
-        quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if file.suffix == ".jpg" else []
-        cv2.imwrite(str(file), np.ascontiguousarray(np.rot90(_ids(file), -1)), quality)
-    for file in folder.glob("pose/*.txt"):
-        pose = np.loadtxt(file)
-        pose[:3, :2] = np.column_stack([-pose[:3, 1], pose[:3, 0]])
-        np.savetxt(file, pose)
-    for file in folder.glob("intrinsic/intrinsic_*.txt"):
-        matrix = np.loadtxt(file)
-        (fx, _, cx), (_, fy, cy) = matrix[:2, :3]
-        width = _ids(next((folder / file.stem.removeprefix("intrinsic_")).iterdir())).shape[1]
-        matrix[:2, :3] = (fy, 0, width - 1 - cy), (0, fx, cx)
-        np.savetxt(file, matrix)
-
-
-def shake(folder: Path, off: str, drift: bool) -> None:
-    """Make poses inexact. off: millimetres and degrees, with a comma between them."""
-    metres, angle = np.array([float(number) for number in off.split(",")]) / (1000, 180 / np.pi) / np.sqrt(3)
-    turned, moved, noise = np.eye(3), np.zeros(3), np.random.default_rng(7)
-    for file in sorted(folder.glob("pose/*.txt")):
-        turn, step = cv2.Rodrigues(angle * noise.normal(size=3))[0], metres * noise.normal(size=3)
-        turned, moved = (turn @ turned, moved + step) if drift else (turn, step)
-        pose = np.loadtxt(file)
-        pose[:3, :3] @= turned
-        pose[:3, 3] += moved
-        np.savetxt(file, pose)
-
-
-def enlarge(folder: Path, factor: float) -> None:
-    """Give depth another scale than the poses have."""
-    for file in folder.glob("depth/*.png"):
-        depth = _ids(file)
-        cv2.imwrite(str(file), np.rint(depth * factor).astype(depth.dtype))
-
-
 def outcome(folder: Path, params: Params, store: Store, photos: bool = False) -> Outcome:
     """Run Split on a capture, or on its photos alone, and read what came of it."""
     scene = open_scene(folder / "color" if photos else folder)
@@ -213,6 +168,8 @@ def main() -> None:
     parser.add_argument("--shaken", help="how far poses are off, as in 15,1: millimetres, degrees")
     parser.add_argument("--drift", action="store_true", help="each pose farther than the one before")
     parser.add_argument("--larger", type=float, help="factor on all depth")
+    parser.add_argument("--dark", action="store_true", help="dark, noisy photos")
+    parser.add_argument("--uneven", action="store_true", help="photos of different exposure")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
     args = parser.parse_args()
@@ -228,6 +185,10 @@ def main() -> None:
                 folder = altered(folder, f"{how}-{args.shaken}", lambda copy: shake(copy, args.shaken, args.drift))
             if args.larger:
                 folder = altered(folder, f"larger-{args.larger}", lambda copy: enlarge(copy, args.larger))
+            if args.dark:
+                folder = altered(folder, "dark", darken)
+            if args.uneven:
+                folder = altered(folder, "uneven", expose_each)
             found = outcome(folder, params, Store(Path(kept)), args.photos)
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]

@@ -1,13 +1,14 @@
 """Whether Splat makes the masks of a capture better or worse, object by object.
 
     python tests/bench/bench_masks.py CAPTURE [--labels PATH] [--preset fast] [--set STEP.PARAM=VALUE] [--store DIR]
-                                      [--split]
+                                      [--split] [--noisy DEVIATION]
 
 Prints, for each object of the labels, the best IoU of any mask with it, mean over the labelled views: of the view's own
 masks (raw), then of the instances' after Split, after refinement, and in the end; and the most that a view loses from
 Split to the end. Labels are one-channel PNG files named like the frames, 0 where nothing is said; the capture's
 `instance` folder if not told otherwise. Or one JSON file of polygons: `outlines/hololens_office.json` was drawn by hand
-on thirteen photos of an office, every second frame of which has all of them. --split stops after Split.
+on thirteen photos of an office, every second frame of which has all of them. --split stops after Split. With --noisy,
+photos get noise of so many grey values, as JPEG of quality 90.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from altered_captures import add_noise, altered
 from outlines import Outlines, read_outlines
 
 from ss_flow.cache.store import Store
@@ -79,12 +81,15 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--split", action="store_true", help="stop after Split")
+    parser.add_argument("--noisy", type=float, help="noise that photos get, of 255 grey values")
     args = parser.parse_args()
     outlines = read_outlines(args.labels or args.capture / "instance")
     params = settings.apply(settings.preset(Params(), args.preset), args.set)
     with tempfile.TemporaryDirectory() as temporary:
-        asked = STAGES[:2] if args.split else STAGES
-        stages = masks_of(args.capture, params, Store(args.store or Path(temporary)), asked)
+        asked, place, capture = STAGES[:2] if args.split else STAGES, args.store or Path(temporary), args.capture
+        if args.noisy:
+            capture = altered(capture, f"noisy-{args.noisy:g}", lambda copy: add_noise(copy, args.noisy), place)
+        stages = masks_of(capture, params, Store(place), asked)
         table = by_object(stages, outlines)
     columns = ("object", "views", *("raw", "Split", "refined", "final")[: len(asked)], "worst view")
     print(f"| {' | '.join(columns)} |\n" + "|---" * len(columns) + "|")

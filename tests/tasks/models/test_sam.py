@@ -1,5 +1,6 @@
 """Segment Anything: needs the small network's weights beside the project."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from published_sam import published
 
 from ss_flow.errors import InputError
 from ss_flow.task import FileRef
+from ss_flow.tasks.geometry.noise import without_noise
 from ss_flow.tasks.models.catalogue import ModelFile, find
 from ss_flow.tasks.models.sam import LOW, Embedding, Sam
 
@@ -47,6 +49,22 @@ def test_prompt_on_a_disk_gives_the_disk(encoded):
     assert mask.shape == (150, 200)
     assert iou(mask, disk_image()[1]) > 0.9
     assert 0.8 < score < 1.1
+
+
+@needs_weights
+def test_a_noisy_image_is_seen_smoothed_where_that_is_asked_for(encoded):
+    sam, embedding = encoded
+    rgb, disk = disk_image()
+    rough = np.clip(rgb + np.random.default_rng(0).normal(0, 25, rgb.shape), 0, 255).astype(np.uint8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        as_it_is = sam.encode(rough)
+        np.testing.assert_array_equal(sam.encode(rgb, noise=1.0).features, embedding.features)
+    with pytest.warns(UserWarning, match="Photos are noisy"):
+        smoothed = sam.encode(rough, noise=1.0)
+    np.testing.assert_array_equal(smoothed.features, sam.encode(without_noise(rough)).features)
+    assert np.abs(smoothed.features - as_it_is.features).max() > 0.1
+    assert iou(sam.image(smoothed).predict_prompt(np.array([[60.0, 70.0]]))[0], disk) > 0.9
 
 
 @needs_weights

@@ -39,7 +39,7 @@ class ScriptedSam(sam_module.Sam):
     def __init__(self, model):
         pass
 
-    def encode(self, rgb, turns=0):
+    def encode(self, rgb, turns=0, noise=0.0):
         type(self).prompts = []
         return sam_module.Embedding(np.zeros((1, 256, 64, 64), np.float32), *np.rot90(rgb, turns).shape[:2], turns)
 

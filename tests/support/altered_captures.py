@@ -1,0 +1,92 @@
+"""Copies of captures that are worse than they were, in the ways in which captures are."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+
+def altered(capture: Path, name: str, change: Callable[[Path], None], place: Path | None = None) -> Path:
+    """A copy of a capture, changed where it lies: in a place, or beside the capture; made first if it is not there."""
+    folder = (place or capture.parent) / f"{capture.name}-{name}"
+    if not folder.exists():
+        shutil.copytree(capture, folder)
+        change(folder)
+    return folder
+
+
+def lay_down(folder: Path) -> None:
+    """Turn photos, and all else, on their right side."""
+    for file in (*folder.rglob("*.jpg"), *folder.rglob("*.png")):
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if file.suffix == ".jpg" else []
+        cv2.imwrite(str(file), np.ascontiguousarray(np.rot90(_read(file), -1)), quality)
+    for file in folder.glob("pose/*.txt"):
+        pose = np.loadtxt(file)
+        pose[:3, :2] = np.column_stack([-pose[:3, 1], pose[:3, 0]])
+        np.savetxt(file, pose)
+    for file in folder.glob("intrinsic/intrinsic_*.txt"):
+        matrix = np.loadtxt(file)
+        (fx, _, cx), (_, fy, cy) = matrix[:2, :3]
+        width = _read(next((folder / file.stem.removeprefix("intrinsic_")).iterdir())).shape[1]
+        matrix[:2, :3] = (fy, 0, width - 1 - cy), (0, fx, cx)
+        np.savetxt(file, matrix)
+
+
+def shake(folder: Path, off: str, drift: bool) -> None:
+    """Make poses inexact. off: millimetres and degrees, with a comma between them."""
+    metres, angle = np.array([float(number) for number in off.split(",")]) / (1000, 180 / np.pi) / np.sqrt(3)
+    turned, moved, noise = np.eye(3), np.zeros(3), np.random.default_rng(7)
+    for file in sorted(folder.glob("pose/*.txt")):
+        turn, step = cv2.Rodrigues(angle * noise.normal(size=3))[0], metres * noise.normal(size=3)
+        turned, moved = (turn @ turned, moved + step) if drift else (turn, step)
+        pose = np.loadtxt(file)
+        pose[:3, :3] @= turned
+        pose[:3, 3] += moved
+        np.savetxt(file, pose)
+
+
+def enlarge(folder: Path, factor: float) -> None:
+    """Give depth another scale than the poses have."""
+    for file in folder.glob("depth/*.png"):
+        depth = _read(file)
+        cv2.imwrite(str(file), np.rint(depth * factor).astype(depth.dtype))
+
+
+def darken(folder: Path) -> None:
+    """Photos half as bright, blurred by a pixel, with noise of 8 grey values, as JPEG of quality 85."""
+    noise = np.random.default_rng(3)
+
+    def change(photo: np.ndarray) -> np.ndarray:
+        return 0.5 * cv2.GaussianBlur(photo, (0, 0), 1.0) + noise.normal(0, 8, photo.shape)
+
+    _change_photos(folder, change, 85)
+
+
+def add_noise(folder: Path, deviation: float) -> None:
+    """Photos with noise of so many grey values, as JPEG of quality 90."""
+    noise = np.random.default_rng(5)
+    _change_photos(folder, lambda photo: photo + noise.normal(0, deviation, photo.shape), 90)
+
+
+def expose_each(folder: Path) -> None:
+    """Each photo at an exposure (a quarter more or less, in general) and a white balance (6 %) of its own."""
+    noise = np.random.default_rng(3)
+
+    def change(photo: np.ndarray) -> np.ndarray:
+        return photo * np.exp(noise.normal(0, 0.25)) * np.exp(noise.normal(0, 0.06, 3))
+
+    _change_photos(folder, change, 95)
+
+
+def _change_photos(folder: Path, change: Callable[[np.ndarray], np.ndarray], quality: int) -> None:
+    for file in sorted(file for place in ("color", "images") for file in (folder / place).glob("*.jpg")):
+        photo = change(_read(file).astype(np.float32))
+        cv2.imwrite(str(file), np.clip(photo, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def _read(path: Path) -> np.ndarray:
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
