@@ -71,8 +71,7 @@ def dense(
             yield view
 
     def sums(view: int) -> VoxelSums:
-        look = colours[view] if colours else None
-        return sum_by_voxel([depth_samples(frames[view], cameras, view, depths[view], look)], voxel)
+        return sum_by_voxel([depth_samples(frames[view], cameras, view, depths[view], colours)], voxel)
 
     summed = sum_by_voxel(in_threads(sums, views()), voxel)
     cloud = consistent_cloud(summed, cameras, depths, voxel=voxel, unit=unit, params=params)
@@ -155,7 +154,7 @@ def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
 
 
 def depth_samples(
-    frame: Frame, cameras: Cameras, view: int, depth: DepthMap, colours: ColourTransform | None
+    frame: Frame, cameras: Cameras, view: int, depth: DepthMap, colours: tuple[ColourTransform, ...]
 ) -> VoxelSums:
     """The known depth pixels of one view as points with the colours of its photo, or those of the scene there, in cubes
     of a pixel's size at least.
@@ -167,6 +166,7 @@ def depth_samples(
     known = ((depth.depth > 0) & resampled(decode_valid(frame), height, width)).ravel()
     camera = camera_of(cameras, view).scaled(width, height)
     points = backproject(depth.depth, camera)[known]
-    colors = resampled(scene_rgb(frame, colours), height, width).reshape(-1, 3)[known].astype(np.float64)
+    photo = scene_rgb(frame, *colours[view : view + 1])  # as it is where there are none
+    colors = resampled(photo, height, width).reshape(-1, 3)[known].astype(np.float64)
     sides = depth.depth.ravel()[known].astype(np.float64) / camera.fx
     return VoxelSums(points, colors, np.ones(len(points)), sides)

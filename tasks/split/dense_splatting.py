@@ -80,8 +80,8 @@ def dense_splatting(
     known = depths if any(depth.depth.any() for depth in depths) else seeds
     voxel = voxel_side(cameras, known, unit, params)
     samples = (
-        sum_by_voxel([depth_samples(frames[view], cameras, view, seed, colours[view] if colours else None)], voxel)
-        for view, seed in enumerate(seeds)
+        sum_by_voxel([depth_samples(frame, cameras, view, seed, colours)], voxel)
+        for view, (frame, seed) in enumerate(zip(frames, seeds, strict=True))
     )
     initial = _first_gaussians(sum_by_voxel(samples, voxel), voxel, splatting.initial_points)
     seen = SceneViews(frames, cameras_by_view(cameras), depths, unit, colours, VisibilityParams())

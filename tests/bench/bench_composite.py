@@ -34,11 +34,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
-from altered_captures import altered, darken, enlarge, expose_each, lay_down, shake
+from altered_captures import altered, darken, enlarge, expose_each, lay_down, read_image, shake
 from depth_sensor import sensed
 from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
@@ -120,7 +119,7 @@ def outcome(folder: Path, params: Params, store: Store, photos: bool = False) ->
     values: dict[str, Any] = run_flow(build, store, scene=prepared.name, header={}).values
     seconds = time.perf_counter() - begun
     frames, predicted = (tuple(store.get(digest) for digest in values[name]) for name in STEPS)
-    truth = tuple(LabelMap(frame.name, _ids(folder / "instance" / f"{frame.name}.png")) for frame in frames)
+    truth = tuple(LabelMap(frame.name, read_image(folder / "instance" / f"{frame.name}.png")) for frame in frames)
     return Outcome(frames, truth, predicted, seconds)
 
 
@@ -140,17 +139,13 @@ def look(found: Outcome, folder: Path, place: Path) -> None:
     colors[0] = 0
     rows = []
     for i in [i for i in range(len(found.frames)) if i % 4 < 2]:
-        parts = _ids(folder / "part" / f"{found.frames[i].name}.png")
+        parts = read_image(folder / "part" / f"{found.frames[i].name}.png")
         truth = colors[found.truth[i].ids] * (1 - 0.12 * (parts % 6))[..., None]
         row = [decode_rgb(found.frames[i]), truth.astype(np.uint8), colors[found.predicted[i].ids]]
         rows.append(np.hstack(row))
     for page in range(0, len(rows), 4):
         path = place / f"{folder.name}-{page // 4}.png"
         path.write_bytes(encode_png(np.vstack(rows[page : page + 4])).tobytes())
-
-
-def _ids(path: Path) -> np.ndarray:
-    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
 
 
 def main() -> None:

@@ -86,7 +86,8 @@ def main() -> None:
     outlines = read_outlines(args.labels or args.capture / "instance")
     params = settings.apply(settings.preset(Params(), args.preset), args.set)
     with tempfile.TemporaryDirectory() as temporary:
-        asked, place, capture = STAGES[:2] if args.split else STAGES, args.store or Path(temporary), args.capture
+        asked = STAGES[:2] if args.split else STAGES
+        place, capture = args.store or Path(temporary), args.capture
         if args.noisy:
             capture = altered(capture, f"noisy-{args.noisy:g}", lambda copy: add_noise(copy, args.noisy), place)
         stages = masks_of(capture, params, Store(place), asked)

@@ -23,7 +23,7 @@ def lay_down(folder: Path) -> None:
     """Turn photos, and all else, on their right side."""
     for file in (*folder.rglob("*.jpg"), *folder.rglob("*.png")):
         quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if file.suffix == ".jpg" else []
-        cv2.imwrite(str(file), np.ascontiguousarray(np.rot90(_read(file), -1)), quality)
+        cv2.imwrite(str(file), np.ascontiguousarray(np.rot90(read_image(file), -1)), quality)
     for file in folder.glob("pose/*.txt"):
         pose = np.loadtxt(file)
         pose[:3, :2] = np.column_stack([-pose[:3, 1], pose[:3, 0]])
@@ -31,7 +31,7 @@ def lay_down(folder: Path) -> None:
     for file in folder.glob("intrinsic/intrinsic_*.txt"):
         matrix = np.loadtxt(file)
         (fx, _, cx), (_, fy, cy) = matrix[:2, :3]
-        width = _read(next((folder / file.stem.removeprefix("intrinsic_")).iterdir())).shape[1]
+        width = read_image(next((folder / file.stem.removeprefix("intrinsic_")).iterdir())).shape[1]
         matrix[:2, :3] = (fy, 0, width - 1 - cy), (0, fx, cx)
         np.savetxt(file, matrix)
 
@@ -52,7 +52,7 @@ def shake(folder: Path, off: str, drift: bool) -> None:
 def enlarge(folder: Path, factor: float) -> None:
     """Give depth another scale than the poses have."""
     for file in folder.glob("depth/*.png"):
-        depth = _read(file)
+        depth = read_image(file)
         cv2.imwrite(str(file), np.rint(depth * factor).astype(depth.dtype))
 
 
@@ -84,9 +84,10 @@ def expose_each(folder: Path) -> None:
 
 def _change_photos(folder: Path, change: Callable[[np.ndarray], np.ndarray], quality: int) -> None:
     for file in sorted(file for place in ("color", "images") for file in (folder / place).glob("*.jpg")):
-        photo = change(_read(file).astype(np.float32))
+        photo = change(read_image(file).astype(np.float32))
         cv2.imwrite(str(file), np.clip(photo, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
-def _read(path: Path) -> np.ndarray:
+def read_image(path: Path) -> np.ndarray:
+    """An image as its file has it, of any depth."""
     return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
