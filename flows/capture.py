@@ -18,7 +18,7 @@ from ss_flow.flows.depths import (
     without_sensor,
 )
 from ss_flow.flows.params import CaptureParams
-from ss_flow.flows.poses import fitting_poses, poses, poses_by_depth, refined_poses
+from ss_flow.flows.poses import fitting_cameras, poses, poses_by_depth, refined_poses
 from ss_flow.graph import expand, pick
 from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import (
@@ -196,7 +196,8 @@ def _placed(
     if params.refine_poses == "always":
         cameras = refined_poses(frames, cameras, sensed, params)
     elif compares_poses(scene, params) and has_pycolmap():
-        cameras = fitting_poses(frames, cameras, sensed, params)
+        told = any(not lens.pinhole for lens in scene.lenses or ())
+        frames, cameras, sensed = fitting_cameras(frames, cameras, sensed, params, "focal" if told else "all")
     return frames, cameras, sensed
 
 

@@ -64,7 +64,8 @@ class CaptureParams:
     "auto" where it is clearly better. Both multiply it by the factor by which it clearly fits the poses."""
     refine_poses: Literal["auto", "always", "never"] = "auto"
     """Whether poses that come with the capture are first refined by bundle adjustment; "auto" does so where photos do
-    not fit the given ones, and uses what it finds where photos then fit better and measured depth no worse."""
+    not fit the given ones, and uses what it finds where photos then fit better and measured depth no worse; where
+    another lens makes them fit, it takes that instead."""
     turns: QuarterTurns | None = None
     """Quarter turns, counterclockwise, by which the segmenter and the encoder see the photos turned, since they know
     things as they stand, and the report shows them; none = photos that lie on their side by the given poses stand

@@ -13,9 +13,10 @@ from ss_flow.tasks.capture.depth_poses import placed_by_depth
 from ss_flow.tasks.capture.features import Features, features
 from ss_flow.tasks.capture.matches import Matches, match
 from ss_flow.tasks.capture.pairs import Look, look, partners
-from ss_flow.tasks.capture.pose_fit import PoseFit, PosePairs, better_poses, pose_fit, pose_pairs
+from ss_flow.tasks.capture.pose_fit import FreeLens, PoseFit, PosePairs, better_poses, pose_fit, pose_pairs, with_lens
 from ss_flow.tasks.capture.refine_poses import refined_cameras
-from ss_flow.tasks.capture.sfm import SfmParams, Unregistered, accepted, sfm, unregistered
+from ss_flow.tasks.capture.registration import straightened
+from ss_flow.tasks.capture.sfm import SfmParams, Unregistered, accepted, registered, sfm, unregistered
 
 
 def poses(frames: tuple[Frame, ...], params: SfmParams, names: tuple[str, ...] | None) -> Cameras:
@@ -70,41 +71,55 @@ def refined_poses(
     )
 
 
-def fitting_poses(
-    frames: tuple[Frame, ...], cameras: Cameras, depths: tuple[DepthMap, ...] | None, params: CaptureParams
-) -> Cameras:
-    """Add the nodes that look at a few pairs of photos, at more where these leave a doubt, and refine the given poses
-    where these do not fit them.
+def fitting_cameras(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...] | None,
+    params: CaptureParams,
+    lens: FreeLens,
+) -> tuple[tuple[Frame, ...], Cameras, tuple[DepthMap, ...] | None]:
+    """Add the nodes that look at a few pairs of photos, at more where these leave a doubt, and where the given cameras
+    do not fit them, find another lens, or else refine the poses.
 
-    depths: what a sensor measured, if one did; it has a say in which poses are better.
+    depths: what a sensor measured, if one did; it has a say in which cameras are better. lens: what of the lens may
+    be wrong. Returns frames and depths, without a distortion that was found, and the cameras.
     """
-
     looks = pose_pairs(cameras)
 
-    def look(place: int, count: int) -> Cameras:
-        return expand(looks[place], lambda chosen: compare(chosen, place, count))
-
-    def compare(chosen: PosePairs, place: int, count: int) -> Cameras:
+    def seen_in(chosen: PosePairs) -> tuple[tuple[Features, ...], tuple[Matches, ...], tuple[DepthMap, ...]]:
         rows = chosen.view.tolist()
         photos = each(pick(frames, rows), build=lambda frame: features(frame, params=params.sfm.features))
         matches = gather([match(photos[a], pick(photos, [b])) for a, b in chosen.pair.tolist()])
-        known = gather([]) if depths is None else pick(depths, rows)
-        before = pose_fit(cameras, looks[place], photos, matches, known)
+        return photos, matches, gather([]) if depths is None else pick(depths, rows)
 
-        def decide(fit: PoseFit) -> Cameras:
-            if params.pose_fit.certain(fit):
-                return cameras
-            if place + 1 < count:
-                return look(place + 1, count)
-            if not fit.distance > params.pose_fit.least_distance:
-                return cameras
-            refined = refined_poses(frames, cameras, depths, params)
-            after = pose_fit(refined, looks[place], photos, matches, known)
-            return better_poses(cameras, refined, before, after, params=params.pose_fit)
+    def look(place: int, count: int) -> PoseFit:
+        fit = expand(
+            looks[place], lambda c: pose_fit(cameras, looks[place], *seen_in(c), lens=lens, params=params.pose_fit)
+        )
 
-        return expand(before, decide)
+        def decide(found: PoseFit) -> PoseFit:
+            return fit if params.pose_fit.certain(found) or place + 1 == count else look(place + 1, count)
 
-    return expand(cast(Any, looks), lambda count: look(0, count))
+        return expand(fit, decide)
+
+    def better(found: PoseFit) -> Cameras:
+        if found.other_lens:
+            return with_lens(cameras, fit)
+        if not found.distance > params.pose_fit.least_distance:
+            return cameras
+        refined = refined_poses(frames, cameras, depths, params)
+        last = expand(cast(Any, looks), lambda count: looks[count - 1])
+        after = expand(last, lambda chosen: pose_fit(refined, last, *seen_in(chosen)))
+        return better_poses(cameras, refined, fit, after, params=params.pose_fit)
+
+    fit = expand(cast(Any, looks), lambda count: look(0, count))
+    found = expand(fit, better)
+    straight = expand(fit, lambda one: registered(frames, found) if one.radial else frames)
+    if depths is None:
+        return straight, found, None
+    as_photos = params.registration.in_use(advise=False)
+    sensed = expand(fit, lambda one: straightened(straight, found, depths, params=as_photos) if one.radial else depths)
+    return straight, found, sensed
 
 
 def compared(

@@ -29,6 +29,9 @@ LEADS_TO = {
     "agree": "depth",
     "gaps": "depth",
     "sized": "depth",
+    "sensor_depth": "depth",
+    "sens_depth": "depth",
+    "straightened": "depth",
     "depth_scale": "depth",
     "rescaled": "depth",
     "completed": "depth",
@@ -39,7 +42,9 @@ LEADS_TO = {
     "rendered": "describe",
 }
 """Steps of which only other results tell what nodes there are: the result that all of these lead to."""
-LEADS_TO_CAMERAS = frozenset({"features", "look", "match", "partners", "pose_fit", "refined_cameras", "better_poses"})
+LEADS_TO_CAMERAS = frozenset(
+    {"features", "look", "match", "partners", "pose_fit", "with_lens", "refined_cameras", "better_poses"}
+)
 """The same of steps that in some captures are known beforehand."""
 
 

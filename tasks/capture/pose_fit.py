@@ -7,15 +7,18 @@ right poses, and depth that a sensor measured in one view is met in the other.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Int32
+from ss_flow.tasks.capture.epipolar import fundamental_matrix, sampson_distance
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.lens import found_lens, undistorted
+from ss_flow.tasks.capture.lens_fit import LEAST_PAIRS, CommonPoints, epipolar_distance, other_lens, with_focal
 from ss_flow.tasks.capture.matches import MAX_ERROR, Matches
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
@@ -25,8 +28,10 @@ _FEW_PAIRS, _MOST_PAIRS = 4, 12
 these leave a doubt."""
 _CLEAR = 0.5
 """Few pairs leave none below this share of the distance from which poses are refined."""
-_LEAST_PAIRS, _LEAST_MATCHES = 3, 15
-"""With fewer pairs, of fewer matches each, photos tell nothing about poses."""
+_DOUBTFUL_GAIN = 0.1
+"""Nor where another lens would take away such a share of what is off; of a right lens that is a hundredth."""
+_LEAST_MATCHES = 15
+"""A pair of fewer matches tells nothing about poses."""
 _OCCLUDED = 0.25
 """Relative difference of depth beyond which something else stands in front."""
 _NEAR = 3
@@ -34,6 +39,10 @@ _NEAR = 3
 of that distance where refining succeeds, and forty times where photos and poses are of two captures in one."""
 _NOT_WORSE = 1.05
 """Depth that fits so much less well after refining is within the noise of the sample."""
+
+
+FreeLens = Literal["focal", "all"]
+"""What of a stated lens may be wrong: focal lengths; or also that lines are straight, where it says no more."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +53,11 @@ class PoseFitParams:
     """Matched points lie so far from their epipolar lines, as a share of the photo's longer side (median), before poses
     are refined; under exact poses and under COLMAP's it is a third of that."""
     gain: Fraction = 0.25
-    """Share of this distance that refined poses must take away to be used."""
+    """Share of this distance that refined poses, or another lens, must take away to be used."""
 
     def certain(self, fit: PoseFit) -> bool:
-        """Whether poses fit beyond doubt, so that no more pairs need to be looked at."""
-        return fit.distance <= _CLEAR * self.least_distance
+        """Whether poses and lens fit beyond doubt, so that no more pairs need to be looked at."""
+        return fit.distance <= _CLEAR * self.least_distance and fit.lens_gain < _DOUBTFUL_GAIN
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,21 @@ class PoseFit:
     """Of matched points from their epipolar lines (Sampson's), as a share of the photo's longer side: the median of the
     pairs' medians."""
     depth: float
-    """The same of the relative difference between one view's depth, carried into the other, and the depth there."""
+    """The same of the relative difference between one view's depth, carried into the other, and the depth there; under
+    the given lens."""
+    focal: float = 1.0
+    """A factor on the focal lengths of the capture, ..."""
+    radial: float = 0.0
+    """... and the first radial distortion coefficient of its photos, with which `distance` is so; ..."""
+    as_given: float = np.nan
+    """... and the distance without them; nan where no other lens is needed."""
+    lens_gain: float = 0.0
+    """The share of what is off under the given lens that the best one takes away (`OtherLens.gain`)."""
+
+    @property
+    def other_lens(self) -> bool:
+        """Whether another lens than the given one fits."""
+        return bool(np.isfinite(self.as_given))
 
 
 @task(name="capture.pose_pairs")
@@ -97,27 +120,64 @@ def pose_fit(
     photos: Sequence[Features],
     matches: Sequence[Matches],
     depths: Sequence[DepthMap],
+    *,
+    lens: FreeLens | None = None,
+    params: PoseFitParams = PoseFitParams(),
 ) -> PoseFit:
-    """How well poses fit their photos and depth, in the pairs.
+    """How well poses fit their photos and depth, in the pairs; where photos fit beyond doubt, and clearly better, under
+    another lens than the given one, how they fit under that.
 
+    Depth has no say in the lens: from view to near view it differs less by a wrong one than by a sensor's noise.
     photos, depths: of the views of `pairs`; no depths where no sensor measured any. matches: one for each pair, of its
-    first photo with its second.
+    first photo with its second. lens: what of the lens may be wrong, if anything.
     """
-    distances, differences = [], []
+    common = list(_common_points(pairs, photos, matches))
+    given = PoseFit(epipolar_distance(cameras, common), _depth_difference(cameras, pairs, depths))
+    if lens is None or not np.isfinite(given.distance):
+        return given
+    best = other_lens(cameras, common)
+    given = replace(given, lens_gain=best.gain)
+    fits = best.distance <= min(_CLEAR * params.least_distance, (1 - params.gain) * given.distance)
+    if not fits or (best.radial and lens == "focal"):
+        return given
+    return replace(given, distance=best.distance, focal=best.focal, radial=best.radial, as_given=given.distance)
+
+
+def _common_points(pairs: PosePairs, photos: Sequence[Features], matches: Sequence[Matches]) -> Iterator[CommonPoints]:
+    """Those of the pairs that have enough of them. Arguments as of `pose_fit`."""
     for (a, b), found in zip(pairs.pair.tolist(), matches, strict=True):
-        views = int(pairs.view[a]), int(pairs.view[b])
         if len(found.pair) >= _LEAST_MATCHES:
-            first, second = photos[a], photos[b]
-            points = first.points[found.pair[:, 0]], second.points[found.pair[:, 1]]
-            off = sampson_distance(_fundamental(cameras, *views), *points)
-            distances.append(np.median(off) / max(first.width, first.height))
-        if len(depths):
-            differences.append(_depth_difference(cameras, views, (depths[a], depths[b])))
-    known = [d for d in differences if np.isfinite(d)]
-    return PoseFit(
-        float(np.median(distances)) if len(distances) >= _LEAST_PAIRS else np.nan,
-        float(np.median(known)) if len(known) >= _LEAST_PAIRS else np.nan,
+            first, second = photos[a].points[found.pair[:, 0]], photos[b].points[found.pair[:, 1]]
+            views = int(pairs.view[a]), int(pairs.view[b])
+            yield CommonPoints(views, (first.astype(np.float64), second.astype(np.float64)))
+
+
+def _depth_difference(cameras: Cameras, pairs: PosePairs, depths: Sequence[DepthMap]) -> float:
+    """The median of the pairs' medians of the relative difference between the first view's depth, carried into the
+    second, and what was measured there; nan of too few pairs that tell it."""
+    known = []
+    for a, b in pairs.pair.tolist() if len(depths) else ():
+        first, second = depths[a].depth, depths[b].depth
+        sized = camera_of(cameras, int(pairs.view[a])).scaled(*first.shape[::-1])
+        other = camera_of(cameras, int(pairs.view[b])).scaled(*second.shape[::-1])
+        off = depth_differences(backproject(first, sized)[first.ravel() > 0], other, second)
+        if len(off):
+            known.append(np.median(off))
+    return float(np.median(known)) if len(known) >= LEAST_PAIRS else np.nan
+
+
+@task(name="capture.with_lens")
+def with_lens(cameras: Cameras, fit: PoseFit) -> Cameras:
+    """The cameras with the lens that fits; says so. `registered` then takes out its distortion."""
+    straight = f" and photos straightened by a first radial coefficient of {fit.radial:.3g}" if fit.radial else ""
+    warn(
+        "The lens that came with this capture does not fit its photos, so another is used: with focal lengths "
+        f"{fit.focal:.3f} times as long{straight}, matched points lie {1000 * fit.distance:.2f} instead of "
+        f"{1000 * fit.as_given:.2f} thousandths of the photo's longer side off their epipolar lines (medians). "
+        "capture.refine_poses=never keeps the given one."
     )
+    changed = with_focal(cameras, fit.focal)
+    return replace(changed, radial=np.full(len(cameras), fit.radial)) if fit.radial else changed
 
 
 @task(name="capture.better_poses")
@@ -185,41 +245,9 @@ def pairs_that_fit(
             if own.name not in points or other not in points:
                 continue
             pair = own.pairs_with(i)
-            fundamental = _fundamental(cameras, rows[own.name], rows[other])
+            fundamental = fundamental_matrix(cameras, rows[own.name], rows[other])
             off = sampson_distance(fundamental, points[own.name][pair[:, 0]], points[other][pair[:, 1]])
             yield own.name, other, pair, off < MAX_ERROR
-
-
-def sampson_distance(fundamental: Float64, first: np.ndarray, second: np.ndarray) -> Float64:
-    """[N] how far, in pixels, matched points lie from their epipolar lines (Hartley and Zisserman, Eq. 11.9, its root).
-
-    fundamental: [3, 3] F in x_second^T F x_first = 0. first, second: [N, 2] pixels.
-    """
-    a, b = (np.column_stack([points, np.ones(len(points))]).astype(np.float64) for points in (first, second))
-    lines_b, lines_a = a @ fundamental.T, b @ fundamental
-    slope = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
-    return np.asarray(np.abs((b * lines_b).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-300)))
-
-
-def _fundamental(cameras: Cameras, first: int, second: int) -> Float64:
-    """[3, 3] of two views, from their poses and lenses (Hartley and Zisserman, Sec. 9.6.1)."""
-
-    def lens(view: int) -> Float64:
-        fx, fy, cx, cy = cameras.intrinsics[view]
-        return np.linalg.inv(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64))
-
-    relative = cameras.world_to_camera[second] @ np.linalg.inv(cameras.world_to_camera[first])
-    x, y, z = relative[:3, 3]
-    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(lens(second).T @ across @ relative[:3, :3] @ lens(first))
-
-
-def _depth_difference(cameras: Cameras, views: tuple[int, int], depths: tuple[DepthMap, DepthMap]) -> float:
-    """The median relative difference between the first view's depth in the second and what was measured there."""
-    (first, second) = (depth.depth for depth in depths)
-    points = backproject(first, camera_of(cameras, views[0]).scaled(*first.shape[::-1]))[first.ravel() > 0]
-    off = depth_differences(points, camera_of(cameras, views[1]).scaled(*second.shape[::-1]), second)
-    return float(np.median(off)) if len(off) else np.nan
 
 
 def depth_differences(points: Float64, camera: Camera, measured: Float32, factor: float = 1.0) -> Float64:

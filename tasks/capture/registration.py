@@ -16,6 +16,7 @@ import numpy as np
 from ss_flow.running import in_threads, warn
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float32, Float64, Frame, Registration
+from ss_flow.tasks.capture.lens import found_lens, undistortion_map
 from ss_flow.tasks.geometry.holes import close_holes
 from ss_flow.tasks.geometry.images import decode_rgb, resampled, size_within
 from ss_flow.tasks.ranges import Count, Fraction
@@ -34,6 +35,8 @@ _BLIND = 4
 _APART = 3.0
 """How far apart, at the photo's border, two halves of the views may place the depth and still mean the same."""
 _IDENTITY = (1.0, 0.0, 0.0)
+_CLEARLY = 1.02
+"""So much better edges fit where depth is bent or straight as it should be; it is a tenth where outlines are many."""
 
 Placing = tuple[float, float, float]
 """Scale about the principal point, then shift along x and y."""
@@ -88,10 +91,7 @@ def registration(
     finds holds for the other.
     advise: whether to warn where the depth maps had better be scaled and shifted.
     """
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(params.views, len(frames))).round().astype(int))
-    some = ((frames[k], cameras.intrinsics[k], depths[k]) for k in chosen.tolist())
-    looked = in_threads(lambda given: _view(*given, params.jump), some)
-    views = [view for view in looked if len(view.outline) >= _LEAST_OUTLINE]
+    views = _views(frames, cameras, depths, params)
     if len(views) < _LEAST_VIEWS:
         return Registration(1.0, np.zeros(2), 0.0)
     coarse = list(in_threads(_coarse_fits, views))
@@ -147,9 +147,45 @@ def calibrated(
     return tuple(result)
 
 
+@task(name="capture.straightened", resources=Resources(cores=1, most_cores=8))
+def straightened(
+    frames: Sequence[Frame],
+    cameras: Cameras,
+    depths: Sequence[DepthMap],
+    *,
+    params: RegistrationParams = RegistrationParams(),
+) -> tuple[DepthMap, ...]:
+    """Depth beside photos out of which `registered` took a distortion that the capture does not state: straightened
+    too, where its edges fit them clearly better so.
+
+    Some of the programs that lay depth onto photos bend it as these are bent; others know nothing of their lens.
+    """
+    import cv2
+
+    straight = []
+    for row, depth in enumerate(depths):
+        source = undistortion_map(found_lens(cameras, row).scaled(*depth.depth.shape[::-1]))
+        straight.append(replace(depth, depth=cv2.remap(depth.depth, source, None, cv2.INTER_NEAREST)))
+    given, other = (_views(frames, cameras, some, params) for some in (depths, straight))
+    if min(len(given), len(other)) < _LEAST_VIEWS or _fit(other, _IDENTITY) < _CLEARLY * _fit(given, _IDENTITY):
+        return tuple(depths)
+    warn("The depth images were bent as their photos were, and straightened likewise, so that their edges fit.")
+    return tuple(straight)
+
+
 def _said(found: Registration) -> str:
     x, y = found.shift
     return f"scaled by {found.scale:.3f} and shifted by ({x:+.1f}, {y:+.1f}) pixels"
+
+
+def _views(
+    frames: Sequence[Frame], cameras: Cameras, depths: Sequence[DepthMap], params: RegistrationParams
+) -> list[_View]:
+    """Those of some views that have outlines."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(params.views, len(frames))).round().astype(int))
+    some = ((frames[k], cameras.intrinsics[k], depths[k]) for k in chosen.tolist())
+    looked = in_threads(lambda given: _view(*given, params.jump), some)
+    return [view for view in looked if len(view.outline) >= _LEAST_OUTLINE]
 
 
 def _view(frame: Frame, intrinsics: Float64, depth: DepthMap, jump: float) -> _View:

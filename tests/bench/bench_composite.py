@@ -3,7 +3,7 @@
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
                                           [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | ...]
                                           [--photos] [--lying] [--shaken MM,DEG [--drift]] [--larger FACTOR]
-                                          [--dark] [--uneven]
+                                          [--dark] [--uneven] [--bent RADIAL] [--focal FACTOR]
                                           [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
@@ -18,7 +18,8 @@ place instead (`tests/support/generated_*.py`). With --photos, from the photos a
 --lying, photos lie on their side, as a phone stores them. With --shaken, poses are off by so many millimetres and
 degrees (root mean square), each for itself, or, with --drift, each farther off than the one before. With --larger,
 depth is so many times as large as it should be. With --dark, photos are half as bright, blurred and noisy; with
---uneven, each has an exposure and a white balance of its own.
+--uneven, each has an exposure and a white balance of its own. With --bent, photos have a first radial distortion of
+which nothing is said; with --focal, focal lengths are stated so many times as long as they are.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
-from altered_captures import altered, darken, enlarge, expose_each, lay_down, read_image, shake
+from altered_captures import altered, bend, darken, enlarge, expose_each, lay_down, read_image, shake, zoom
 from depth_sensor import sensed
 from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
@@ -77,7 +78,7 @@ OTHERS = {
 }
 COLUMNS = ("whole", "miou", "pq", "over_segmentation", "under_segmentation")
 COUNTS = ("num_predicted", "num_truth")
-STEPS = "ingest", "masks_split"
+STEPS = "ingest", "masks_split", "truth"
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,9 @@ def outcome(folder: Path, params: Params, store: Store, photos: bool = False) ->
     begun = time.perf_counter()
     values: dict[str, Any] = run_flow(build, store, scene=prepared.name, header={}).values
     seconds = time.perf_counter() - begun
-    frames, predicted = (tuple(store.get(digest) for digest in values[name]) for name in STEPS)
+    frames, predicted, *found = (tuple(map(store.get, values[name])) for name in STEPS if name in values)
+    if found:  # in the pixels of the frames, out of which a distortion may have been taken
+        return Outcome(frames, found[0], predicted, seconds)
     truth = tuple(LabelMap(frame.name, read_image(folder / "instance" / f"{frame.name}.png")) for frame in frames)
     return Outcome(frames, truth, predicted, seconds)
 
@@ -165,6 +168,8 @@ def main() -> None:
     parser.add_argument("--larger", type=float, help="factor on all depth")
     parser.add_argument("--dark", action="store_true", help="dark, noisy photos")
     parser.add_argument("--uneven", action="store_true", help="photos of different exposure")
+    parser.add_argument("--bent", type=float, help="first radial distortion coefficient of the photos, not stated")
+    parser.add_argument("--focal", type=float, help="factor on the stated focal lengths")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
     args = parser.parse_args()
@@ -184,6 +189,10 @@ def main() -> None:
                 folder = altered(folder, "dark", darken)
             if args.uneven:
                 folder = altered(folder, "uneven", expose_each)
+            if args.bent:
+                folder = altered(folder, f"bent-{args.bent}", lambda copy: bend(copy, args.bent))
+            if args.focal:
+                folder = altered(folder, f"focal-{args.focal}", lambda copy: zoom(copy, args.focal))
             found = outcome(folder, params, Store(Path(kept)), args.photos)
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from bent_room import straight_places
 
 
 def altered(capture: Path, name: str, change: Callable[[Path], None], place: Path | None = None) -> Path:
@@ -54,6 +55,27 @@ def enlarge(folder: Path, factor: float) -> None:
     for file in folder.glob("depth/*.png"):
         depth = read_image(file)
         cv2.imwrite(str(file), np.rint(depth * factor).astype(depth.dtype))
+
+
+def bend(folder: Path, radial: float) -> None:
+    """Photos, and what is drawn on them, as a lens of such a first radial coefficient shows them; depth stays that of a
+    pinhole."""
+    fx, fy, cx, cy = np.loadtxt(folder / "intrinsic" / "intrinsic_color.txt")[[0, 1, 0, 1], [0, 1, 2, 2]]
+    for place, how in (("color", cv2.INTER_LANCZOS4), ("instance", cv2.INTER_NEAREST), ("part", cv2.INTER_NEAREST)):
+        for file in sorted((folder / place).iterdir()):
+            image = read_image(file)
+            height, width = image.shape[:2]
+            source = straight_places((fx, fy, cx + 0.5, cy + 0.5), width, height, radial).astype(np.float32)
+            quality = [cv2.IMWRITE_JPEG_QUALITY, 95] if file.suffix == ".jpg" else []
+            cv2.imwrite(str(file), cv2.remap(image, source, None, how, borderMode=cv2.BORDER_REPLICATE), quality)
+
+
+def zoom(folder: Path, factor: float) -> None:
+    """State focal lengths so many times as long as they are."""
+    for file in folder.glob("intrinsic/intrinsic_*.txt"):
+        matrix = np.loadtxt(file)
+        matrix[[0, 1], [0, 1]] *= factor
+        np.savetxt(file, matrix)
 
 
 def darken(folder: Path) -> None:

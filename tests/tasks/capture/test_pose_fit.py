@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap
+from ss_flow.tasks.capture.epipolar import sampson_distance
 from ss_flow.tasks.capture.features import features
 from ss_flow.tasks.capture.matches import match
 from ss_flow.tasks.capture.pose_fit import (
@@ -18,7 +19,6 @@ from ss_flow.tasks.capture.pose_fit import (
     matches_that_fit,
     pose_fit,
     pose_pairs,
-    sampson_distance,
 )
 
 EYES = [(x, y, 0.1 * x) for x in (-0.9, -0.3, 0.3, 0.9) for y in (-0.3, 0.3)]
