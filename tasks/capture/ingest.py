@@ -189,12 +189,19 @@ def cameras(
     Raises InputError when that file is damaged.
     """
     row = {name: i for i, name in enumerate(names)}
-    intrinsics = []
+    intrinsics, other_sizes = [], []
     for frame in frames:
         lens = lenses[row[frame.name]]
-        sized = lens if lens.width else lens.scaled(frame.source_width, frame.source_height)
-        scaled = sized.scaled(frame.width, frame.height)
+        size = frame.source_width, frame.source_height
+        if (meant := lens.of_photo(*size)) != size:
+            other_sizes.append("{} x {}, though its intrinsics are of about {:.0f} x {:.0f}".format(*size, *meant))
+        scaled = lens.scaled(*size).scaled(frame.width, frame.height)
         intrinsics.append((scaled.fx, scaled.fy, scaled.cx, scaled.cy))
+    if other_sizes:
+        warn(
+            f"Intrinsics were scaled to their photos, since their principal points show that they are those of photos "
+            f"of another size: {len(other_sizes)} of {len(frames)} views, the first of {other_sizes[0]}."
+        )
     return Cameras(
         names=tuple(f.name for f in frames),
         sizes=np.array([(f.width, f.height) for f in frames], np.int32).reshape(-1, 2),

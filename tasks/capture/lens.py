@@ -10,6 +10,9 @@ from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Frame, UInt
 
 _NOWHERE = -1e4
 """Where a map points for what no photo shows, pixels."""
+_SCALED, _SAME_FACTOR = 1.3, 0.05
+"""A principal point that lies so many times as far from the photo's upper and left borders as its middle does, or as
+much nearer, is that of the photo at another size, where both tell nearly the same factor."""
 _NEWTON_STEPS = 40
 _NEWTON_CLOSE = 1e-6
 """Pixels of the photo."""
@@ -23,7 +26,7 @@ class Lens:
 
     width: int
     height: int
-    """Size of the photo that the intrinsics refer to; 0, 0 when the capture does not say (then the photo's own)."""
+    """Size of the photo that the intrinsics refer to; 0, 0 when the capture does not say (then `of_photo` tells)."""
     fx: float
     fy: float
     cx: float
@@ -40,10 +43,22 @@ class Lens:
         """Whether straight lines stay straight."""
         return not self.fisheye and not any(self.distortion)
 
+    def of_photo(self, width: int, height: int) -> tuple[float, float]:
+        """The size that the intrinsics refer to, for a photo of such a size.
+
+        Where the capture does not say, it is the photo's own; or that of a photo about whose middle the principal point
+        lies, where this one was scaled since, as its distances from the middles of all sides tell.
+        """
+        if self.width:
+            return self.width, self.height
+        x, y = 2 * self.cx / width, 2 * self.cy / height
+        was_scaled = abs(x / y - 1) < _SAME_FACTOR and not 1 / _SCALED < x < _SCALED
+        return (2 * self.cx, 2 * self.cy) if was_scaled else (width, height)
+
     def scaled(self, width: int, height: int) -> Lens:
         """The same lens for an image of another size (pixel borders map to pixel borders)."""
-        sx = width / self.width if self.width else 1.0
-        sy = height / self.height if self.height else 1.0
+        own_width, own_height = self.of_photo(width, height)
+        sx, sy = width / own_width, height / own_height
         focal, center = (self.fx * sx, self.fy * sy), (self.cx * sx, self.cy * sy)
         return Lens(width, height, *focal, *center, self.distortion, self.fisheye, self.turns)
 

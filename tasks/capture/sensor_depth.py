@@ -47,6 +47,7 @@ def depth(
     result = []
     measured = False
     skies: list[str] = []
+    scaled: list[str] = []
     for i, frame in enumerate(frames):
         ref = files[row[frame.name]]
         lens = lenses[row[frame.name]] if lenses else None
@@ -65,10 +66,17 @@ def depth(
             values = _reliable(values, confidence, ref)
         if lens is not None:
             values = np.rot90(values, lens.turns)
+        if depth_lens is not None and (meant := depth_lens.of_photo(*values.shape[::-1])) != values.shape[::-1]:
+            scaled.append("of {1} x {0} instead of about {2:.0f} x {3:.0f}".format(*values.shape, *meant))
         measured = measured or bool((np.isfinite(values) & (values > 0)).any())
         result.append(registered_depth(frame, values, str(ref.path), metric, lens, depth_lens))
         progress(i + 1, len(frames), frame.name)
     _check_known(result, measured, str(files[0].path.parent))
+    if scaled and depth_lens is not None and not depth_lens.width:
+        warn(
+            "The intrinsics of the depth camera were scaled to its images, since its principal point shows that they "
+            f"are of another size: {len(scaled)} of {len(frames)} views, the first {scaled[0]} pixels."
+        )
     if skies:
         warn(
             f"Depth of {_SKY} times what is near in its view counts as unknown, as renderers write such numbers for "
@@ -117,9 +125,9 @@ def registered_depth(
             "its unit (the depth scale) is probably wrong."
         )
     h, w = values.shape
-    color = None if lens is None else lens.scaled(frame.source_width, frame.source_height) if not lens.width else lens
-    if depth_lens is not None and color is not None and not _same_camera(depth_lens, color, w, h):
-        sized = depth_lens if depth_lens.width else Lens(w, h, *_focal_and_center(depth_lens))
+    color = None if lens is None else lens.scaled(frame.source_width, frame.source_height)
+    sized = None if depth_lens is None else depth_lens if depth_lens.width else depth_lens.scaled(w, h)
+    if sized is not None and color is not None and not _same_camera(sized, color, w, h):
         if not (abs(sized.cx / w - 0.5) < 0.25 and abs(sized.cy / h - 0.5) < 0.25):
             raise InputError(
                 f"{where} is {w}x{h} pixels, but its lens has its centre at ({sized.cx:g}, {sized.cy:g}), far from the "

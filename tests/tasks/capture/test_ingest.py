@@ -1,5 +1,6 @@
 """Photos become frames: scaled, without distortion, and with cameras of the same size."""
 
+import shutil
 from dataclasses import replace
 
 import capture_folders as made
@@ -89,3 +90,27 @@ def test_cameras_are_scaled_to_the_frames_and_carry_sparse_points(tmp_path):
     np.testing.assert_allclose(result.intrinsics, [[15, 15, 8, 6]] * 2)
     np.testing.assert_allclose(result.world_to_camera[0], np.linalg.inv(made.pose(1)), atol=1e-9)
     assert result.sparse_points.shape == (2, 3) and result.sizes.tolist() == [[16, 12]] * 2
+
+
+def test_intrinsics_without_a_size_are_scaled_to_photos_that_were_scaled_since(tmp_path):
+    made.scannet(tmp_path)
+    shutil.rmtree(tmp_path / "valid")
+    for name in made.NAMES:
+        made.write(tmp_path / "color" / f"{name}.jpg", made.photo(width=48, height=36))
+    scene = open_scene(tmp_path)
+    given = {"names": scene.names, "lenses": scene.lenses, "poses": scene.poses, "metric": True}
+    with pytest.warns(UserWarning, match=r"3 of 3 views, the first of 48 x 36, though .* of about 32 x 24"):
+        result = cameras(ingested(scene), **given)
+    np.testing.assert_allclose(result.intrinsics, [[45, 45, 24, 18]] * 3)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(0, 0, 30, 30, 20, 15),  # a quarter beside the middle: no other size
+        Lens(0, 0, 30, 30, 24, 12),  # one axis alone
+        Lens(32, 24, 30, 30, 24, 18),  # a size that is stated holds
+    ],
+)
+def test_a_principal_point_beside_the_middle_is_taken_as_it_is(lens):
+    assert lens.of_photo(32, 24) == (32, 24) and lens.scaled(32, 24) == replace(lens, width=32, height=24)

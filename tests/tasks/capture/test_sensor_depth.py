@@ -3,6 +3,7 @@
 import re
 
 import capture_folders as made
+import cv2
 import numpy as np
 import pytest
 from capture_folders import ingested, refs
@@ -76,10 +77,26 @@ def test_registering_moves_pixels_only_where_the_cameras_differ(tmp_path):
 
 def test_the_depth_lens_of_another_size_is_refused(tmp_path):
     made.scannet(tmp_path)
-    made.write(tmp_path / "depth" / "2.png", np.full((24, 32), 1000, np.uint16))
+    matrix = np.loadtxt(tmp_path / "intrinsic" / "intrinsic_depth.txt")
+    matrix[0, 2] *= 2
+    np.savetxt(tmp_path / "intrinsic" / "intrinsic_depth.txt", matrix)
     scene = open_scene(tmp_path)
     with pytest.raises(InputError, match="far from the middle"):
         read_depth(scene, ingested(scene))
+
+
+def test_the_depth_lens_of_scaled_depth_is_scaled_with_it(tmp_path):
+    made.scannet(tmp_path)
+    scene = open_scene(tmp_path)
+    as_it_was = read_depth(scene, ingested(scene))[0].depth
+    stored = cv2.imread(str(tmp_path / "depth" / "2.png"), cv2.IMREAD_UNCHANGED)
+    made.write(tmp_path / "depth" / "2.png", stored.repeat(2, axis=0).repeat(2, axis=1))
+    scene = open_scene(tmp_path)
+    with pytest.warns(
+        UserWarning, match=r"scaled to its images.*: 1 of . views, the first of 32 x 24 instead of about 16 x 12"
+    ):
+        twice = read_depth(scene, ingested(scene))[0].depth
+    np.testing.assert_array_equal(twice, as_it_was.repeat(2, axis=0).repeat(2, axis=1))
 
 
 def test_float_depth_is_in_world_units_and_what_is_not_finite_is_unknown(tmp_path):
