@@ -18,7 +18,7 @@ from ss_flow.flows.depths import (
     without_sensor,
 )
 from ss_flow.flows.params import CaptureParams
-from ss_flow.flows.poses import fitting_cameras, poses, poses_by_depth, refined_poses
+from ss_flow.flows.poses import Placed, fitting_cameras, poses, poses_by_depth, refined_poses, seen_through
 from ss_flow.graph import expand, pick
 from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import (
@@ -42,6 +42,7 @@ from ss_flow.tasks.capture.colours import colours
 from ss_flow.tasks.capture.given_scene import given_scene
 from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
+from ss_flow.tasks.capture.pose_fit import PoseFit
 from ss_flow.tasks.capture.registration import registration
 from ss_flow.tasks.capture.scene_files import NO_POSE, SceneFiles
 from ss_flow.tasks.capture.sfm import registered
@@ -89,6 +90,8 @@ class Capture:
     """The scene that is to be labelled, where one was trained elsewhere."""
     turns: int = 0
     """Quarter turns, counterclockwise, by which networks are to see the photos turned."""
+    fit: PoseFit | None = None
+    """How the cameras that came with it fit its photos, where that is asked."""
 
     @property
     def views(self) -> Views:
@@ -96,14 +99,22 @@ class Capture:
         return Views(self.frames, self.by_view, self.depths, self.unit, self.colours)
 
 
-def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, monodepth: Model | None) -> Capture:
+def capture(
+    scene: SceneFiles,
+    reference: Reference,
+    params: CaptureParams,
+    monodepth: Model | None,
+    fit: PoseFit | None = None,
+) -> Capture:
     """Add the nodes that read a capture.
 
-    reference: turns a path into a file reference (digests are remembered outside the flow).
+    reference: turns a path into a file reference (digests are remembered outside the flow). fit: that of a capture by
+    the same camera, whose lens this one is then seen through.
     Raises InputError when the depth that the parameters ask for cannot be had.
     """
     source = depth_source(scene, params)
-    frames, cameras, sensed = _placed(scene, reference, params, with_sensor=source == "sensor")
+    placed = _placed(scene, reference, params, with_sensor=source == "sensor", fit=fit)
+    frames, cameras, sensed = placed.frames, placed.cameras, placed.sensed
     names = scene.names if scene.poses is not None else None  # else a photo may still drop out for want of a pose
     known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
     masks = pointed = corrected = truth = None
@@ -162,6 +173,7 @@ def capture(scene: SceneFiles, reference: Reference, params: CaptureParams, mono
         checks=checks(frames, cameras, depths, params=params.checks),
         given=given,
         turns=turned(scene, params).turns or 0,
+        fit=placed.fit,
     )
 
 
@@ -174,31 +186,31 @@ def turned(scene: SceneFiles, params: CaptureParams) -> CaptureParams:
 
 
 def _placed(
-    scene: SceneFiles, reference: Reference, params: CaptureParams, with_sensor: bool
-) -> tuple[tuple[Frame, ...], Cameras, tuple[DepthMap, ...] | None]:
-    """The frames that have a camera, their cameras, and what a sensor measured in them."""
+    scene: SceneFiles, reference: Reference, params: CaptureParams, with_sensor: bool, fit: PoseFit | None
+) -> Placed:
+    """fit: as of `capture`."""
     frames = _frames(scene, reference, params)
     sensed = measured(scene, reference, frames) if with_sensor else None
+    told = any(not lens.pinhole for lens in scene.lenses or ())
     if scene.poses is None:
         if params.refine_poses == "always":
             raise InputError(f"{scene.root} has no poses that could be refined; leave --refine-poses out.")
         if scene.lenses is None or sensed is None:
-            straight = any(not lens.pinhole for lens in scene.lenses or ())
-            cameras = poses(frames, params.sfm.straight() if straight else params.sfm, scene.names or None)
-            return registered(frames, cameras), cameras, sensed
+            cameras = poses(frames, params.sfm.straight() if told else params.sfm, scene.names or None)
+            return Placed(registered(frames, cameras), cameras, sensed)
         unposed = replace(scene, poses=(NO_POSE,) * len(scene.names))
         cameras = poses_by_depth(frames, _given_cameras(unposed, reference, frames), sensed, params, scene.names)
         depths = sensed
         rows = {name: row for row, name in enumerate(scene.names)}
         sensed = expand(cameras, lambda placed: pick(depths, [rows[name] for name in placed.names]))
-        return registered(frames, cameras), cameras, sensed
+        return Placed(registered(frames, cameras), cameras, sensed)
     cameras = _given_cameras(scene, reference, frames)
     if params.refine_poses == "always":
-        cameras = refined_poses(frames, cameras, sensed, params)
-    elif compares_poses(scene, params) and has_pycolmap():
-        told = any(not lens.pinhole for lens in scene.lenses or ())
-        frames, cameras, sensed = fitting_cameras(frames, cameras, sensed, params, "focal" if told else "all")
-    return frames, cameras, sensed
+        return Placed(frames, refined_poses(frames, cameras, sensed, params), sensed)
+    if compares_poses(scene, params) and has_pycolmap():
+        return fitting_cameras(frames, cameras, sensed, params, "focal" if told else "all")
+    placed = Placed(frames, cameras, sensed)
+    return placed if fit is None else seen_through(fit, placed)
 
 
 def compares_poses(scene: SceneFiles, params: CaptureParams) -> bool:

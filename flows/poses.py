@@ -3,7 +3,7 @@ out; or, where a sensor measured depth, by that. Photos with poses that do not f
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 from ss_flow.flows.params import CaptureParams
@@ -71,18 +71,30 @@ def refined_poses(
     )
 
 
+@dataclass(frozen=True)
+class Placed:
+    """Nodes of the frames that have a camera."""
+
+    frames: tuple[Frame, ...]
+    cameras: Cameras
+    sensed: tuple[DepthMap, ...] | None
+    """What a sensor measured in them."""
+    fit: PoseFit | None = None
+    """How the cameras that came with the capture fit its photos, where that is asked."""
+
+
 def fitting_cameras(
     frames: tuple[Frame, ...],
     cameras: Cameras,
     depths: tuple[DepthMap, ...] | None,
     params: CaptureParams,
     lens: FreeLens,
-) -> tuple[tuple[Frame, ...], Cameras, tuple[DepthMap, ...] | None]:
+) -> Placed:
     """Add the nodes that look at a few pairs of photos, at more where these leave a doubt, and where the given cameras
     do not fit them, find another lens, or else refine the poses.
 
-    depths: what a sensor measured, if one did; it has a say in which cameras are better. lens: what of the lens may
-    be wrong. Returns frames and depths, without a distortion that was found, and the cameras.
+    depths: what a sensor measured, if one did; it has a say in which poses are better. lens: what of the lens may be
+    wrong. A distortion that is found is taken out of frames and depths.
     """
     looks = pose_pairs(cameras)
 
@@ -116,10 +128,19 @@ def fitting_cameras(
     found = expand(fit, better)
     straight = expand(fit, lambda one: registered(frames, found) if one.radial else frames)
     if depths is None:
-        return straight, found, None
+        return Placed(straight, found, None, fit)
     as_photos = params.registration.in_use(advise=False)
     sensed = expand(fit, lambda one: straightened(straight, found, depths, params=as_photos) if one.radial else depths)
-    return straight, found, sensed
+    return Placed(straight, found, sensed, fit)
+
+
+def seen_through(fit: PoseFit, placed: Placed) -> Placed:
+    """The same with the lens that other photos of the same camera need, as `fitting_cameras` found; depth stays."""
+    frames, cameras = placed.frames, placed.cameras
+    found = expand(fit, lambda one: with_lens(cameras, fit) if one.other_lens else cameras)
+    return replace(
+        placed, frames=expand(fit, lambda one: registered(frames, found) if one.radial else frames), cameras=found
+    )
 
 
 def compared(

@@ -182,12 +182,15 @@ def prepare(
     reference = references(digests)
 
     def build() -> dict[str, Any]:
+        own = capture(scene, reference, params.capture, networks.monodepth)
         extra: Capture | None = None
         if held_out.is_dir():
             # Of these views only the photos count.
             plain = replace(params.capture, depth="auto", calibrate="none", refine_poses="never")
-            extra = capture(open_scene(held_out), reference, plain, networks.monodepth)
-        results = split_splat(capture(scene, reference, params.capture, networks.monodepth), extra, networks, params)
+            kept = open_scene(held_out)
+            same_lens = set(kept.lenses or ()) <= set(scene.lenses or ())
+            extra = capture(kept, reference, plain, networks.monodepth, own.fit if same_lens else None)
+        results = split_splat(own, extra, networks, params)
         if text is not None:
             results["query"] = query(
                 results["describe"],

@@ -65,3 +65,21 @@ def test_a_focal_length_that_is_stated_wrongly_is_put_right(room, tmp_path):
     np.testing.assert_allclose(*focal, rtol=0.003)
     assert found["segment"] == right["segment"] and found["depth"] == right["depth"]
     assert none == [] and any("0.94" in text for text in warnings)
+
+
+def test_views_that_were_kept_back_are_seen_through_the_lens_that_was_found(tmp_path):
+    room = generate(RoomParams(objects=8, views=10, width=480, height=360, held_out=2))
+    folder, store = tmp_path / "room", tmp_path / "store"
+    write_scene(room, folder, masks="truth")
+    for place in (folder, folder / "held_out"):
+        zoom(place, 1.06)
+    focal = {}
+    for step in ("cameras", "cameras_held_out"):
+        called = run_tiny(folder, store, "--until", step)
+        assert called.code == 0, called.err
+        focal[step] = Store(store).get(called.results()[step]).intrinsics[0, 0]
+    assert focal["cameras_held_out"] == focal["cameras"] == pytest.approx(room.cameras.intrinsics[0, 0], rel=0.003)
+    zoom(folder / "held_out", 1.06)
+    other = run_tiny(folder, store, "--until", "cameras_held_out")
+    stays = Store(store).get(other.results()["cameras_held_out"]).intrinsics[0, 0]
+    assert stays == pytest.approx(1.06**2 * room.cameras.intrinsics[0, 0])
