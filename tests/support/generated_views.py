@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Cameras, Frame
+from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
+from ss_flow.tasks.capture.features import features
+from ss_flow.tasks.capture.matches import match
+from ss_flow.tasks.capture.pose_fit import pose_pairs
 from ss_flow.tasks.geometry.cameras import Camera, looking
 from ss_flow.tasks.geometry.images import encode_png
 
@@ -76,6 +79,17 @@ def views(eyes, width=160, height=120, focal=150.0):
         metric=True,
     )
     return frames, artifact, [depth for _, depth in rendered]
+
+
+def compared():
+    """The cameras of eight views, and what `pose_fit` takes: pairs, features, matches and the true depth."""
+    eyes = [(x, y, 0.1 * x) for x in (-0.9, -0.3, 0.3, 0.9) for y in (-0.3, 0.3)]
+    frames, cameras, depths = views(eyes, width=320, height=240, focal=300.0)
+    pairs = pose_pairs(cameras)[-1]
+    photos = [features(frames[row]) for row in pairs.view]
+    matches = [match(photos[a], [photos[b]]) for a, b in pairs.pair]
+    measured = [DepthMap(cameras.names[row], depths[row].astype(np.float32), "sensor") for row in pairs.view]
+    return cameras, pairs, photos, matches, measured
 
 
 def jittered(cameras, distance, degrees):

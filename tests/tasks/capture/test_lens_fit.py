@@ -4,27 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from generated_views import jittered, views
+from generated_views import compared, jittered
 
-from ss_flow.tasks.artifacts import DepthMap
-from ss_flow.tasks.capture.features import features
 from ss_flow.tasks.capture.lens import distorted, found_lens
 from ss_flow.tasks.capture.lens_fit import with_focal
-from ss_flow.tasks.capture.matches import match
-from ss_flow.tasks.capture.pose_fit import PoseFit, PoseFitParams, pose_fit, pose_pairs, with_lens
-
-EYES = [(x, y, 0.1 * x) for x in (-0.9, -0.3, 0.3, 0.9) for y in (-0.3, 0.3)]
-PARAMS = PoseFitParams()
+from ss_flow.tasks.capture.pose_fit import PoseFit, pose_fit, with_lens
 
 
 @pytest.fixture(scope="module")
 def scene():
-    frames, cameras, depths = views(EYES, width=320, height=240, focal=300.0)
-    pairs = pose_pairs(cameras)[-1]
-    photos = [features(frames[row]) for row in pairs.view]
-    matches = [match(photos[a], [photos[b]]) for a, b in pairs.pair]
-    measured = [DepthMap(cameras.names[row], depths[row].astype(np.float32), "sensor") for row in pairs.view]
-    return cameras, pairs, photos, matches, measured
+    return compared()
 
 
 def bent(scene, radial):

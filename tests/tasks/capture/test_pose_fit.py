@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from generated_views import jittered, looking_at, views
+from generated_views import compared, jittered, looking_at
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ss_flow.tasks.artifacts import Cameras, DepthMap
+from ss_flow.tasks.artifacts import Cameras
 from ss_flow.tasks.capture.epipolar import sampson_distance
-from ss_flow.tasks.capture.features import features
-from ss_flow.tasks.capture.matches import match
 from ss_flow.tasks.capture.pose_fit import (
     PoseFit,
     PoseFitParams,
@@ -21,22 +19,10 @@ from ss_flow.tasks.capture.pose_fit import (
     pose_pairs,
 )
 
-EYES = [(x, y, 0.1 * x) for x in (-0.9, -0.3, 0.3, 0.9) for y in (-0.3, 0.3)]
-
 
 @pytest.fixture(scope="module")
 def scene():
-    frames, cameras, depths = views(EYES, width=320, height=240, focal=300.0)
-    pairs = pose_pairs(cameras)[-1]
-    photos = [features(frames[row]) for row in pairs.view]
-    matches = [match(photos[a], [photos[b]]) for a, b in pairs.pair]
-    return (
-        cameras,
-        pairs,
-        photos,
-        matches,
-        [DepthMap(cameras.names[row], depths[row].astype(np.float32), "sensor") for row in pairs.view],
-    )
+    return compared()
 
 
 def test_exact_poses_fit_and_jittered_ones_do_not(scene):
