@@ -17,8 +17,9 @@ from ss_flow.tasks.artifacts import Cameras, Float64
 from ss_flow.tasks.capture.epipolar import fundamental_matrix, sampson_distance
 from ss_flow.tasks.capture.lens import found_lens, undistorted
 
-_FREE = [True, False], [False, True], [True, True]
-"""Whether the focal lengths and the radial coefficient may change, in each search."""
+DOUBTFUL_GAIN = 0.1
+"""The share of what is off that another lens takes away where the given one may be wrong; of a right one that is a
+hundredth."""
 LEAST_PAIRS = 3
 """Of fewer pairs of photos that tell something nothing is said."""
 _SCALE = 0.001
@@ -27,7 +28,7 @@ _SCALE = 0.001
 _FAR = 1.0
 """The same of a point that a lens cannot have seen."""
 _AS_GOOD = 1.1
-"""A lens of which one number was changed is preferred to one of which both were, where it fits nearly as well."""
+"""So much worse, at most, is nearly as well."""
 _LEAST, _MOST = np.array([0.3, -1.0]), np.array([3.0, 1.0])
 """Between which the factor on the focal lengths and the radial coefficient are looked for."""
 _UNCHANGED = np.array([1.0, 0.0])
@@ -73,14 +74,18 @@ def _off_lines(cameras: Cameras, common: CommonPoints) -> Float64:
 
 
 def other_lens(cameras: Cameras, common: Sequence[CommonPoints]) -> OtherLens:
-    """The lens under which common points lie nearest to their epipolar lines."""
-    found = [_search(cameras, common, np.array(free)) for free in _FREE]
+    """The lens under which common points lie nearest to their epipolar lines; where it is clearly better than the given
+    one, one of its numbers stays as given if that fits nearly as well."""
+    both = _search(cameras, common, np.array([True, True]))
+    if both.gain < DOUBTFUL_GAIN:
+        return both
+    found = [_search(cameras, common, np.array(free)) for free in ([True, False], [False, True])] + [both]
     least = min(lens.distance for lens in found)
     return next(lens for lens in found if lens.distance <= _AS_GOOD * least)
 
 
 def _search(cameras: Cameras, common: Sequence[CommonPoints], free: NDArray[np.bool_]) -> OtherLens:
-    """free: [2] as of _FREE."""
+    """free: [2] whether the focal lengths and the radial coefficient may change."""
     from scipy.optimize import least_squares
 
     def lens(numbers: Float64) -> tuple[float, float]:

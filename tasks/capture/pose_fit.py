@@ -18,7 +18,14 @@ from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, I
 from ss_flow.tasks.capture.epipolar import fundamental_matrix, sampson_distance
 from ss_flow.tasks.capture.features import Features
 from ss_flow.tasks.capture.lens import found_lens, undistorted
-from ss_flow.tasks.capture.lens_fit import LEAST_PAIRS, CommonPoints, epipolar_distance, other_lens, with_focal
+from ss_flow.tasks.capture.lens_fit import (
+    DOUBTFUL_GAIN,
+    LEAST_PAIRS,
+    CommonPoints,
+    epipolar_distance,
+    other_lens,
+    with_focal,
+)
 from ss_flow.tasks.capture.matches import MAX_ERROR, Matches
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.ranges import Fraction, NonNegative
@@ -28,8 +35,6 @@ _FEW_PAIRS, _MOST_PAIRS = 4, 12
 these leave a doubt."""
 _CLEAR = 0.5
 """Few pairs leave none below this share of the distance from which poses are refined."""
-_DOUBTFUL_GAIN = 0.1
-"""Nor where another lens would take away such a share of what is off; of a right lens that is a hundredth."""
 _LEAST_MATCHES = 15
 """A pair of fewer matches tells nothing about poses."""
 _OCCLUDED = 0.25
@@ -57,7 +62,7 @@ class PoseFitParams:
 
     def certain(self, fit: PoseFit) -> bool:
         """Whether poses and lens fit beyond doubt, so that no more pairs need to be looked at."""
-        return fit.distance <= _CLEAR * self.least_distance and fit.lens_gain < _DOUBTFUL_GAIN
+        return fit.distance <= _CLEAR * self.least_distance and fit.lens_gain < DOUBTFUL_GAIN
 
 
 @dataclass(frozen=True)
@@ -137,8 +142,8 @@ def pose_fit(
         return given
     best = other_lens(cameras, common)
     given = replace(given, lens_gain=best.gain)
-    fits = best.distance <= min(_CLEAR * params.least_distance, (1 - params.gain) * given.distance)
-    if not fits or (best.radial and lens == "focal"):
+    most = min(_CLEAR * params.least_distance, (1 - params.gain) * given.distance)
+    if best.gain < DOUBTFUL_GAIN or best.distance > most or (best.radial and lens == "focal"):
         return given
     return replace(given, distance=best.distance, focal=best.focal, radial=best.radial, as_given=given.distance)
 
