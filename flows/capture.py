@@ -191,12 +191,12 @@ def _placed(
     """fit: as of `capture`."""
     frames = _frames(scene, reference, params)
     sensed = measured(scene, reference, frames) if with_sensor else None
-    told = any(not lens.pinhole for lens in scene.lenses or ())
+    distortion_stated = any(not lens.pinhole for lens in scene.lenses or ())
     if scene.poses is None:
         if params.refine_poses == "always":
             raise InputError(f"{scene.root} has no poses that could be refined; leave --refine-poses out.")
         if scene.lenses is None or sensed is None:
-            cameras = poses(frames, params.sfm.straight() if told else params.sfm, scene.names or None)
+            cameras = poses(frames, params.sfm.straight() if distortion_stated else params.sfm, scene.names or None)
             return Placed(registered(frames, cameras), cameras, sensed)
         unposed = replace(scene, poses=(NO_POSE,) * len(scene.names))
         cameras = poses_by_depth(frames, _given_cameras(unposed, reference, frames), sensed, params, scene.names)
@@ -208,7 +208,7 @@ def _placed(
     if params.refine_poses == "always":
         return Placed(frames, refined_poses(frames, cameras, sensed, params), sensed)
     if compares_poses(scene, params) and has_pycolmap():
-        return fitting_cameras(frames, cameras, sensed, params, "focal" if told else "all")
+        return fitting_cameras(frames, cameras, sensed, params, "focal" if distortion_stated else "all")
     placed = Placed(frames, cameras, sensed)
     return placed if fit is None else seen_through(fit, placed)
 

@@ -126,7 +126,7 @@ def fitting_cameras(
 
     fit = expand(cast(Any, looks), lambda count: look(0, count))
     found = expand(fit, better)
-    straight = expand(fit, lambda one: registered(frames, found) if one.radial else frames)
+    straight = _straight(frames, found, fit)
     if depths is None:
         return Placed(straight, found, None, fit)
     as_photos = params.registration.in_use(advise=False)
@@ -136,11 +136,14 @@ def fitting_cameras(
 
 def seen_through(fit: PoseFit, placed: Placed) -> Placed:
     """The same with the lens that other photos of the same camera need, as `fitting_cameras` found; depth stays."""
-    frames, cameras = placed.frames, placed.cameras
-    found = expand(fit, lambda one: with_lens(cameras, fit) if one.other_lens else cameras)
-    return replace(
-        placed, frames=expand(fit, lambda one: registered(frames, found) if one.radial else frames), cameras=found
-    )
+    given = placed.cameras
+    found = expand(fit, lambda one: with_lens(given, fit) if one.other_lens else given)
+    return replace(placed, frames=_straight(placed.frames, found, fit), cameras=found)
+
+
+def _straight(frames: tuple[Frame, ...], cameras: Cameras, fit: PoseFit) -> tuple[Frame, ...]:
+    """The frames without the distortion that these cameras have by `fit`, if any."""
+    return expand(fit, lambda found: registered(frames, cameras) if found.radial else frames)
 
 
 def compared(

@@ -199,7 +199,7 @@ def cameras(
         intrinsics.append((scaled.fx, scaled.fy, scaled.cx, scaled.cy))
     if other_sizes:
         warn(
-            f"Intrinsics were scaled to their photos, since their principal points show that they are those of photos "
+            "Intrinsics were scaled to their photos, since their principal points show that they are those of photos "
             f"of another size: {len(other_sizes)} of {len(frames)} views, the first of {other_sizes[0]}."
         )
     return Cameras(

@@ -46,8 +46,8 @@ class Lens:
     def of_photo(self, width: int, height: int) -> tuple[float, float]:
         """The size that the intrinsics refer to, for a photo of such a size.
 
-        Where the capture does not say, it is the photo's own; or that of a photo about whose middle the principal point
-        lies, where this one was scaled since, as its distances from the middles of all sides tell.
+        Where the capture does not say, it is the photo's own, unless the principal point tells that the photo was
+        scaled since: then that of a photo about whose middle it lies.
         """
         if self.width:
             return self.width, self.height

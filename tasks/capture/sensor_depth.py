@@ -72,7 +72,7 @@ def depth(
         result.append(registered_depth(frame, values, str(ref.path), metric, lens, depth_lens))
         progress(i + 1, len(frames), frame.name)
     _check_known(result, measured, str(files[0].path.parent))
-    if scaled and depth_lens is not None and not depth_lens.width:
+    if scaled:
         warn(
             "The intrinsics of the depth camera were scaled to its images, since its principal point shows that they "
             f"are of another size: {len(scaled)} of {len(frames)} views, the first {scaled[0]} pixels."
@@ -126,7 +126,7 @@ def registered_depth(
         )
     h, w = values.shape
     color = None if lens is None else lens.scaled(frame.source_width, frame.source_height)
-    sized = None if depth_lens is None else depth_lens if depth_lens.width else depth_lens.scaled(w, h)
+    sized = None if depth_lens is None else depth_lens.scaled(w, h)
     if sized is not None and color is not None and not _same_camera(sized, color, w, h):
         if not (abs(sized.cx / w - 0.5) < 0.25 and abs(sized.cy / h - 0.5) < 0.25):
             raise InputError(
