@@ -12,7 +12,8 @@ import pytest
 from tiny_runs import SHORT, ss_flow
 
 
-def test_alone_it_helps_and_it_tells_its_version_also_as_a_module():
+def test_alone_it_helps_and_it_tells_its_version_also_as_a_module(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where nothing has run: a result in this folder would be offered in the demo's place
     helped, told = ss_flow(), ss_flow("--version")
     assert helped.code == 2 and all(word in helped.out for word in ("ss-flow demo", "ss-flow doctor", "--help"))
     assert (told.code, told.out) == (0, f"ss-flow {version('ss-flow')}\n")
