@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -29,7 +29,7 @@ class SelectionParams:
     """IoU with a label's painted points below which a mask does not show the label: one that was prompted or drawn for
     it, or, with "best", one of the view's own."""
     unlabelled: Fraction = 0.5
-    """How much a point without a label counts against a mask that holds it (only with "best")."""
+    """How much a point without a label counts where masks are held against points (only with "best")."""
     erosion: ErosionParams = field(default_factory=ErosionParams)
     """How far a mask's border is taken off before its majority is counted (only with "all")."""
 
@@ -38,7 +38,11 @@ def paint_for_selection(view: Visibility, label: Int32, params: SelectionParams)
     """The labels [N] of all dense points as masks are picked by: by the area that they cover, or, with "all", by their
     number."""
     painted = paint_labels(view, label)
-    return painted if params.masks == "all" else by_area(painted, view.height, view.width)
+    if params.masks == "all":
+        return painted
+    painted = by_area(painted, view.height, view.width)
+    counts = np.where(painted.label == 0, np.float32(params.unlabelled), np.float32(1))
+    return replace(painted, area=painted.area * counts)
 
 
 def select_masks(painted: PaintedView, pool: MaskSet, params: SelectionParams) -> dict[int, Bool]:
@@ -80,8 +84,7 @@ def _by_agreement(painted: PaintedView, pool: MaskSet, dense: Bool, params: Sele
     held = [rows[rows >= 0] for rows in (row_at[np.flatnonzero(mask)] for mask in dense)]
     count = np.stack([np.bincount(index[rows], painted.area[rows], len(labels)) for rows in held])
     total = np.bincount(index, painted.area, len(labels))
-    area = count @ np.where(labels == 0, params.unlabelled, 1.0)
-    fits = count / np.maximum(area[:, None] + total - count, 1)
+    fits = count / np.maximum(count.sum(axis=1, keepdims=True) + total - count, 1)
     fits[:, labels == 0] = 0
     rank = np.round(fits * pool.quality[order, None], 9)
 
