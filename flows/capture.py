@@ -18,7 +18,15 @@ from ss_flow.flows.depths import (
     without_sensor,
 )
 from ss_flow.flows.params import CaptureParams
-from ss_flow.flows.poses import Placed, fitting_cameras, poses, poses_by_depth, refined_poses, seen_through
+from ss_flow.flows.poses import (
+    Placed,
+    fitting_cameras,
+    localized_beside,
+    poses,
+    poses_by_depth,
+    refined_poses,
+    seen_through,
+)
 from ss_flow.graph import expand, pick
 from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import (
@@ -42,7 +50,6 @@ from ss_flow.tasks.capture.colours import colours
 from ss_flow.tasks.capture.given_scene import given_scene
 from ss_flow.tasks.capture.hints import clicks
 from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
-from ss_flow.tasks.capture.pose_fit import PoseFit
 from ss_flow.tasks.capture.registration import registration
 from ss_flow.tasks.capture.scene_files import NO_POSE, SceneFiles
 from ss_flow.tasks.capture.sfm import registered
@@ -58,6 +65,8 @@ class Capture:
 
     frames: tuple[Frame, ...]
     cameras: Cameras
+    placed: Placed
+    """These two, and what tells how exact the cameras are that came with the capture."""
     by_view: tuple[Camera, ...]
     """The cameras one by one."""
     depths: tuple[DepthMap, ...]
@@ -90,8 +99,6 @@ class Capture:
     """The scene that is to be labelled, where one was trained elsewhere."""
     turns: int = 0
     """Quarter turns, counterclockwise, by which networks are to see the photos turned."""
-    fit: PoseFit | None = None
-    """How the cameras that came with it fit its photos, where that is asked."""
 
     @property
     def views(self) -> Views:
@@ -104,16 +111,16 @@ def capture(
     reference: Reference,
     params: CaptureParams,
     monodepth: Model | None,
-    fit: PoseFit | None = None,
+    trained: Placed | None = None,
 ) -> Capture:
     """Add the nodes that read a capture.
 
-    reference: turns a path into a file reference (digests are remembered outside the flow). fit: that of a capture by
-    the same camera, whose lens this one is then seen through.
+    reference: turns a path into a file reference (digests are remembered outside the flow). trained: the
+    photos that are trained on, where those of this capture are kept back; with the fit of a lens that is theirs, too.
     Raises InputError when the depth that the parameters ask for cannot be had.
     """
     source = depth_source(scene, params)
-    placed = _placed(scene, reference, params, with_sensor=source == "sensor", fit=fit)
+    placed = _placed(scene, reference, params, with_sensor=source == "sensor", trained=trained)
     frames, cameras, sensed = placed.frames, placed.cameras, placed.sensed
     names = scene.names if scene.poses is not None else None  # else a photo may still drop out for want of a pose
     known: dict[str, Any] = {"names": scene.names, "lenses": scene.lenses}
@@ -156,6 +163,7 @@ def capture(
     return Capture(
         frames=frames,
         cameras=cameras,
+        placed=placed,
         by_view=by_view,
         depths=depths,
         presumed=presumed_depth(frames, depths, names, params) if source == "mvs" else depths,
@@ -173,7 +181,6 @@ def capture(
         checks=checks(frames, cameras, depths, params=params.checks),
         given=given,
         turns=turned(scene, params).turns or 0,
-        fit=placed.fit,
     )
 
 
@@ -186,9 +193,9 @@ def turned(scene: SceneFiles, params: CaptureParams) -> CaptureParams:
 
 
 def _placed(
-    scene: SceneFiles, reference: Reference, params: CaptureParams, with_sensor: bool, fit: PoseFit | None
+    scene: SceneFiles, reference: Reference, params: CaptureParams, with_sensor: bool, trained: Placed | None
 ) -> Placed:
-    """fit: as of `capture`."""
+    """trained: as of `capture`."""
     frames = _frames(scene, reference, params)
     sensed = measured(scene, reference, frames) if with_sensor else None
     distortion_stated = any(not lens.pinhole for lens in scene.lenses or ())
@@ -206,11 +213,15 @@ def _placed(
         return Placed(registered(frames, cameras), cameras, sensed)
     cameras = _given_cameras(scene, reference, frames)
     if params.refine_poses == "always":
-        return Placed(frames, refined_poses(frames, cameras, sensed, params), sensed)
+        return Placed(frames, refined_poses(frames, cameras, sensed, params), sensed, cameras)
     if compares_poses(scene, params) and has_pycolmap():
         return fitting_cameras(frames, cameras, sensed, params, "focal" if distortion_stated else "all")
     placed = Placed(frames, cameras, sensed)
-    return placed if fit is None else seen_through(fit, placed)
+    if trained is None:
+        return placed
+    if trained.fit is not None:
+        placed = seen_through(trained.fit, placed)
+    return placed if trained.given is None else localized_beside(trained, trained.given, placed, params)
 
 
 def compares_poses(scene: SceneFiles, params: CaptureParams) -> bool:

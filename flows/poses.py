@@ -6,11 +6,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
+import numpy as np
+
 from ss_flow.flows.params import CaptureParams
 from ss_flow.graph import INDEX, each, expand, gather, pick
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Frame
 from ss_flow.tasks.capture.depth_poses import placed_by_depth
 from ss_flow.tasks.capture.features import Features, features
+from ss_flow.tasks.capture.localize import localized
 from ss_flow.tasks.capture.matches import Matches, match
 from ss_flow.tasks.capture.pairs import Look, look, partners
 from ss_flow.tasks.capture.pose_fit import FreeLens, PoseFit, PosePairs, better_poses, pose_fit, pose_pairs, with_lens
@@ -79,8 +82,10 @@ class Placed:
     cameras: Cameras
     sensed: tuple[DepthMap, ...] | None
     """What a sensor measured in them."""
+    given: Cameras | None = None
+    """The cameras that came with the capture, where other poses may stand in their place."""
     fit: PoseFit | None = None
-    """How the cameras that came with the capture fit its photos, where that is asked."""
+    """How they fit its photos, where that is asked."""
 
 
 def fitting_cameras(
@@ -128,10 +133,10 @@ def fitting_cameras(
     found = expand(fit, better)
     straight = _straight(frames, found, fit)
     if depths is None:
-        return Placed(straight, found, None, fit)
+        return Placed(straight, found, None, cameras, fit)
     as_photos = params.registration.in_use(advise=False)
     sensed = expand(fit, lambda one: straightened(straight, found, depths, params=as_photos) if one.radial else depths)
-    return Placed(straight, found, sensed, fit)
+    return Placed(straight, found, sensed, cameras, fit)
 
 
 def seen_through(fit: PoseFit, placed: Placed) -> Placed:
@@ -139,6 +144,37 @@ def seen_through(fit: PoseFit, placed: Placed) -> Placed:
     given = placed.cameras
     found = expand(fit, lambda one: with_lens(given, fit) if one.other_lens else given)
     return replace(placed, frames=_straight(placed.frames, found, fit), cameras=found)
+
+
+def localized_beside(trained: Placed, given: Cameras, kept: Placed, params: CaptureParams) -> Placed:
+    """Photos that are kept back, placed anew among those that are trained on, where the poses of these were refined.
+
+    given: the cameras with which the latter came.
+    """
+
+    def found() -> Cameras:
+        photos, looks, matches = compared(trained.frames, params.sfm, None)
+        own = each(kept.frames, build=lambda frame: features(frame, params=params.sfm.features))
+
+        def with_all(photo: Features) -> Matches:
+            seen = look(photo, count=params.sfm.pairs.look_features)
+            chosen = expand(
+                cast(Any, looks),
+                lambda count: partners(seen, pick(looks, range(count)), place=count, params=params.sfm.pairs),
+            )
+            return expand(chosen, lambda plan: match(photo, pick(photos, plan.row.tolist())))
+
+        beside = each(own, build=with_all)
+        return localized(kept.cameras, own, beside, trained.cameras, photos, matches, params=params.refine)
+
+    def moved(before: Cameras, after: Cameras) -> bool:
+        return not np.array_equal(before.world_to_camera, after.world_to_camera)
+
+    cameras = expand(
+        given,
+        lambda before: expand(trained.cameras, lambda after: found() if moved(before, after) else kept.cameras),
+    )
+    return replace(kept, cameras=cameras)
 
 
 def _straight(frames: tuple[Frame, ...], cameras: Cameras, fit: PoseFit) -> tuple[Frame, ...]:

@@ -40,6 +40,7 @@ LEADS_TO = {
     "plan": "merge",
     "merge_pair": "merge",
     "rendered": "describe",
+    "localized": "cameras_held_out",
 }
 """Steps of which only other results tell what nodes there are: the result that all of these lead to."""
 LEADS_TO_CAMERAS = frozenset(

@@ -189,7 +189,8 @@ def prepare(
             plain = replace(params.capture, depth="auto", calibrate="none", refine_poses="never")
             kept = open_scene(held_out)
             same_lens = set(kept.lenses or ()) <= set(scene.lenses or ())
-            extra = capture(kept, reference, plain, networks.monodepth, own.fit if same_lens else None)
+            trained = own.placed if same_lens else replace(own.placed, fit=None)
+            extra = capture(kept, reference, plain, networks.monodepth, trained)
         results = split_splat(own, extra, networks, params)
         if text is not None:
             results["query"] = query(

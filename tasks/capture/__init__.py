@@ -9,8 +9,9 @@ The steps, in the order in which they run:
    known of photos: `photo_files`, `lens`, `upright`; `photo_pixels`: the way back to the photos as they were taken.
 3. Without poses: `features`, `pairs`, `matches`, `sfm` (with `colmap`, `colmap_database`; `turning`: photos from one
    place are refused; `contradicted`: photos in a wrong place), or `depth_poses` where a sensor measured depth. With
-   poses: `pose_fit` (with `epipolar` and `lens_fit`), and `refine_poses` where they do not fit. `depth_poses` and
-   `refine_poses` use `placing` where a sensor measured depth. `views`: cameras one by one, and the unit of length.
+   poses: `pose_fit` (with `epipolar` and `lens_fit`), and where they do not fit `refine_poses`, and `localize` for
+   photos that are kept back (both with `mapping`). `depth_poses` and `refine_poses` use `placing` where a sensor
+   measured depth. `views`: cameras one by one, and the unit of length.
 4. Depth: `sensor_depth`, with `registration`, `depth_scale` and `completion`; or `depth` and `stereo` (its library:
    `patchmatch`), of `neighbors` only, and `planes`; or `mono`.
 5. `checks`: whether all this fits together; `misfits`: what is said where it does not. `colours`: photos of several

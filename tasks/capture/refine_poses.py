@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.errors import InputError
-from ss_flow.running import progress, warn
+from ss_flow.running import warn
 from ss_flow.task import task
 from ss_flow.tasks.artifacts import Cameras, DepthMap, Float64
-from ss_flow.tasks.capture.colmap import SEED, load_pycolmap
-from ss_flow.tasks.capture.colmap_database import fill_database
+from ss_flow.tasks.capture.colmap import load_pycolmap
 from ss_flow.tasks.capture.features import Features
+from ss_flow.tasks.capture.mapping import opened, triangulate
 from ss_flow.tasks.capture.matches import Matches
 from ss_flow.tasks.capture.placing import places
 from ss_flow.tasks.geometry.cameras import centers_of
@@ -118,37 +118,15 @@ def adjusted(
     world-to-camera to start from, which a photo keeps that sees too few points; the cameras' own if not given.
     Raises Unrefinable when the photos have too little in common.
     """
-    pycolmap = load_pycolmap()
     start = cameras.world_to_camera if start is None else start
-
-    def lens(photo: Features, row: int) -> tuple[tuple[float, ...], Any]:
-        numbers = [*cameras.intrinsics[row].tolist()]
-        camera = pycolmap.Camera(model="PINHOLE", width=photo.width, height=photo.height, params=numbers)
-        return (photo.width, photo.height, *numbers), camera
-
-    database, _ = fill_database(photos, matches, lens)
-    cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
-    model = pycolmap.Reconstruction()
-    model.load(cache)
-    for row, pose in enumerate(start):
-        if model.exists_frame(row + 1):
-            model.frame(row + 1).rig_from_world = pycolmap.Rigid3d(pose[:3])
-            model.register_frame(row + 1)
-    mapper = pycolmap.IncrementalMapper(cache)
-    mapper.begin_reconstruction(model)
+    mapper, model = opened(photos, cameras.intrinsics, matches, start)
     error = max(params.first_error, params.last_error)
     focal = float(np.median(cameras.intrinsics[:, 0]))
     while True:
-        filtering, triangulating = _limits(pycolmap, error, focal)
-        numbers = sorted(model.reg_image_ids())
-        for i, number in enumerate(numbers):
-            mapper.triangulate_image(triangulating, number)
-            progress(i, len(numbers), f"points within {error:g} pixels")
-        mapper.complete_and_merge_tracks(triangulating)
-        mapper.filter_points(filtering)
+        filtering = triangulate(mapper, model, error, focal)
         if model.num_points3D() < _LEAST_POINTS:
             raise Unrefinable(f"only {model.num_points3D()} points are seen in common as the given poses would have it")
-        _adjust(pycolmap, model, poses=True, intrinsics=params.intrinsics)
+        _adjust(model, poses=True, intrinsics=params.intrinsics)
         mapper.filter_points(filtering)
         if error <= params.last_error:
             break
@@ -161,23 +139,11 @@ def adjusted(
     back = _similarity(poses, start[rows])
     if back is None:
         raise Unrefinable("the cameras stand in one place, which tells no scale")
-    return _result(pycolmap, model, cameras, rows, start, back)
+    return _result(model, cameras, rows, start, back)
 
 
-def _limits(pycolmap: Any, error: float, focal: float) -> tuple[Any, Any]:
-    """What COLMAP filters and triangulates by when points may be seen so far off, in pixels."""
-    filtering = pycolmap.IncrementalMapperOptions()
-    filtering.num_threads = 1
-    filtering.random_seed = SEED
-    filtering.filter_max_reproj_error = error
-    triangulating = pycolmap.IncrementalTriangulatorOptions()
-    triangulating.random_seed = SEED
-    triangulating.create_max_angle_error = triangulating.continue_max_angle_error = float(np.degrees(error / focal))
-    triangulating.complete_max_reproj_error = triangulating.merge_max_reproj_error = error
-    return filtering, triangulating
-
-
-def _adjust(pycolmap: Any, model: Any, *, poses: bool, intrinsics: bool) -> None:
+def _adjust(model: Any, *, poses: bool, intrinsics: bool) -> None:
+    pycolmap = load_pycolmap()
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_rig_from_world = poses
     options.refine_sensor_from_rig = options.refine_extra_params = False
@@ -193,7 +159,8 @@ def _adjust(pycolmap: Any, model: Any, *, poses: bool, intrinsics: bool) -> None
     pycolmap.create_default_bundle_adjuster(options, scope, model).solve()
 
 
-def _result(pycolmap: Any, model: Any, given: Cameras, rows: list[int], start: Float64, back: Float64) -> Adjusted:
+def _result(model: Any, given: Cameras, rows: list[int], start: Float64, back: Float64) -> Adjusted:
+    pycolmap = load_pycolmap()
     after = _median_error(model)
     model.transform(pycolmap.Sim3d(back))
     world_to_camera, intrinsics = start.copy(), given.intrinsics.copy()
@@ -203,7 +170,7 @@ def _result(pycolmap: Any, model: Any, given: Cameras, rows: list[int], start: F
     points = [point.xyz for _, point in sorted(model.points3D.items()) if point.track.length() >= 3]
     for number in model.reg_image_ids():
         model.frame(number).rig_from_world = pycolmap.Rigid3d(given.world_to_camera[number - 1][:3])
-    _adjust(pycolmap, model, poses=False, intrinsics=False)
+    _adjust(model, poses=False, intrinsics=False)
     sparse = np.array(points, np.float32).reshape(-1, 3)
     cameras = replace(given, world_to_camera=world_to_camera, intrinsics=intrinsics, sparse_points=sparse)
     return Adjusted(cameras, rows, error_before=_median_error(model), error_after=after)

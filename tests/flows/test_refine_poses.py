@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from altered_captures import shake
 from tiny_runs import run_tiny
 
 from ss_flow.cache.store import Store
@@ -86,6 +87,34 @@ def test_poses_that_fit_their_photos_stay_without_a_word(scenes, tmp_path):
     assert "capture.refined_cameras" not in called.computed()
     assert warnings_of(called) == []
     assert called.results() == run_tiny(scenes[0], store, *UNTIL, *NEVER).results()
+
+
+def test_views_that_were_kept_back_come_to_where_refined_poses_have_them(scenes, tmp_path):
+    room = generate(RoomParams(objects=10, views=12, width=320, height=240, held_out=2))
+    capture, store = tmp_path / "room", tmp_path / "store"
+    write_scene(room, capture, masks="truth")
+    shake(capture, "20,1", drift=False)
+    shake(capture / "held_out", "60,3", drift=False)
+
+    def placed(step, *options):
+        called = run_tiny(capture, store, "--until", step, *options)
+        assert called.code == 0, called.err
+        return called, Store(store).get(called.results()[step]).world_to_camera
+
+    def off(kept, trained):
+        """[held out] by how much each view is turned, as the others see it: the median, in degrees."""
+        true = room.held_out.cameras.world_to_camera, room.cameras.world_to_camera
+        there, right = (a[:, None, :3, :3] @ b[:, :3, :3].transpose(0, 2, 1) for a, b in ((kept, trained), true))
+        cosine = (np.einsum("abij,abij->ab", there, right) - 1) / 2
+        return np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1))), axis=1)
+
+    called, found = placed("cameras_held_out")
+    given = placed("cameras_held_out", *NEVER)[1]
+    refined = placed("cameras")[1]
+    assert off(found, refined).max() < 0.4 and off(given, refined).max() > 2.5
+    assert "2 of 2 views that were kept back moved" in warnings_of(called)[-1]
+    np.testing.assert_array_equal(placed("cameras_held_out", "--refine-poses")[1], found)
+    assert run_tiny(capture, store, "--until", "localized").computed() == {}
 
 
 def test_refined_poses_that_gain_too_little_are_not_used(scenes, tmp_path):
