@@ -27,7 +27,7 @@ from ss_flow.flows.poses import (
     refined_poses,
     seen_through,
 )
-from ss_flow.graph import expand, pick
+from ss_flow.graph import INDEX, each, expand, pick
 from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import (
     Cameras,
@@ -53,6 +53,7 @@ from ss_flow.tasks.capture.id_images import ground_truth, ready_masks
 from ss_flow.tasks.capture.registration import registration
 from ss_flow.tasks.capture.scene_files import NO_POSE, SceneFiles
 from ss_flow.tasks.capture.sfm import registered
+from ss_flow.tasks.capture.transients import Transients, transients, without_transients
 from ss_flow.tasks.gaussians.views import Views
 from ss_flow.tasks.geometry.cameras import Camera
 from ss_flow.tasks.geometry.lying import quarter_turns
@@ -146,6 +147,7 @@ def capture(
         placing = registration(frames, cameras, sensed, advise=advise, params=compared)
         fitting = fitting_depth(frames, cameras, sensed, placing, params)
         scaled = scaled_depth(cameras, fitting, names, params)
+        frames = _without_transients(frames, cameras, scaled, names, params)
         depths = completed_depth(frames, cameras, scaled, names, params)
     elif params.calibrate == "depth":
         raise InputError(
@@ -182,6 +184,29 @@ def capture(
         given=given,
         turns=turned(scene, params).turns or 0,
     )
+
+
+def _without_transients(
+    frames: tuple[Frame, ...],
+    cameras: Cameras,
+    depths: tuple[DepthMap, ...],
+    names: tuple[str, ...] | None,
+    params: CaptureParams,
+) -> tuple[Frame, ...]:
+    """The frames, of which no pixel counts where something moves; depths: a sensor's."""
+    if not params.transients.views:
+        return frames
+    moving = transients(cameras, depths, params=params.transients)
+
+    def ignoring(found: Transients) -> tuple[Frame, ...]:
+        some = set(found.view.tolist())
+
+        def still(frame: Frame, view: int) -> Frame:
+            return without_transients(frame, moving, view=view) if view in some else frame
+
+        return each(frames, INDEX, names=names, build=still) if some else frames
+
+    return expand(moving, ignoring)
 
 
 def turned(scene: SceneFiles, params: CaptureParams) -> CaptureParams:

@@ -19,6 +19,7 @@ from ss_flow.tasks.capture.refine_poses import RefinePosesParams
 from ss_flow.tasks.capture.registration import RegistrationParams
 from ss_flow.tasks.capture.sfm import SfmParams
 from ss_flow.tasks.capture.stereo import StereoParams
+from ss_flow.tasks.capture.transients import TransientParams
 from ss_flow.tasks.capture.video import VideoParams
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.ranges import Count, Fraction, Natural, NonNegative, QuarterTurns
@@ -84,6 +85,7 @@ class CaptureParams:
     planes: PlaneParams = field(default_factory=PlaneParams)
     """What Split takes to be flat where comparing views tells nothing. Nothing is trained on it."""
     registration: RegistrationParams = field(default_factory=RegistrationParams)
+    transients: TransientParams = field(default_factory=TransientParams)
     completion: CompletionParams = field(default_factory=CompletionParams)
     mono: MonoParams = field(default_factory=MonoParams)
     given: GivenSceneParams = field(default_factory=GivenSceneParams)

@@ -13,7 +13,7 @@ The steps, in the order in which they run:
    photos that are kept back (both with `mapping`). `depth_poses` and `refine_poses` use `placing` where a sensor
    measured depth. `views`: cameras one by one, and the unit of length.
 4. Depth: `sensor_depth`, with `registration`, `depth_scale` and `completion`; or `depth` and `stereo` (its library:
-   `patchmatch`), of `neighbors` only, and `planes`; or `mono`.
+   `patchmatch`), of `neighbors` only, and `planes`; or `mono`. `transients`: what moves before a sensor.
 5. `checks`: whether all this fits together; `misfits`: what is said where it does not. `colours`: photos of several
    exposures brought to one.
 

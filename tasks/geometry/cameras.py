@@ -192,12 +192,13 @@ def surface_of_pixels(column: NDArray[np.integer], row: NDArray[np.integer], dep
     return np.asarray(local @ camera.world_to_camera[:3, :3])
 
 
-def nearest_views(cameras: Cameras, view: int, count: int) -> list[int]:
-    """Rows of the nearest other cameras that look the same way as one does, within 45 degrees; the nearest first."""
+def nearest_views(cameras: Cameras, view: int, count: int, within: float = 45) -> list[int]:
+    """Rows of the nearest other cameras that look the same way as one does, within so many degrees; the nearest
+    first."""
     poses = cameras.world_to_camera
     centers = centers_of(poses)
     distance = np.linalg.norm(centers - centers[view], axis=1)
-    distance[poses[:, 2, :3] @ poses[view, 2, :3] < np.sqrt(0.5)] = np.inf
+    distance[poses[:, 2, :3] @ poses[view, 2, :3] < np.cos(np.radians(within))] = np.inf
     distance[view] = np.inf
     nearest = np.argsort(distance, kind="stable")[:count]
     return [int(other) for other in nearest if np.isfinite(distance[other])]

@@ -3,7 +3,7 @@
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
                                           [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | ...]
                                           [--photos] [--lying] [--shaken MM,DEG [--drift]] [--larger FACTOR]
-                                          [--dark] [--uneven] [--bent RADIAL] [--focal FACTOR]
+                                          [--dark] [--uneven] [--bent RADIAL] [--focal FACTOR] [--arm]
                                           [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
@@ -19,7 +19,8 @@ place instead (`tests/support/generated_*.py`). With --photos, from the photos a
 degrees (root mean square), each for itself, or, with --drift, each farther off than the one before. With --larger,
 depth is so many times as large as it should be. With --dark, photos are half as bright, blurred and noisy; with
 --uneven, each has an exposure and a white balance of its own. With --bent, photos have a first radial distortion of
-which nothing is said; with --focal, focal lengths are stated so many times as long as they are.
+which nothing is said; with --focal, focal lengths are stated so many times as long as they are. With --arm, an arm
+reaches into each photo, elsewhere in each; it is no instance.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
-from altered_captures import altered, bend, darken, enlarge, expose_each, lay_down, read_image, shake, zoom
+from altered_captures import altered, bend, darken, enlarge, expose_each, lay_down, reach_in, read_image, shake, zoom
 from depth_sensor import sensed
 from generated_bedroom import generate_bedroom
 from generated_desk import generate_desk
@@ -170,6 +171,7 @@ def main() -> None:
     parser.add_argument("--uneven", action="store_true", help="photos of different exposure")
     parser.add_argument("--bent", type=float, help="first radial distortion coefficient of the photos, not stated")
     parser.add_argument("--focal", type=float, help="factor on the stated focal lengths")
+    parser.add_argument("--arm", action="store_true", help="an arm in each photo")
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--look", type=Path, help="a folder for pictures")
     args = parser.parse_args()
@@ -193,6 +195,8 @@ def main() -> None:
                 folder = altered(folder, f"bent-{args.bent}", lambda copy: bend(copy, args.bent))
             if args.focal:
                 folder = altered(folder, f"focal-{args.focal}", lambda copy: zoom(copy, args.focal))
+            if args.arm:
+                folder = altered(folder, "arm", reach_in)
             found = outcome(folder, params, Store(Path(kept)), args.photos)
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             cells = [f"{100 * values[name]:.1f}" for name in COLUMNS] + [f"{values[name]:.0f}" for name in COUNTS]

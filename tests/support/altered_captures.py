@@ -11,7 +11,7 @@ import numpy as np
 from bent_room import straight_places
 
 
-def altered(capture: Path, name: str, change: Callable[[Path], None], place: Path | None = None) -> Path:
+def altered(capture: Path, name: str, change: Callable[[Path], object], place: Path | None = None) -> Path:
     """A copy of a capture, changed where it lies: in a place, or beside the capture; made first if it is not there."""
     folder = (place or capture.parent) / f"{capture.name}-{name}"
     if not folder.exists():
@@ -76,6 +76,34 @@ def zoom(folder: Path, factor: float) -> None:
         matrix = np.loadtxt(file)
         matrix[[0, 1], [0, 1]] *= factor
         np.savetxt(file, matrix)
+
+
+def reach_in(folder: Path, every: int = 1) -> np.ndarray:
+    """Let an arm reach into every so many photos, elsewhere in each, 90 cm before the camera; it is no instance.
+
+    Returns where it is: [photos, H, W].
+    """
+    random = np.random.default_rng(3)
+    photos = sorted(folder.glob("color/*"))
+    height, width = read_image(photos[0]).shape[:2]
+    arms = np.zeros((len(photos), height, width), np.uint8)
+    for photo, arm in zip(photos[::every], arms[::every], strict=True):
+        start = np.array([random.uniform(0.1, 0.9) * width, height - 1])
+        tip = np.array([start[0] + random.normal(0, 0.12) * width, 0.6 * height])
+        cv2.line(arm, *(tuple(map(int, end)) for end in (start, tip)), 1, int(0.11 * height))
+        cv2.circle(arm, tuple(map(int, tip)), int(0.085 * height), 1, -1)
+        image, inside = read_image(photo).astype(np.float32), arm > 0
+        shade = 0.55 + 0.5 * cv2.GaussianBlur(arm.astype(np.float32), (0, 0), 8)[..., None]
+        skin = np.array([120.0, 150.0, 205.0]) * shade + random.normal(0, 4, image.shape)
+        image[inside] = skin[inside]
+        cv2.imwrite(str(photo), np.clip(image, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])
+        for kind, value in (("depth", 900), ("instance", 0), ("instance_masks", 0), ("part", 0)):
+            file = folder / kind / f"{photo.stem}.png"
+            if file.exists():
+                behind = read_image(file)
+                behind[cv2.resize(arm, behind.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0] = value
+                cv2.imwrite(str(file), behind)
+    return arms > 0
 
 
 def darken(folder: Path) -> None:
