@@ -31,7 +31,7 @@ _THICK, _AROUND = 7, 2
 """What is narrower may be an edge that was not measured well; and so far round the rest its border may lie."""
 _TRUSTED, _STILL = 0.9, 2
 """Of all other pixels so many, and so many times as many as move, must be where other views see them: where a pose is
-wrong, everything seems to move. Of noisy rooms and captures .93 and more are, of views with wrong poses .64 to .83."""
+wrong, everything seems to move. Under right poses, with noisy depth, .89 and more are, under wrong ones .64 to .83."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ def transients(
 ) -> Transients:
     """The pixels of each view through whose places at least `params.views` others see, and hardly any sees them.
 
-    Compared are the nearest views that look the same way. Says what is ignored. What only one photo shows, what has no
-    depth, and what stood still in some of the photos, stays.
+    Says what is ignored. What has no depth, what stands where no other view looks, and what stood still in some of the
+    photos, stays.
     """
     views = [_View.of(camera_of(cameras, row), depths[row].depth) for row in range(len(cameras))]
 

@@ -48,3 +48,17 @@ def test_frames_of_a_capture_in_which_nothing_moves_are_those_that_were_read(cap
     called, _ = frames(still, tmp_path / "store")
     assert called.results() == frames(still, tmp_path / "store", *KEPT)[0].results()
     assert called.computed()["capture.transients"] == 1
+
+
+def test_views_that_were_kept_back_count_whole(captures, tmp_path):
+    """Of these only the photos are looked at."""
+    import shutil
+
+    reached = tmp_path / "room"
+    shutil.copytree(captures[1], reached)
+    shutil.copytree(captures[1], reached / "held_out")
+    called = run_tiny(reached, tmp_path / "store", "--until", "ingest_held_out")
+    assert called.code == 0, called.err
+    for digest in called.results()["ingest_held_out"]:
+        assert decode_valid(Store(tmp_path / "store").get(digest)).all()
+    assert "capture.transients" not in called.computed()

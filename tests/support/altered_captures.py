@@ -79,7 +79,7 @@ def zoom(folder: Path, factor: float) -> None:
 
 
 def reach_in(folder: Path, every: int = 1) -> np.ndarray:
-    """Let an arm reach into every so many photos, elsewhere in each, 90 cm before the camera; it is no instance.
+    """Let an arm reach into every so many photos, elsewhere in each, nearer than all that it hides; it is no instance.
 
     Returns where it is: [photos, H, W].
     """
@@ -97,12 +97,14 @@ def reach_in(folder: Path, every: int = 1) -> np.ndarray:
         skin = np.array([120.0, 150.0, 205.0]) * shade + random.normal(0, 4, image.shape)
         image[inside] = skin[inside]
         cv2.imwrite(str(photo), np.clip(image, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])
-        for kind, value in (("depth", 900), ("instance", 0), ("instance_masks", 0), ("part", 0)):
+        for kind in ("depth", "instance", "instance_masks", "part"):
             file = folder / kind / f"{photo.stem}.png"
             if file.exists():
-                behind = read_image(file)
-                behind[cv2.resize(arm, behind.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0] = value
-                cv2.imwrite(str(file), behind)
+                values = read_image(file)
+                there = cv2.resize(arm, values.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
+                known = values[there & (values > 0)]
+                values[there] = 0.7 * known.min() if kind == "depth" and len(known) else 0
+                cv2.imwrite(str(file), values)
     return arms > 0
 
 
