@@ -66,8 +66,10 @@ class Capture:
 
     frames: tuple[Frame, ...]
     cameras: Cameras
+    still: tuple[Frame, ...]
+    """The frames, of which no pixel counts where something moves: what Splat learns from."""
     placed: Placed
-    """These two, and what tells how exact the cameras are that came with the capture."""
+    """Frames and cameras, and what tells how exact the cameras are that came with the capture."""
     by_view: tuple[Camera, ...]
     """The cameras one by one."""
     depths: tuple[DepthMap, ...]
@@ -104,7 +106,7 @@ class Capture:
     @property
     def views(self) -> Views:
         """What every step of Splat looks at."""
-        return Views(self.frames, self.by_view, self.depths, self.unit, self.colours)
+        return Views(self.still, self.by_view, self.depths, self.unit, self.colours)
 
 
 def capture(
@@ -140,14 +142,14 @@ def capture(
     given: Gaussians | None = None
     if scene.given_scene is not None:
         given = given_scene(frames, cameras, file=reference(scene.given_scene), params=params.given)
-    placing = None
+    placing, still = None, frames
     if sensed is not None:
         advise = params.calibrate == "none"
         compared = params.registration.in_use(advise=advise)
         placing = registration(frames, cameras, sensed, advise=advise, params=compared)
         fitting = fitting_depth(frames, cameras, sensed, placing, params)
         scaled = scaled_depth(cameras, fitting, names, params)
-        frames = _without_transients(frames, cameras, scaled, names, params)
+        still = _without_transients(frames, cameras, scaled, names, params)
         depths = completed_depth(frames, cameras, scaled, names, params)
     elif params.calibrate == "depth":
         raise InputError(
@@ -165,6 +167,7 @@ def capture(
     return Capture(
         frames=frames,
         cameras=cameras,
+        still=still,
         placed=placed,
         by_view=by_view,
         depths=depths,

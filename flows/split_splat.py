@@ -41,7 +41,7 @@ LEADS_TO = {
     "merge_pair": "merge",
     "rendered": "describe",
     "localized": "cameras_held_out",
-    "without_transients": "ingest",
+    "without_transients": "reconstruct",
 }
 """Steps of which only other results tell what nodes there are: the result that all of these lead to."""
 LEADS_TO_CAMERAS = frozenset(

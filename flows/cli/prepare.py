@@ -186,8 +186,7 @@ def prepare(
         extra: Capture | None = None
         if held_out.is_dir():
             # Of these views only the photos count.
-            still = replace(params.capture.transients, views=0)
-            plain = replace(params.capture, depth="auto", calibrate="none", refine_poses="never", transients=still)
+            plain = replace(params.capture, depth="auto", calibrate="none", refine_poses="never")
             kept = open_scene(held_out)
             same_lens = set(kept.lenses or ()) <= set(scene.lenses or ())
             trained = own.placed if same_lens else replace(own.placed, fit=None)

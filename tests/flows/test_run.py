@@ -229,7 +229,7 @@ def test_until_stops_there_and_writes_no_output(tiny, tmp_path):
     steps = {n["step"] for n in called.document()["nodes"]}
     of_poses = {"capture.cameras", "capture.pose_pairs", "capture.pose_fit"}
     of_depth = {"capture.sensor_depth", "capture.registration", "capture.depth_scale", "capture.unit"}
-    assert steps == {"capture.ingest", *of_poses, *of_depth, "capture.transients", "capture.colours", "split.dense"}
+    assert steps == {"capture.ingest", *of_poses, *of_depth, "capture.colours", "split.dense"}
     assert not (tmp_path / "out").exists()
 
 
