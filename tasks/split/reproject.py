@@ -183,12 +183,10 @@ def _drawn(painted: PaintedView, view: Visibility, shown: dict[int, Bool], param
     ids = stack_exclusive(shown, view.height, view.width)
     labels = np.array(sorted(shown), np.int32)
     good = set(labels[agreements(painted, ids, labels) >= params.min_agreement].tolist())
-    in_front = labels_in_front(painted, params.min_points)
-    missing = [label for label in in_front if label not in good]
+    missing = [label for label in labels_in_front(painted, params.min_points) if label not in good]
     if not missing:
         return {}
     nearest, distance = nearest_painted(painted, view.height, view.width)
-    nearest[~np.isin(nearest, in_front)] = 0
     masks = {}
     for label in missing:
         reach = _reach_of(label, painted, view, params)
