@@ -18,15 +18,7 @@ from ss_flow.flows.depths import (
     without_sensor,
 )
 from ss_flow.flows.params import CaptureParams
-from ss_flow.flows.poses import (
-    Placed,
-    fitting_cameras,
-    localized_beside,
-    poses,
-    poses_by_depth,
-    refined_poses,
-    seen_through,
-)
+from ss_flow.flows.poses import Placed, fitting_cameras, kept_back, poses, poses_by_depth, refined_poses
 from ss_flow.graph import INDEX, each, expand, pick
 from ss_flow.task import Reference
 from ss_flow.tasks.artifacts import (
@@ -118,8 +110,8 @@ def capture(
 ) -> Capture:
     """Add the nodes that read a capture.
 
-    reference: turns a path into a file reference (digests are remembered outside the flow). trained: the
-    photos that are trained on, where those of this capture are kept back; with the fit of a lens that is theirs, too.
+    reference: turns a path into a file reference (digests are remembered outside the flow). trained: the photos that
+    are trained on, where those of this capture are kept back; with the fit of a lens that is theirs, too.
     Raises InputError when the depth that the parameters ask for cannot be had.
     """
     source = depth_source(scene, params)
@@ -245,11 +237,7 @@ def _placed(
     if compares_poses(scene, params) and has_pycolmap():
         return fitting_cameras(frames, cameras, sensed, params, "focal" if distortion_stated else "all")
     placed = Placed(frames, cameras, sensed)
-    if trained is None:
-        return placed
-    if trained.fit is not None:
-        placed = seen_through(trained.fit, placed)
-    return placed if trained.given is None else localized_beside(trained, trained.given, placed, params)
+    return placed if trained is None else kept_back(placed, trained, params)
 
 
 def compares_poses(scene: SceneFiles, params: CaptureParams) -> bool:

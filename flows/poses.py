@@ -139,18 +139,23 @@ def fitting_cameras(
     return Placed(straight, found, sensed, cameras, fit)
 
 
-def seen_through(fit: PoseFit, placed: Placed) -> Placed:
+def kept_back(placed: Placed, trained: Placed, params: CaptureParams) -> Placed:
+    """Photos that are kept back from those that are trained on: seen through the lens that was found for these, where
+    they have its fit, and placed anew among them, where their poses were refined."""
+    if trained.fit is not None:
+        placed = _seen_through(trained.fit, placed)
+    return placed if trained.given is None else _localized(placed, trained, trained.given, params)
+
+
+def _seen_through(fit: PoseFit, placed: Placed) -> Placed:
     """The same with the lens that other photos of the same camera need, as `fitting_cameras` found; depth stays."""
     given = placed.cameras
     found = expand(fit, lambda one: with_lens(given, fit) if one.other_lens else given)
     return replace(placed, frames=_straight(placed.frames, found, fit), cameras=found)
 
 
-def localized_beside(trained: Placed, given: Cameras, kept: Placed, params: CaptureParams) -> Placed:
-    """Photos that are kept back, placed anew among those that are trained on, where the poses of these were refined.
-
-    given: the cameras with which the latter came.
-    """
+def _localized(kept: Placed, trained: Placed, given: Cameras, params: CaptureParams) -> Placed:
+    """given: the cameras with which the photos came that are trained on."""
 
     def found() -> Cameras:
         photos, looks, matches = compared(trained.frames, params.sfm, None)
@@ -158,11 +163,7 @@ def localized_beside(trained: Placed, given: Cameras, kept: Placed, params: Capt
 
         def with_all(photo: Features) -> Matches:
             seen = look(photo, count=params.sfm.pairs.look_features)
-            chosen = expand(
-                cast(Any, looks),
-                lambda count: partners(seen, pick(looks, range(count)), place=count, params=params.sfm.pairs),
-            )
-            return expand(chosen, lambda plan: match(photo, pick(photos, plan.row.tolist())))
+            return expand(cast(Any, looks), lambda count: _with_first(count, photo, seen, photos, looks, params.sfm))
 
         beside = each(own, build=with_all)
         return localized(kept.cameras, own, beside, trained.cameras, photos, matches, params=params.refine)
@@ -197,10 +198,17 @@ def matched(
     """Every photo matched with its partners among those before it."""
 
     def of_photo(photo: Features, row: int) -> Matches:
-        chosen = partners(looks[row], pick(looks, range(row)), place=row, params=params.pairs)
-        return expand(chosen, lambda plan: match(photo, pick(found, plan.row.tolist())))
+        return _with_first(row, photo, looks[row], found, looks, params)
 
     return each(found, INDEX, names=names, build=of_photo)
+
+
+def _with_first(
+    count: int, photo: Features, seen: Look, found: tuple[Features, ...], looks: tuple[Look, ...], params: SfmParams
+) -> Matches:
+    """A photo matched with its partners among the first `count`; seen: its first look."""
+    chosen = partners(seen, pick(looks, range(count)), place=count, params=params.pairs)
+    return expand(chosen, lambda plan: match(photo, pick(found, plan.row.tolist())))
 
 
 def rematched(found: tuple[Features, ...], looks: tuple[Look, ...], row: int, total: int, params: SfmParams) -> Matches:

@@ -5,14 +5,14 @@ Each photo shows it somewhere else, and the depth of the others sees through the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ss_flow.running import in_threads, warn
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Frame, Int32
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Frame, Int32
 from ss_flow.tasks.geometry.cameras import Camera, backproject, camera_of, nearest_views, pixels_in_view
 from ss_flow.tasks.geometry.images import decode_valid, encode_valid, size_within
 from ss_flow.tasks.packed import Masks
@@ -109,9 +109,11 @@ def _moving(view: _View, others: Sequence[_View], params: TransientParams) -> Bo
     known = np.flatnonzero(view.depth)
     points = backproject(view.depth, view.camera)[known]
     through, seen = np.zeros(len(known), int), np.zeros(len(known), int)
-    for sees_through, sees in _looks(points, others):
-        through[sees_through] += 1
-        seen[sees] += 1
+    for other in others:
+        rows, column, row, z = pixels_in_view(points, other.camera)
+        measured = other.depth[row, column]
+        through[rows[measured > (1 + _BEHIND) * z]] += 1
+        seen[rows[np.abs(measured - z) < _SAME * z]] += 1
     moves = (through >= params.views) & (seen <= _CONFIRMED * through)
     judged = ~moves & (through + seen >= params.views)
     stands = (judged & (seen > through)).sum()
@@ -119,14 +121,6 @@ def _moving(view: _View, others: Sequence[_View], params: TransientParams) -> Bo
     if stands >= _TRUSTED * judged.sum() and stands >= _STILL * moves.sum():
         mask.ravel()[known[moves]] = True
     return _pieces(mask, params.min_area)
-
-
-def _looks(points: Float64, others: Sequence[_View]) -> Iterator[tuple[Int32, Int32]]:
-    """Rows of the points [N, 3] that each other view sees through, and of those that it sees."""
-    for other in others:
-        rows, column, row, z = pixels_in_view(points, other.camera)
-        measured = other.depth[row, column]
-        yield rows[measured > (1 + _BEHIND) * z], rows[np.abs(measured - z) < _SAME * z]
 
 
 def _pieces(mask: Bool, min_area: float) -> Bool:

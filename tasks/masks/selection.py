@@ -35,8 +35,8 @@ class SelectionParams:
 
 
 def paint_for_selection(view: Visibility, label: Int32, params: SelectionParams) -> PaintedView:
-    """The labels [N] of all dense points as masks are picked by: by the area that they cover, or, with "all", by their
-    number."""
+    """The labels [N] of all dense points as masks are picked by: by the area that they cover, where points without one
+    count less (`unlabelled`), or, with "all", by their number."""
     painted = paint_labels(view, label)
     if params.masks == "all":
         return painted
