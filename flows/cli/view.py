@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import time
+import signal
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -110,9 +112,9 @@ class View:
 
             server, address = start(self.host, self.port, self.what)
             show(server, values, around)
-            out.print(f"{address}\nCtrl-C ends it.")
-            with contextlib.suppress(KeyboardInterrupt):
-                _wait()
+            with _ctrl_c_put_off() as wait:
+                out.print(f"{address}\nCtrl-C ends it.")
+                wait()
             server.stop()
         else:
             for line in told(values, digests, store, run, asked):
@@ -173,11 +175,11 @@ class View:
         rest = "." if "set" in run.document else ", and the run's other options."
         saved = f"Edits are saved in {escape(str(script))} ({len(operations)} so far)."
         try:
-            with contextlib.suppress(KeyboardInterrupt):
+            with _ctrl_c_put_off() as wait:
                 out.print(f"{viewer.address}\nCtrl-C ends it. {saved}")
                 out.print(f"Corrections are made by: {escape(again + rest)}")
                 viewer.load_pictures()
-                _wait()
+                wait()
             if viewer.panel.unsaved:
                 out.print("The last edits were not saved.")
         finally:
@@ -185,9 +187,26 @@ class View:
         return 0
 
 
-def _wait() -> None:
-    while True:
-        time.sleep(3600)
+@contextlib.contextmanager
+def _ctrl_c_put_off() -> Iterator[Callable[[], object]]:
+    """Yields what waits for Ctrl-C or SIGTERM. One that comes earlier counts there; a second one ends what is done.
+
+    An exception out of nowhere could end a lock or a callback of the server halfway, or be lost in one.
+    """
+    asked = SimpleQueue[int]()  # whose `put`, unlike that of an event, may come in the middle of `get`
+
+    def ask(number: int, _: object) -> None:
+        if not asked.empty():
+            raise KeyboardInterrupt
+        asked.put(number)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            yield asked.get
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def search_of(run: FinishedRun) -> Search | None:

@@ -47,6 +47,11 @@ def started(*arguments: object) -> tuple[subprocess.Popen[str], str, str]:
     return process, process.stdout.readline().strip(), process.stdout.readline()
 
 
+def interrupted(*_: object) -> None:
+    """Ctrl-C in the middle of what is done before it is waited for."""
+    signal.raise_signal(signal.SIGINT)
+
+
 class TestWithTheExtra:
     @pytest.fixture(autouse=True)
     def extra(self) -> None:
@@ -71,10 +76,7 @@ class TestWithTheExtra:
         assert called.code == 2 and "operation 1 (remove): instances is [999]" in called.err
 
     def test_the_command_that_corrects_works_from_anywhere(self, tiny, tmp_path, monkeypatch):
-        def wait() -> None:
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr("ss_flow.flows.cli.view._wait", wait)
+        monkeypatch.setattr("ss_flow.flows.view.viewer.Viewer.load_pictures", interrupted)
         monkeypatch.chdir(tiny.out.parent)
         hints = tmp_path / "h.json"
         asked = ["--correct", os.path.relpath(hints), "--cache", tiny.store, "--port", "0"]
@@ -94,8 +96,22 @@ class TestWithTheExtra:
         assert process.returncode == 0 and not err and "saved in" in told
         assert not (tiny.out.parent / "out.edit.json").exists()
 
+    def test_a_second_interrupt_ends_what_the_first_one_lets_go_on(self, tiny, monkeypatch):
+        after: list[bool] = []
+
+        def twice(_: object) -> None:
+            signal.raise_signal(signal.SIGINT)
+            after.append(True)
+            signal.raise_signal(signal.SIGINT)
+            after.append(False)
+
+        monkeypatch.setattr("ss_flow.flows.view.viewer.Viewer.load_pictures", twice)
+        before = signal.getsignal(signal.SIGINT)
+        assert ss_flow("view", tiny.out, "--cache", tiny.store, "--port", "0").code == 0 and after == [True]
+        assert signal.getsignal(signal.SIGINT) == before
+
     def test_an_edited_run_whose_source_changed_or_is_gone_says_so(self, warm, tmp_path, monkeypatch):
-        monkeypatch.setattr("ss_flow.flows.cli.view._wait", lambda: None)
+        monkeypatch.setattr("ss_flow.flows.view.viewer.Viewer.load_pictures", interrupted)
         script, edited = tmp_path / "s.json", tmp_path / "edited"
         script.write_text('{"operations": []}')
         assert ss_flow("edit", warm.out, script, "--out", edited, "--cache", warm.store).code == 0
