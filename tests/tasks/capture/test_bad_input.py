@@ -103,6 +103,14 @@ def photo_that_is_a_cut_jpeg(root):
     return root
 
 
+@case("10.jpg", "is expected. Of the photos after it 1 cannot be read either: 11.jpg.")
+def two_photos_that_are_cut(root):
+    made.photos(root)
+    cut(root / "10.jpg")
+    cut(root / "11.jpg")
+    return root
+
+
 @case("20.heic", "cut short or damaged")
 def photo_that_is_a_cut_heic(root):
     made.photos(root)
