@@ -66,11 +66,12 @@ def frames(
     dim: list[str] = []
     for i, (name, ref) in enumerate(zip(names, photos, strict=True)):
         try:
-            photo, pixels = _read(ref)
+            photo = read_photo(ref.path)
         except InputError as error:
-            raise InputError(f"{error}{_unread_too(photos[i + 1 :])}") from error
+            raise InputError(f"{error}{_damaged_too(photos[i + 1 :])}") from error
         mask = valid[i] if valid else None
         lens = lenses[i] if lenses else None
+        pixels = pixels_of(photo, str(ref.path))
         if black_borders:
             pixels = replace(pixels, opaque=~black_border(pixels.image))
         frame = frame_of(name, photo, pixels, str(ref.path), mask, lens, params)
@@ -94,17 +95,12 @@ def frames(
     return tuple(result)
 
 
-def _read(ref: FileRef) -> tuple[Photo, Pixels]:
-    photo = read_photo(ref.path)
-    return photo, pixels_of(photo, str(ref.path))
-
-
-def _unread_too(photos: tuple[FileRef, ...]) -> str:
-    """What to add of photos that cannot be read either, so that all are known at once."""
+def _damaged_too(photos: tuple[FileRef, ...]) -> str:
+    """What to add of photos that are damaged as well, so that all are known at once."""
     names = []
     for ref in photos:
         try:
-            _read(ref)
+            read_photo(ref.path)
         except InputError:
             names.append(ref.path.name)
     return f" Of the photos after it {len(names)} cannot be read either: {first_of(names)}." if names else ""

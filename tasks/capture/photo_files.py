@@ -76,6 +76,8 @@ def read_photo(path: Path) -> Photo:
 def inspect(data: bytes, where: str) -> Photo:
     """As `read_photo`, for the bytes of a file; `where` is what to name in a message."""
     try:
+        if not data:
+            raise EOFError("an empty file")
         if data.startswith(b"\xff\xd8"):
             return _inspect_jpeg(data)
         if data.startswith(_PNG_SIGNATURE):
