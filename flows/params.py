@@ -34,6 +34,7 @@ from ss_flow.tasks.splat.refine import RefineParams
 from ss_flow.tasks.splat.render_masks import RenderMasksParams
 from ss_flow.tasks.splat.resolve import ResolveParams
 from ss_flow.tasks.split.boards import BoardParams
+from ss_flow.tasks.split.close_ups import CloseUpParams
 from ss_flow.tasks.split.dense import DenseParams
 from ss_flow.tasks.split.dense_splatting import DenseSplattingParams
 from ss_flow.tasks.split.hierarchy import HierarchyParams
@@ -103,6 +104,7 @@ class SplitParams:
     """Standard deviation of a photo's noise from pixel to pixel, of 255 grey values, above which the segmenter sees it
     smoothed; 0 = never."""
     segment: SegmentParams = field(default_factory=SegmentParams)
+    close_ups: CloseUpParams = field(default_factory=CloseUpParams)
     rgbd: SegmentRgbdParams = field(default_factory=SegmentRgbdParams)
     dense_source: Literal["depth", "splatting"] = "depth"
     """Where the dense points come from: all depth maps, or a short splatting of the whole scene, as in the paper."""

@@ -26,6 +26,7 @@ from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
 from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.appearances import appearances
 from ss_flow.tasks.split.boards import part_boards
+from ss_flow.tasks.split.close_ups import close_ups
 from ss_flow.tasks.split.correct import correct, corrected_tree, part_masks
 from ss_flow.tasks.split.cut import cut, cut_parts
 from ss_flow.tasks.split.dense import dense
@@ -201,11 +202,28 @@ def _masks_of_views(
             names=capture.names,
             build=lambda frame, depth, camera: segment_rgbd(frame, depth, camera, params=params.rgbd),
         )
-    return each(
+    segmenting = params.segment.in_use()
+    masks = each(
         capture.frames,
         embeddings,
         names=capture.names,
-        build=lambda frame, embedding: segment(frame, embedding, params=params.segment.in_use(), model=segmenter),
+        build=lambda frame, embedding: segment(frame, embedding, params=segmenting, model=segmenter),
+    )
+    if not params.close_ups.side:
+        return masks
+    return each(
+        capture.frames,
+        masks,
+        names=capture.names,
+        build=lambda frame, whole: close_ups(
+            frame,
+            whole,
+            params=params.close_ups,
+            segmenting=segmenting,
+            model=segmenter,
+            turns=capture.turns,
+            noise=params.noise,
+        ),
     )
 
 

@@ -2,8 +2,8 @@
 
 The steps, in the order in which they run:
 
-1. `embed`, `segment` or `segment_rgbd` (or `hints`, from clicks): the 2D masks of each view. `regions`: what
-   `segment_rgbd` is made of.
+1. `embed`, `segment`, `close_ups`, or `segment_rgbd` (or `hints`, from clicks): the 2D masks of each view. `regions`:
+   what `segment_rgbd` is made of.
 2. `dense` or `dense_splatting`: the dense points of the scene.
 3. `visibility` (Eq. 1, 2): the points that each view sees, and `visible_by_color`: where it has no depth. `observe`
    (Eq. 3): the masks that they lie under.

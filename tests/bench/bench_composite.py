@@ -1,26 +1,27 @@
 """How many things are exactly one instance: Split with a segmenter's masks on generated rooms of composite things.
 
     python tests/bench/bench_composite.py [--seeds 0 1] [--preset default] [--set STEP.PARAM=VALUE ...]
-                                          [--gripper | --sensor | --bedroom | --desk | --kitchen | --shelf | ...]
+                                          [--gripper | --sensor | --objects N | --bedroom | --desk | --kitchen | ...]
                                           [--photos] [--lying] [--shaken MM,DEG [--drift]] [--larger FACTOR]
                                           [--dark] [--uneven] [--bent RADIAL] [--focal FACTOR] [--arm]
                                           [--store DIR] [--look DIR]
 
 SS_FLOW_MODELS names the folder of the segmenter's weights. A line for each seed, on the pixels of all views pooled:
-whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more than
-a tenth), mIoU, PQ, over- and under-segmentation, in per cent; the predicted ids, the true things, seconds. Then for
-each thing its best IoU, and of how many predicted ids each covers at least a tenth of it. With --store, rooms and
+whole (the share of things that are one predicted id, which has an IoU of at least 0.5, while no second covers more
+than a tenth), mIoU, PQ, over- and under-segmentation, in per cent; the predicted ids, the true things, seconds. Then
+for each thing its best IoU, and of how many predicted ids each covers at least a tenth of it. With --store, rooms and
 results are kept: a run with other parameters computes only what they change. --look draws photo, truth (parts as
-shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With --desk,
-of small things on a table, in few near views of a depth sensor; with --bedroom, a bedroom, with --kitchen, a kitchen,
-with --shelf, a shelf of goods, with --walk, a table in a garden, with --tote, goods in a heap, with --office, a work
-place instead (`tests/support/generated_*.py`). With --photos, from the photos alone: without depth and poses. With
---lying, photos lie on their side, as a phone stores them. With --shaken, poses are off by so many millimetres and
-degrees (root mean square), each for itself, or, with --drift, each farther off than the one before. With --larger,
-depth is so many times as large as it should be. With --dark, photos are half as bright, blurred and noisy; with
---uneven, each has an exposure and a white balance of its own. With --bent, photos have a first radial distortion of
-which nothing is said; with --focal, focal lengths are stated so many times as long as they are. With --arm, an arm
-reaches into each photo, elsewhere in each; it is no instance.
+shades) and prediction of some views. With --sensor, rooms have the depth of a camera as the first Kinect. With
+--objects, it is a room of so many small things of one piece, in 40 views. With --desk, of small things on a table, in
+few near views of a depth sensor; with --bedroom, a bedroom, with --kitchen, a kitchen, with --shelf, a shelf of goods,
+with --walk, a table in a garden, with --tote, goods in a heap, with --office, a work place instead
+(`tests/support/generated_*.py`). With --photos, from the photos alone: without depth and poses. With --lying, photos
+lie on their side, as a phone stores them. With --shaken, poses are off by so many millimetres and degrees (root mean
+square), each for itself, or, with --drift, each farther off than the one before. With --larger, depth is so many times
+as large as it should be. With --dark, photos are half as bright, blurred and noisy; with --uneven, each has an
+exposure and a white balance of its own. With --bent, photos have a first radial distortion of which nothing is said;
+with --focal, focal lengths are stated so many times as long as they are. With --arm, an arm reaches into each photo,
+elsewhere in each; it is no instance.
 """
 
 from __future__ import annotations
@@ -101,6 +102,15 @@ def folder_of(room: RoomParams, place: Path, sensor: bool = False) -> Path:
     return folder
 
 
+def crowded_of(objects: int, seed: int, place: Path) -> Path:
+    """The capture of a room of so many small things, likewise."""
+    folder = place / f"crowded-{objects}-{seed}"
+    if not folder.exists():
+        room = RoomParams(objects=objects, views=40, width=640, height=480, seed=seed, held_out=0)
+        write_scene(generate(room), folder)
+    return folder
+
+
 def other_of(kind: str, seed: int, place: Path) -> Path:
     """The capture of a bedroom, a desk, a kitchen, a shelf or a garden, likewise."""
     folder = place / f"{kind}-{seed}"
@@ -143,8 +153,9 @@ def look(found: Outcome, folder: Path, place: Path) -> None:
     colors[0] = 0
     rows = []
     for i in [i for i in range(len(found.frames)) if i % 4 < 2]:
-        parts = read_image(folder / "part" / f"{found.frames[i].name}.png")
-        truth = colors[found.truth[i].ids] * (1 - 0.12 * (parts % 6))[..., None]
+        truth = colors[found.truth[i].ids]
+        if (file := folder / "part" / f"{found.frames[i].name}.png").exists():
+            truth = truth * (1 - 0.12 * (read_image(file) % 6))[..., None]
         row = [decode_rgb(found.frames[i]), truth.astype(np.uint8), colors[found.predicted[i].ids]]
         rows.append(np.hstack(row))
     for page in range(0, len(rows), 4):
@@ -160,6 +171,7 @@ def main() -> None:
     scene = parser.add_mutually_exclusive_group()
     scene.add_argument("--gripper", action="store_true", help="with a gripper before the lens")
     scene.add_argument("--sensor", action="store_true", help="with the depth of a depth camera")
+    scene.add_argument("--objects", type=int, help="a room of so many small things")
     for kind in OTHERS:
         scene.add_argument(f"--{kind}", dest="kind", action="store_const", const=kind, help=f"a {kind}, not a room")
     parser.add_argument("--photos", action="store_true", help="from the photos alone")
@@ -179,7 +191,12 @@ def main() -> None:
     with nullcontext(args.store) if args.store else tempfile.TemporaryDirectory() as kept:
         for seed in args.seeds:
             room = replace(ROOM, seed=seed, gripper=args.gripper)
-            folder = other_of(args.kind, seed, Path(kept)) if args.kind else folder_of(room, Path(kept), args.sensor)
+            if args.objects:
+                folder = crowded_of(args.objects, seed, Path(kept))
+            elif args.kind:
+                folder = other_of(args.kind, seed, Path(kept))
+            else:
+                folder = folder_of(room, Path(kept), args.sensor)
             if args.lying:
                 folder = altered(folder, "lying", lay_down)
             if args.shaken:
