@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ss_flow.errors import InputError
 from ss_flow.flows.capture import Capture
+from ss_flow.flows.masks import clicked_masks, labelled, masks_of_views
 from ss_flow.flows.params import SplitParams
 from ss_flow.graph import INDEX, each
 from ss_flow.tasks.artifacts import (
     Appearances,
-    Clicks,
     Hierarchy,
     InstanceMasks,
     InstancesInView,
@@ -23,10 +22,8 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.sam import EmbeddedPhoto, Embedding
-from ss_flow.tasks.split import hints
 from ss_flow.tasks.split.appearances import appearances
 from ss_flow.tasks.split.boards import part_boards
-from ss_flow.tasks.split.close_ups import close_ups
 from ss_flow.tasks.split.correct import correct, corrected_tree, part_masks
 from ss_flow.tasks.split.cut import cut, cut_parts
 from ss_flow.tasks.split.dense import dense
@@ -38,8 +35,6 @@ from ss_flow.tasks.split.parts import find_parts
 from ss_flow.tasks.split.propagate import propagate
 from ss_flow.tasks.split.reproject import instances_in_view, reproject
 from ss_flow.tasks.split.reprompt import reprompt
-from ss_flow.tasks.split.segment import segment
-from ss_flow.tasks.split.segment_rgbd import segment_rgbd
 from ss_flow.tasks.split.tally import tally
 from ss_flow.tasks.split.visibility import visibility
 from ss_flow.tasks.split.visible_by_color import visible_by_color
@@ -99,7 +94,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
             build=lambda frame: embed(frame, model=segmenter, turns=capture.turns, noise=params.noise),
         )
     seen = _seen(capture, points, params)
-    masks, hinted = _masks(capture, embeddings, points, seen, segmenter, params)
+    masks, hinted = masks_of_views(capture, embeddings, points, seen, segmenter, params)
 
     # Which masks of all views show one object (Sec. 3.1.3).
     observed = each(
@@ -173,116 +168,6 @@ def _seen(capture: Capture, points: PointCloud, params: SplitParams) -> tuple[Vi
     )
 
 
-def _masks(
-    capture: Capture,
-    embeddings: tuple[Embedding, ...],
-    points: PointCloud,
-    seen: tuple[Visibility, ...],
-    segmenter: Model | None,
-    params: SplitParams,
-) -> tuple[tuple[MaskSet, ...], PointLabels | None]:
-    """The masks of all views (M_k; Sec. 3.1.1): the capture's own, those of clicked objects, or the segmenter's; and
-    the points labelled by the objects that were clicked, where some were."""
-    if capture.masks is not None:
-        return capture.masks, None
-    if capture.clicks is not None:
-        return _masks_of_hints(capture, capture.clicks, embeddings, points, seen, segmenter, params)
-    return _masks_of_views(capture, embeddings, segmenter, params), None
-
-
-def _masks_of_views(
-    capture: Capture, embeddings: tuple[Embedding, ...], segmenter: Model | None, params: SplitParams
-) -> tuple[MaskSet, ...]:
-    """The masks of all views, from the segmenter, or without one from colour, depth and normals."""
-    if segmenter is None:
-        return each(
-            capture.frames,
-            capture.depths,
-            capture.by_view,
-            names=capture.names,
-            build=lambda frame, depth, camera: segment_rgbd(frame, depth, camera, params=params.rgbd),
-        )
-    segmenting = params.segment.in_use()
-    masks = each(
-        capture.frames,
-        embeddings,
-        names=capture.names,
-        build=lambda frame, embedding: segment(frame, embedding, params=segmenting, model=segmenter),
-    )
-    if not params.close_ups.side:
-        return masks
-    return each(
-        capture.frames,
-        masks,
-        names=capture.names,
-        build=lambda frame, whole: close_ups(
-            frame,
-            whole,
-            params=params.close_ups,
-            segmenting=segmenting,
-            model=segmenter,
-            turns=capture.turns,
-            noise=params.noise,
-        ),
-    )
-
-
-def _masks_of_hints(
-    capture: Capture,
-    clicks: tuple[Clicks, ...],
-    embeddings: tuple[Embedding, ...],
-    points: PointCloud,
-    seen: tuple[Visibility, ...],
-    segmenter: Model | None,
-    params: SplitParams,
-) -> tuple[tuple[MaskSet, ...], PointLabels]:
-    """The masks of all views from points clicked in a few, and the points labelled by the clicked objects."""
-    if segmenter is None:
-        raise InputError(
-            "hints need a segmenter to be prompted with, and there is none; `ss-flow models list` names some."
-        )
-    clicked = _clicked(capture, clicks, embeddings, segmenter, params)
-    hinted = _labelled(points, seen, clicked, params)
-    masks = each(
-        capture.frames,
-        embeddings,
-        seen,
-        clicked,
-        names=capture.names,
-        build=lambda frame, embedding, visible, own: hints.spread(
-            EmbeddedPhoto(frame, embedding),
-            visible,
-            own,
-            hinted,
-            params=params.reprompt,
-            contained=params.segment.contained,
-            model=segmenter,
-        ),
-    )
-    return masks, hinted
-
-
-def _clicked(
-    capture: Capture,
-    clicks: tuple[Clicks, ...],
-    embeddings: tuple[Embedding, ...],
-    segmenter: Model,
-    params: SplitParams,
-    *,
-    apart: bool = False,
-) -> tuple[PromptedMasks, ...]:
-    """The masks that clicks ask for in their own views. apart: whether no clicked object is part of another."""
-    return each(
-        capture.frames,
-        embeddings,
-        clicks,
-        names=capture.names,
-        build=lambda frame, embedding, own: hints.clicked(
-            EmbeddedPhoto(frame, embedding), own, speckle=params.reprompt.speckle, model=segmenter, apart=apart
-        ),
-    )
-
-
 def _divided(
     capture: Capture,
     embeddings: tuple[Embedding, ...],
@@ -305,8 +190,8 @@ def _divided(
     if capture.corrections is not None:
         by_clicks: list[PointLabels] = []
         if segmenter is not None:
-            clicked = _clicked(capture, capture.corrections, embeddings, segmenter, params, apart=True)
-            by_clicks = [_labelled(points, seen, clicked, params)]
+            clicked = clicked_masks(capture, capture.corrections, embeddings, segmenter, params, apart=True)
+            by_clicks = [labelled(points, seen, clicked, params)]
         labels = correct(points, seen, capture.corrections, pieces, labels, by_clicks, names=capture.things)
     return labels
 
@@ -357,10 +242,3 @@ def _in_views(
             visible, pool, labels, (prompted[view],) if prompted else (), params=params.reproject.in_view()
         ),
     )
-
-
-def _labelled(
-    points: PointCloud, seen: tuple[Visibility, ...], clicked: tuple[PromptedMasks, ...], params: SplitParams
-) -> PointLabels:
-    """The points by what was clicked."""
-    return hints.label(points, seen, clicked, erosion=params.observe.erosion, tau_label=params.propagate.tau_label)
