@@ -16,6 +16,9 @@ _REST = (0.3, 0.7)
 """The same for the share that it holds of all but the largest piece, which alone may make up most of the IoU."""
 _OWN = 0.75
 """IoU with a single piece from which a mask is the piece's own."""
+_LARGEST = 0.5
+"""How much it counts that the segmenter is surer of the largest piece than of all: a mask of the trunk says less of
+whether the leaves are another thing than a mask of the leaves does."""
 _BALANCED = 0.1
 """Share of the smaller pieces in what a view sees of all, from which on the view counts in full."""
 
@@ -94,9 +97,13 @@ def agreement_of(
             continue
         total, largest, seen = total[rows, None], largest[rows, None], seen[rows]
         iou = inside / np.maximum(size + total - inside, 1)
-        rest = (inside - view.held[:, seen.argmax(axis=1)].T) / (total - largest)
-        surest_piece = np.where(seen > 0, view.own, 0).max(axis=1)
-        less_sure = (surest_piece[:, None] - view.quality) / max(doubt, 1e-9)
+        main = seen.argmax(axis=1)[:, None]
+        rest = (inside - view.held[:, main[:, 0]].T) / (total - largest)
+        own = np.where(seen > 0, view.own, 0)
+        own_main = np.take_along_axis(own, main, axis=1)
+        np.put_along_axis(own, main, 0, axis=1)
+        own_rest = own.max(axis=1, keepdims=True)
+        less_sure = np.maximum(own_rest - view.quality, _LARGEST * (own_main - view.quality)) / max(doubt, 1e-9)
         fit = ramp(iou, *_IOU) * ramp(rest, *_REST) * np.clip(1 - less_sure, 0, 1)
         agreed[rows] += weight[rows] * fit.max(axis=1)
     return (agreed + prior * prior_agreement) / np.maximum(asked + prior, 1e-9)

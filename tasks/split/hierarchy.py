@@ -67,7 +67,7 @@ class HierarchyParams:
 
     doubt: Fraction = 0.2
     """By how much the segmenter may be surer of a piece than of the whole (predicted IoU times stability) before the
-    whole no longer counts; from nothing to this, it counts less and less."""
+    whole no longer counts; from nothing to this, it counts less and less. Twice as much, of the largest piece."""
     silent: Fraction = 0.5
     """How much a view counts that says nothing of the pieces: none of its masks lies mostly on them and holds half of
     one. Small things have none from afar, neither as one nor in pieces. 1 = as much as one that shows them apart."""

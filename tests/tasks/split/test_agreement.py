@@ -18,11 +18,18 @@ def agreement(*views: View, silent: float = 0.3) -> float:
     return float(agreement_of(views, pair, doubt=0.2, silent=silent, prior=0.0, prior_agreement=0.0)[0])
 
 
-@pytest.mark.parametrize(("beside", "expected"), [(30, 0.25), (40, 1.0)])
+@pytest.mark.parametrize(("beside", "expected"), [(29, 0.25), (31, 1.0)])
 def test_a_mask_is_a_pieces_own_from_an_iou_of_three_quarters_on(beside, expected):
     # With a doubt of 0.2, a quarter of the agreement remains beside an own mask that is surer by 0.15.
-    both, surer = ((100, 100, 0), 0.8), ((100, 0, beside), 0.95)
-    assert agreement(view(both, surer)) == pytest.approx(expected)
+    both, surer = ((100, 90, 0), 0.8), ((0, 90, beside), 0.95)
+    assert agreement(view(both, surer, seen=(100, 90, 100))) == pytest.approx(expected)
+
+
+def test_a_surer_mask_of_the_largest_piece_says_half_as_much_against_the_whole():
+    whole, largest, smaller = ((100, 90, 0), 0.8), ((100, 0, 0), 0.95), ((0, 90, 0), 0.85)
+    assert agreement(view(whole, largest, seen=(100, 90, 100))) == pytest.approx(1 - 0.15 / 0.2 / 2)
+    assert agreement(view(whole, smaller, seen=(100, 90, 100))) == pytest.approx(1 - 0.05 / 0.2)
+    assert agreement(view(whole, largest, smaller, seen=(100, 90, 100))) == pytest.approx(1 - 0.15 / 0.2 / 2)
 
 
 @pytest.mark.parametrize(("points", "weight"), [(50, 1.0), (12, 1.0), (5, 0.5)])
