@@ -97,12 +97,10 @@ def agreement_of(
             continue
         total, largest, seen = total[rows, None], largest[rows, None], seen[rows]
         iou = inside / np.maximum(size + total - inside, 1)
-        main = seen.argmax(axis=1)[:, None]
-        rest = (inside - view.held[:, main[:, 0]].T) / (total - largest)
-        own = np.where(seen > 0, view.own, 0)
-        own_main = np.take_along_axis(own, main, axis=1)
-        np.put_along_axis(own, main, 0, axis=1)
-        own_rest = own.max(axis=1, keepdims=True)
+        main = seen.argmax(axis=1)
+        rest = (inside - view.held[:, main].T) / (total - largest)
+        own, is_main = np.where(seen > 0, view.own, 0), np.arange(seen.shape[1]) == main[:, None]
+        own_main, own_rest = ((own * which).max(axis=1, keepdims=True) for which in (is_main, ~is_main))
         less_sure = np.maximum(own_rest - view.quality, _LARGEST * (own_main - view.quality)) / max(doubt, 1e-9)
         fit = ramp(iou, *_IOU) * ramp(rest, *_REST) * np.clip(1 - less_sure, 0, 1)
         agreed[rows] += weight[rows] * fit.max(axis=1)
