@@ -71,8 +71,8 @@ class HierarchyParams:
     silent: Fraction = 0.5
     """How much a view counts that says nothing of the pieces: none of its masks lies mostly on them and holds half of
     one. Small things have none from afar, neither as one nor in pieces. 1 = as much as one that shows them apart."""
-    prior: NonNegative = 0.5
-    """So many views more are taken to have been asked about each union, so that a single view decides less."""
+    prior: NonNegative = 1.0
+    """So many views more are taken to have been asked about each union, so that one view alone does not decide."""
     prior_agreement: Fraction = 0.2
     """Share of these that are taken to show it. If none did, what only a few views can see would come apart."""
     min_agreement: Fraction = 0.2
