@@ -26,7 +26,6 @@ from ss_flow.tasks.split.segment import SegmentParams, segment
 Box = tuple[slice, slice]
 """Rows and columns of a photo."""
 
-
 _SMALL = 0.01
 """Share of a photo below which a mask is small ..."""
 _COARSE = 8
@@ -83,9 +82,10 @@ def close_ups(
         height, width = valid[box].shape
         part = Frame(frame.name, width, height, encode_png(rgb[box]), encode_valid(valid[box]), width, height)
         found = segment(part, embed(part, model=model, turns=turns, noise=noise), params=settings, model=model)
-        kept = np.flatnonzero(~_cut_off(found.dense(), box, frame))
+        shown = found.dense()
+        kept = np.flatnonzero(~_cut_off(shown, box, frame))
         placed = np.zeros((len(kept), frame.height, frame.width), bool)
-        placed[:, *box] = found.dense()[kept]
+        placed[:, *box] = shown[kept]
         masks.append(placed)
         predicted_iou.append(found.predicted_iou[kept])
         stability.append(found.stability[kept])

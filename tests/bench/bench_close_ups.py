@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from bench_masks import best_iou
-from bench_segment import load
+from bench_segment import first_segmenter, load
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from outlines import read_outlines
@@ -27,7 +27,6 @@ from outlines import read_outlines
 from ss_flow.flows import settings
 from ss_flow.flows.params import Params
 from ss_flow.tasks.artifacts import Float64
-from ss_flow.tasks.models.catalogue import available, default_folders, find
 from ss_flow.tasks.split.close_ups import CloseUpParams, close_ups
 from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.segment import segment
@@ -51,9 +50,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=8, help="so many that have labels, evenly spread")
     parser.add_argument("--models", type=Path, help="a folder of models; by default SS_FLOW_MODELS")
     args = parser.parse_args()
-    folders = [args.models] if args.models else default_folders()
-    names = [entry.name for entry in available("segmenter", folders)]
-    model = find(names[0], folders) if names else None
+    model = first_segmenter(args.models)
     if model is None:
         parser.error("no segmenter is here; see `ss-flow models list`")
     outlines = read_outlines(args.labels or args.capture / "instance")

@@ -22,7 +22,7 @@ from ss_flow.tasks.capture.ingest import IngestParams, frames
 from ss_flow.tasks.capture.scene import open_scene
 from ss_flow.tasks.geometry.images import decode_rgb
 from ss_flow.tasks.models import sam as network
-from ss_flow.tasks.models.catalogue import available, blake3_of, default_folders, find
+from ss_flow.tasks.models.catalogue import Model, available, blake3_of, default_folders, find
 from ss_flow.tasks.split import segment as step
 
 LARGE = 0.01
@@ -64,6 +64,13 @@ def load(path: Path, count: int) -> list[Frame]:
     )
 
 
+def first_segmenter(folder: Path | None) -> Model | None:
+    """The first segmenter of a folder of models, or of the usual ones; None where there is none."""
+    folders = [folder] if folder else default_folders()
+    names = [entry.name for entry in available("segmenter", folders)]
+    return find(names[0], folders) if names else None
+
+
 def best_iou(masks: MaskSet, others: MaskSet) -> Float32:
     """For each large mask the best IoU with any of the others."""
     one, other = (m.dense().reshape(len(m), -1).astype(np.float32) for m in (masks, others))
@@ -80,9 +87,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=0, help="so many, evenly spread; 0 = all")
     parser.add_argument("--models", type=Path, help="a folder of models; by default SS_FLOW_MODELS")
     options = parser.parse_args()
-    folders = [options.models] if options.models else default_folders()
-    names = [entry.name for entry in available("segmenter", folders)]
-    model = find(names[0], folders) if names else None
+    model = first_segmenter(options.models)
     if model is None:
         parser.error("no segmenter is here; see `ss-flow models list`")
     network.PromptedImage = CountingImage
