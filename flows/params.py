@@ -39,6 +39,7 @@ from ss_flow.tasks.split.dense import DenseParams
 from ss_flow.tasks.split.dense_splatting import DenseSplattingParams
 from ss_flow.tasks.split.hierarchy import HierarchyParams
 from ss_flow.tasks.split.observe import ObserveParams
+from ss_flow.tasks.split.overlooked import OverlookedParams
 from ss_flow.tasks.split.parts import PartsParams
 from ss_flow.tasks.split.propagate import PropagateParams
 from ss_flow.tasks.split.reproject import ReprojectParams
@@ -116,6 +117,7 @@ class SplitParams:
     apart, in CIELAB. 0 = it sees none there, and so where a sensor's gaps are closed (`capture.completion`)."""
     observe: ObserveParams = field(default_factory=ObserveParams)
     propagate: PropagateParams = field(default_factory=PropagateParams)
+    overlooked: OverlookedParams = field(default_factory=OverlookedParams)
     parts: PartsParams = field(default_factory=PartsParams)
     hierarchy: HierarchyParams = field(default_factory=HierarchyParams)
     granularity: Fraction = 0.45

@@ -31,6 +31,7 @@ from ss_flow.tasks.split.dense_splatting import dense_splatting
 from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.hierarchy import hierarchy
 from ss_flow.tasks.split.observe import observe
+from ss_flow.tasks.split.overlooked import asked, claimed, confirmed, overlooked, with_answers
 from ss_flow.tasks.split.parts import find_parts
 from ss_flow.tasks.split.propagate import propagate
 from ss_flow.tasks.split.reproject import instances_in_view, reproject
@@ -64,8 +65,10 @@ class Split:
     """Those that each view sees (P_k)."""
     masks: tuple[MaskSet, ...]
     """What the segmenter found in each view (M_k)."""
+    voted: PointLabels
+    """The labels that the views voted for (l_p)."""
     pieces: PointLabels
-    """The labels that the views voted for (l_p): the leaves of the tree."""
+    """The same, and those of things that had none: the leaves of the tree."""
     tree: Hierarchy
     """What the pieces make up; with the instances that boards and corrections made of others."""
     labels: PointLabels
@@ -106,20 +109,22 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     propagating, granularity = params.propagate, params.granularity
     if capture.clicks is not None:  # what was clicked as two objects stays two, and what was clicked as one, one
         propagating, granularity = replace(propagating, touching_merge=False, apart=False), 1.0
-    pieces = propagate(points, seen, observed, params=propagating.in_use())
+    voted = pieces = propagate(points, seen, observed, params=propagating.in_use())
+    shown = masks
+    if segmenter is not None and capture.masks is None and capture.clicks is None and params.overlooked.rise:
+        pieces, shown = _with_overlooked(capture, embeddings, points, seen, masks, voted, segmenter, params)
 
     # Which of these objects are pieces of one thing (beyond the paper).
-    tallies = each(seen, masks, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
+    tallies = each(seen, shown, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
     tree = hierarchy(points, capture.cameras, seen, pieces, tallies, params=params.hierarchy)
     things = cut(pieces, tree, granularity=granularity)
     nested = find_parts(observed, masks, pieces, params=params.parts)
     labels = _divided(capture, embeddings, points, seen, pieces, tree, things, segmenter, params)
-    shown = masks
     if labels is not things:
         tree, contained = corrected_tree(tree, things, labels), params.segment.contained
         shown = each(
             seen,
-            masks,
+            shown,
             names=capture.names,
             build=lambda visible, pool: part_masks(visible, pool, things, labels, contained=contained),
         )
@@ -132,7 +137,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     in_views = _in_views(capture, seen, shown, labels, prompted, params)
     instances = reproject(points, labels, parts, in_views, min_views=params.reproject.min_views)
     seen_in = appearances(labels, seen)
-    return Split(points, seen, masks, pieces, tree, labels, parts, instances, seen_in, embeddings, hinted)
+    return Split(points, seen, masks, voted, pieces, tree, labels, parts, instances, seen_in, embeddings, hinted)
 
 
 def _dense_points(capture: Capture, params: SplitParams) -> PointCloud:
@@ -166,6 +171,52 @@ def _seen(capture: Capture, points: PointCloud, params: SplitParams) -> tuple[Vi
             points, capture.by_view[view], depth, frame, visible, (looks[view],) if looks else (), color=color
         ),
     )
+
+
+def _with_overlooked(
+    capture: Capture,
+    embeddings: tuple[Embedding, ...],
+    points: PointCloud,
+    seen: tuple[Visibility, ...],
+    masks: tuple[MaskSet, ...],
+    voted: PointLabels,
+    segmenter: Model,
+    params: SplitParams,
+) -> tuple[PointLabels, tuple[MaskSet, ...]]:
+    """The labels, and those of things that had none, since few views have a mask of them; and all masks with those that
+    the segmenter gave when it was asked for these things (beyond the paper)."""
+    suspected = overlooked(points, seen, voted, params=params.overlooked)
+    answers = each(
+        capture.frames,
+        embeddings,
+        seen,
+        names=capture.names,
+        build=lambda frame, embedding, visible: asked(
+            EmbeddedPhoto(frame, embedding),
+            visible,
+            suspected,
+            params=params.reprompt,
+            pred_iou=params.segment.pred_iou,
+            model=segmenter,
+        ),
+    )
+    things = confirmed(suspected, answers)
+    voting, segmenting = params.propagate, params.segment
+    pieces = claimed(seen, voted, things, answers, tau_label=voting.tau_label, min_points=voting.min_label_points)
+    shown = each(
+        masks,
+        answers,
+        names=capture.names,
+        build=lambda pool, more: with_answers(
+            pool,
+            more,
+            things,
+            grid=len(segmenting.grids),
+            max_iou=segmenting.mask_nms,
+            contained=segmenting.contained,
+        ),
+    )
+    return pieces, shown
 
 
 def _divided(

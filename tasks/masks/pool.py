@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Int32, MaskSet
-from ss_flow.tasks.masks.overlap import intersections, suppress
+from ss_flow.tasks.masks.overlap import intersections, mask_iou, suppress
 from ss_flow.tasks.packed import Masks, bounds
 
 _CRUMB = 0.1
@@ -144,6 +146,36 @@ def mask_set(name: str, masks: Bool, predicted_iou: Float32, source: str, *, con
         grid=np.zeros(len(kept), np.int32),
         parent=mask_tree(kept, contained),
         source=source,
+    )
+
+
+def with_more(
+    whole: MaskSet,
+    masks: Bool,
+    predicted_iou: Float32,
+    stability: Float32,
+    *,
+    grid: int,
+    max_iou: float,
+    contained: float,
+) -> MaskSet:
+    """The masks of a view and more of them [N, H, W], none empty: of two with an IoU above `max_iou` its own stays,
+    or the surer one.
+
+    predicted_iou, stability: [N]. grid: what to say that these came from. contained: as `mask_tree` takes it.
+    """
+    everything = np.concatenate([whole.dense(), masks])
+    quality = np.concatenate([whole.predicted_iou, predicted_iou])
+    own = np.arange(len(quality)) < len(whole)
+    rows = suppress(mask_iou(everything), quality + 2 * own, max_iou)
+    rows = rows[canonical_order(everything[rows])]
+    return replace(
+        whole,
+        **vars(Masks.of(everything[rows])),
+        predicted_iou=quality[rows],
+        stability=np.concatenate([whole.stability, stability])[rows],
+        grid=np.append(whole.grid, np.full(len(masks), grid, np.int32))[rows],
+        parent=mask_tree(everything[rows], contained),
     )
 
 

@@ -7,7 +7,8 @@ The steps, in the order in which they run:
 2. `dense` or `dense_splatting`: the dense points of the scene.
 3. `visibility` (Eq. 1, 2): the points that each view sees, and `visible_by_color`: where it has no depth. `observe`
    (Eq. 3): the masks that they lie under.
-4. `propagate` (Algorithm 1): the views vote for the label of each point. `votes`: how.
+4. `propagate` (Algorithm 1): the views vote for the label of each point. `votes`: how. `overlooked`: the segmenter is
+   asked for things that no label has.
 5. `tally`, `hierarchy`, `cut`: labels that the views show as one thing become one instance. What `hierarchy` asks of
    labels: `agreement`, `contact`, `stuff` with `casts`, `surfaces` with `shadows` and `gaps`, `mounds`, `sheets`,
    `supports`, `edges`, `inlays`; `looks`: what views see at a place. `parts`: masks inside the masks of a label.

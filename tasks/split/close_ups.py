@@ -11,14 +11,12 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Frame, MaskSet
+from ss_flow.tasks.artifacts import Bool, Float32, Frame, MaskSet
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png, encode_valid
-from ss_flow.tasks.masks.overlap import mask_iou, suppress
-from ss_flow.tasks.masks.pool import canonical_order, mask_tree
+from ss_flow.tasks.masks.pool import with_more
 from ss_flow.tasks.models.catalogue import Model
 from ss_flow.tasks.models.onnx import network_identity
 from ss_flow.tasks.models.sam import LOW
-from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Fraction, Natural, Range
 from ss_flow.tasks.split.embed import embed
 from ss_flow.tasks.split.segment import SegmentParams, segment
@@ -74,7 +72,7 @@ def close_ups(
         return whole
     settings = _in_close_ups(segmenting, params)
     rgb, valid = decode_rgb(frame), decode_valid(frame)
-    masks, predicted_iou, stability = [whole.dense()], [whole.predicted_iou], [whole.stability]
+    masks, predicted_iou, stability = list[Bool](), list[Float32](), list[Float32]()
     boxes = list(_boxes(frame, params))
     for number, box in enumerate(boxes, 1):
         if not valid[box].any():
@@ -90,17 +88,14 @@ def close_ups(
         predicted_iou.append(found.predicted_iou[kept])
         stability.append(found.stability[kept])
         progress(number, len(boxes), f"{len(kept)} masks")
-    everything, quality = np.concatenate(masks), np.concatenate(predicted_iou)
-    grid = np.append(whole.grid, np.full(len(quality) - len(whole), len(segmenting.grids), np.int32))
-    rows = suppress(mask_iou(everything), quality + 2 * (grid < len(segmenting.grids)), segmenting.mask_nms)
-    rows = rows[canonical_order(everything[rows])]
-    return replace(
+    return with_more(
         whole,
-        **vars(Masks.of(everything[rows])),
-        predicted_iou=quality[rows],
-        stability=np.concatenate(stability)[rows],
-        grid=grid[rows],
-        parent=mask_tree(everything[rows], segmenting.contained),
+        np.concatenate(masks),
+        np.concatenate(predicted_iou),
+        np.concatenate(stability),
+        grid=len(segmenting.grids),
+        max_iou=segmenting.mask_nms,
+        contained=segmenting.contained,
     )
 
 

@@ -44,6 +44,7 @@ TABLE = {
     "split.boards.rises": (0.0, 0.0, 0.15),
     "split.walls.colors": (0.0, 0.0, 0.9),
     "split.granularity": (1.0, 1.0, 0.45),
+    "split.overlooked.rise": (0.0, 0.0, 2.5),
     # 7
     "split.segment.min_area": (0.0025, 0.0025, 0.0025),
     "split.segment.min_pixels": (0, 0, 64),
