@@ -9,9 +9,10 @@ The steps, in the order in which they run:
    (Eq. 3): the masks that they lie under.
 4. `propagate` (Algorithm 1): the views vote for the label of each point. `votes`: how. `overlooked`: the segmenter is
    asked for things that no label has.
-5. `tally`, `hierarchy`, `cut`: labels that the views show as one thing become one instance. What `hierarchy` asks of
-   labels: `agreement`, `contact`, `stuff` with `casts`, `surfaces` with `shadows` and `gaps`, `mounds`, `sheets`,
-   `supports`, `edges`, `inlays`; `looks`: what views see at a place. `parts`: masks inside the masks of a label.
+5. `tally`, `hierarchy`, `cut`: labels that the views show as one thing become one instance. `unions`: which sets of
+   them are weighed. What `hierarchy` asks of labels: `agreement`, `contact`, `stuff` with `casts`, `surfaces` with
+   `shadows` and `gaps`, `mounds`, `sheets`,  `supports`, `edges`, `inlays`; `looks`: what views see at a place.
+   `parts`: masks inside the masks of a label.
 6. `boards`: what rises from a flat one becomes an instance. `walls`: the pieces of a wall or a floor become one.
    `correct`, with its `part_masks`: instances that the user joins or divides.
 7. `reprompt`, `instances_in_view`, `reproject`: the instances' masks in each view. `appearances`: the views that show

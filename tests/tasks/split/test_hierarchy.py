@@ -16,6 +16,7 @@ from ss_flow.tasks.split.inlays import Inlays
 from ss_flow.tasks.split.mounds import Mounds
 from ss_flow.tasks.split.sheets import Sheets
 from ss_flow.tasks.split.stuff import StuffParams
+from ss_flow.tasks.split.unions import Pieces
 
 NO_BORDERS = np.zeros((9, 9), np.int32)
 SEES = 100
@@ -331,7 +332,7 @@ def test_masks_of_a_seat_and_the_bag_on_it_show_each_as_one_where_its_pieces_tou
     def seat_of(pieces, members):
         return tuple(piece for piece in members if set(pieces.labels[piece]) <= {0, 1}) or members
 
-    monkeypatch.setattr(module._Pieces, "_below", seat_of)
+    monkeypatch.setattr(Pieces, "_below", seat_of)
     monkeypatch.setattr(Contact, "parted", lambda _, members: [members] if touch else [(one,) for one in members])
     each = {frozenset({1, 2}): 1.0, frozenset({3, 4}): 1.0 if touch else 0.5}  # two bags may stand on it
     assert unions(tree(views, 4)) == {**each, frozenset({1, 2, 3, 4}): 0.45}
