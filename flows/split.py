@@ -68,7 +68,7 @@ class Split:
     voted: PointLabels
     """The labels that the views voted for (l_p)."""
     pieces: PointLabels
-    """The same, and those of things that had none: the leaves of the tree."""
+    """The same, and those of things that had none of their own: the leaves of the tree."""
     tree: Hierarchy
     """What the pieces make up; with the instances that boards and corrections made of others."""
     labels: PointLabels
@@ -183,9 +183,9 @@ def _with_overlooked(
     segmenter: Model,
     params: SplitParams,
 ) -> tuple[PointLabels, tuple[MaskSet, ...]]:
-    """The labels, and those of things that had none, since few views have a mask of them; and all masks with those that
-    the segmenter gave when it was asked for these things (beyond the paper)."""
-    suspected = overlooked(points, seen, voted, params=params.overlooked)
+    """The labels, and those of things that had none of their own, since few views have a mask of them; and all masks,
+    with those that the segmenter gave when it was asked for these things (beyond the paper)."""
+    suspected = overlooked(points, capture.cameras, seen, voted, params=params.overlooked)
     answers = each(
         capture.frames,
         embeddings,

@@ -98,6 +98,15 @@ def planes_of_patches(points: Float64) -> list[Plane]:
     return [plane_through(points[rows]) for rows in np.reshape(near, (-1, count))]
 
 
+def largest_plane(points: Float64, thickness: float, rounds: int) -> Plane:
+    """The plane, of those through small patches of some points [N, 3], that most of the points lie on.
+
+    thickness: how far from it a point still does. rounds: fits, each to the points on the last one.
+    """
+    best = max(planes_of_patches(points), key=lambda plane: on_plane(points, plane, thickness).sum())
+    return refitted(points, best, thickness, rounds)
+
+
 def middle_of(cameras: Cameras) -> Float64:
     """[3] the mean place of the cameras."""
     return np.asarray(centers_of(cameras.world_to_camera).mean(axis=0))

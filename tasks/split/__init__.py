@@ -8,7 +8,7 @@ The steps, in the order in which they run:
 3. `visibility` (Eq. 1, 2): the points that each view sees, and `visible_by_color`: where it has no depth. `observe`
    (Eq. 3): the masks that they lie under.
 4. `propagate` (Algorithm 1): the views vote for the label of each point. `votes`: how. `overlooked`: the segmenter is
-   asked for things that no label has.
+   asked for things without a label of their own.
 5. `tally`, `hierarchy`, `cut`: labels that the views show as one thing become one instance. `unions`: which sets of
    them are weighed. What `hierarchy` asks of labels: `agreement`, `contact`, `stuff` with `casts`, `surfaces` with
    `shadows` and `gaps`, `mounds`, `sheets`, `supports`, `edges`, `inlays`; `looks`: what views see at a place.

@@ -1,8 +1,9 @@
-"""What stands there, and no label has: a jar on a sill is small, lies between the prompts of most photos, and the few
-views with a mask of it are outvoted.
+"""What stands there without a label of its own: a jar on a sill is small, lies between the prompts of most photos, and
+the few views with a mask of it are outvoted.
 
-Its points are without a label, yet rise from all that is round them. So the segmenter is asked for it in every view
-that sees it, and where most of them show it, its points have a label. Beyond Split&Splat.
+Its points have no label, or that of the chest on which it stands, yet they rise from all that is round them. So the
+segmenter is asked for it in every view that sees it, and where most of them show it, it has a label. Beyond
+Split&Splat.
 """
 
 from __future__ import annotations
@@ -15,7 +16,11 @@ import numpy as np
 
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
+    Bool,
+    Cameras,
     Float32,
+    Float64,
+    Int32,
     Int64,
     MaskSet,
     PointCloud,
@@ -24,7 +29,7 @@ from ss_flow.tasks.artifacts import (
     Visibility,
 )
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
-from ss_flow.tasks.geometry.shape import plane_of_most
+from ss_flow.tasks.geometry.shape import largest_plane, middle_of, plane_of_most, thinned, towards
 from ss_flow.tasks.masks.painting import agreement, by_area, paint_labels
 from ss_flow.tasks.masks.pool import with_more
 from ss_flow.tasks.models.catalogue import Model
@@ -43,9 +48,17 @@ _REACH = 2.0
 _AROUND, _FEW = 5.0, 12
 """Up to which distance from a thing points are round it, in spacings; and below how many it stands on nothing."""
 _ROUNDS = 4
-"""How often the plane of what is round a thing is fitted."""
+"""How often a plane is fitted."""
+_THICKNESS = 1.5
+"""Up to which distance points lie on a plane, in spacings."""
+_FLAT = 0.35
+"""Share of the points of a label that must lie on its largest side: else nothing stands on that."""
+_PART = 0.25
+"""Share of the points of a label up to which something stands on it."""
 _VIEWS = 3
 """Views that must see most of a thing: from fewer, nobody can say that masks of it are missing."""
+_MOST = 60
+"""Things that are asked for, the largest: a lawn has hundreds of tufts."""
 _SMALL = 0.01
 """Share of a photo up to which a thing is asked for: what is larger does not lie between the prompts."""
 _AGREES = 0.5
@@ -54,42 +67,69 @@ _AGREES = 0.5
 
 @dataclass(frozen=True)
 class OverlookedParams:
-    """What is looked for among the points without a label."""
+    """What is looked for."""
 
     rise: NonNegative = 2.5
     """How far at least half of a thing must rise from the plane of what is round it, in multiples of the cloud's
-    spacing: the dots of a wallpaper lie in it. 0 = nothing is looked for."""
+    spacing: the dots of a wallpaper lie in it. Half as far where it stands on the largest side of a label. 0 = nothing
+    is looked for."""
     min_points: Count = 15
     """Points of the smallest thing."""
 
 
 @task(name="split.overlooked")
 def overlooked(
-    points: PointCloud, visibility: Sequence[Visibility], labels: PointLabels, *, params: OverlookedParams
+    points: PointCloud,
+    cameras: Cameras,
+    visibility: Sequence[Visibility],
+    labels: PointLabels,
+    *,
+    params: OverlookedParams,
 ) -> PointLabels:
-    """The things that have no label: theirs are 1.., from the largest on, and all other points have none.
+    """The things that have no label of their own: here theirs are 1.., from the largest on, all other points have none.
 
     visibility: one of each view. labels: of `points`.
     """
     from scipy.spatial import cKDTree
 
-    free = np.flatnonzero(labels.label == 0)
-    piece = dbscan(points.points[free], _REACH * points.spacing, min_samples=1)
     seen = np.zeros(len(points.points), np.int32)
     for view in visibility:
         seen[view.point_index] += 1
     tree = cKDTree(points.points)
+    free, standing = _pieces(points, labels.label, middle_of(cameras), params.min_points)
     things = [
         own
-        for own in (free[rows] for rows in rows_by_label(piece).values())
-        if len(own) >= params.min_points and np.median(seen[own]) >= _VIEWS and _rise(points, tree, own) >= params.rise
+        for least, pieces in ((params.rise, free), (params.rise / 2, standing))
+        for own in pieces
+        if np.median(seen[own]) >= _VIEWS and _rise(points, tree, own) >= least
     ]
-    things = sorted(things, key=len, reverse=True)[: MOST_LABELS - labels.num_labels]
+    things = sorted(things, key=len, reverse=True)[: min(_MOST, MOST_LABELS - labels.num_labels)]
     label = np.zeros(len(points.points), np.int32)
     for number, own in enumerate(things, 1):
         label[own] = number
     nothing = np.zeros(0, np.int32)
     return PointLabels(label, (label > 0).astype(np.float32), len(things), nothing, nothing, nothing)
+
+
+def _pieces(points: PointCloud, label: Int32, eye: Float64, least: int) -> tuple[list[Int64], list[Int64]]:
+    """What hangs together, at least so many points (rows) each: of those without a label, and of those of each label
+    that stand on its largest side."""
+    free, standing = list[Int64](), list[Int64]()
+    for name, rows in rows_by_label(label).items():
+        found, most = (standing, _PART * len(rows)) if name else (free, np.inf)
+        if most >= least:
+            of_it = rows[_on_side(points.points[rows].astype(np.float64), points.spacing, eye)] if name else rows
+            piece = dbscan(points.points[of_it], _REACH * points.spacing, min_samples=1)
+            found += [of_it[own] for own in rows_by_label(piece).values() if least <= len(own) <= most]
+    return free, standing
+
+
+def _on_side(places: Float64, spacing: float, eye: Float64) -> Bool:
+    """[N] which points of a label are before its largest side, as seen from `eye`; none where it has no large one."""
+    centre, normal = largest_plane(thinned(places), _THICKNESS * spacing, _ROUNDS)
+    height = (places - centre) @ towards(normal, centre, eye)
+    flat = (np.abs(height) <= _THICKNESS * spacing).mean() >= _FLAT
+    return (height > _THICKNESS * spacing) & flat
 
 
 def _rise(points: PointCloud, tree: cKDTree, own: Int64) -> float:

@@ -12,11 +12,10 @@ from ss_flow.tasks.geometry.shape import (
     Plane,
     box_diagonal,
     extent_of,
+    largest_plane,
     middle_of,
     on_plane,
     plane_of_most,
-    planes_of_patches,
-    refitted,
     thinned,
     towards,
 )
@@ -81,7 +80,7 @@ def planes_of(places: Float64, params: StuffParams) -> list[Plane]:
     planes: list[Plane] = []
     rest = places
     while 1 < params.planes > len(planes) and len(rest) > (1 - params.flat) * len(places):
-        planes.append(_largest_plane(rest, thickness))
+        planes.append(largest_plane(rest, thickness, _ROUNDS))
         rest = rest[~on_plane(rest, planes[-1], thickness)]
     return planes if len(rest) <= (1 - params.flat) * len(places) else []
 
@@ -89,9 +88,3 @@ def planes_of(places: Float64, params: StuffParams) -> list[Plane]:
 def _extent(places: Float64) -> float:
     # What lies evenly on a plane reaches so much farther than its middle does.
     return box_diagonal(places, _STRAY) / (1 - 2 * _STRAY)
-
-
-def _largest_plane(places: Float64, thickness: float) -> Plane:
-    """The plane, of those through small patches of some points [N, 3], that most of the points lie on."""
-    best = max(planes_of_patches(places), key=lambda plane: on_plane(places, plane, thickness).sum())
-    return refitted(places, best, thickness, _ROUNDS)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from box_scene import row_of_points
-from labelled_points import labels_of, lying
+from labelled_points import labels_of, lying, one_camera
 
 from ss_flow.tasks.artifacts import Frame, PointCloud, PromptedMasks, Visibility
 from ss_flow.tasks.masks.pool import mask_set
@@ -20,6 +20,7 @@ from ss_flow.tasks.split.reprompt import RepromptParams
 
 reprompting = importlib.import_module("ss_flow.tasks.split.reprompt")
 STEP = 0.01
+ABOVE = one_camera(np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2], [0, 0, 0, 1]]))
 FLOOR = lying(0.4, 0.4, step=STEP)
 DOT = np.hypot(FLOOR[:, 0] - 0.1, FLOOR[:, 1]) < 0.04
 
@@ -43,7 +44,12 @@ def seeing(rows: np.ndarray) -> Visibility:
 
 
 def found(cloud: PointCloud, label: np.ndarray, views: list[Visibility], **params: float) -> np.ndarray:
-    return overlooked(cloud, views, labels_of(label), params=OverlookedParams(**params)).label
+    return overlooked(cloud, ABOVE, views, labels_of(label), params=OverlookedParams(**params)).label
+
+
+def above(cloud: PointCloud, rows: np.ndarray) -> np.ndarray:
+    """Those of some points that are not so near to the floor that they count as lying on it."""
+    return rows & (cloud.points[:, 2] > 1.5 * STEP)
 
 
 def test_what_rises_from_a_surface_and_has_no_label_is_found_and_the_largest_comes_first():
@@ -51,7 +57,37 @@ def test_what_rises_from_a_surface_and_has_no_label_is_found_and_the_largest_com
     label = (of == 0).astype(np.int32)
     things = found(cloud, label, [seeing(of >= 0)] * 3)
     assert np.array_equal(things, np.choose(of, [0, 2, 1]))
-    assert not found(cloud, np.ones_like(label), [seeing(of >= 0)] * 3).any()
+
+
+def test_what_has_the_label_of_the_surface_on_which_it_stands_is_found():
+    cloud, of = scene(jar())
+    views = [seeing(of >= 0)] * 3
+    for label in (1, np.where(cloud.points[:, 0] < -0.15, 2, 1)):
+        assert np.array_equal(found(cloud, np.full(len(of), label), views) > 0, above(cloud, of == 1))
+
+
+def test_what_stands_on_a_chest_is_found_but_not_its_front():
+    front = lying(0.4, 0.1, step=STEP)[:, [0, 2, 1]] + np.array([0, -0.2, -0.06])
+    cloud, of = scene(front, jar(0.05))
+    assert np.array_equal(found(cloud, np.ones(len(of)), [seeing(of >= 0)] * 3) > 0, above(cloud, of == 2))
+
+
+def test_a_part_of_what_has_no_large_side_or_a_large_part_is_no_thing():
+    cloud, of = scene(jar())
+    cloud.points[of == 0, 2] -= np.random.default_rng(0).uniform(0, 0.4, len(FLOOR))
+    assert not found(cloud, np.ones(len(of)), [seeing(of >= 0)] * 3).any()
+    cloud, of = scene(jar(height=40))
+    assert 0.25 * len(of) < (of > 0).sum() < 0.4 * len(of)
+    assert not found(cloud, np.ones(len(of)), [seeing(of >= 0)] * 3).any()
+
+
+def test_of_very_many_things_the_largest_are_asked_for():
+    tufts = [jar(height=9 if n % 2 else 8) + np.array([0.2 * (n % 12), 0.2 * (n // 12), 0]) for n in range(100)]
+    points = np.concatenate(tufts).astype(np.float32)
+    of = np.repeat(np.arange(100), [len(tuft) for tuft in tufts])
+    cloud = PointCloud(points, np.zeros(points.shape, np.uint8), 1.0, STEP)
+    things = found(cloud, np.zeros(len(points)), [seeing(np.ones(len(points), bool))] * 3)
+    assert things.max() == 60 and {1, 3, 5, 99} < set(of[things > 0].tolist())
 
 
 def test_a_dot_in_the_surface_is_no_thing():
