@@ -57,10 +57,11 @@ _PART = 0.25
 """Share of the points of a label up to which something stands on it."""
 _VIEWS = 3
 """Views that must see most of a thing: from fewer, nobody can say that masks of it are missing."""
-_MOST = 60
+_MOST = 30
 """Things that are asked for, the largest: a lawn has hundreds of tufts."""
-_SMALL = 0.01
-"""Share of a photo up to which a thing is asked for: what is larger does not lie between the prompts."""
+_SMALL = 0.0005, 0.01
+"""Shares of a photo between which a thing is asked for: a larger one does not lie between the prompts, and of a smaller
+one the segmenter sees too little."""
 _AGREES = 0.5
 """IoU with a thing's points from which an answer of the segmenter shows it; and the share of the answers that must."""
 
@@ -161,7 +162,8 @@ def asked(
     """
     height, width = visibility.height, visibility.width
     painted = by_area(paint_labels(visibility, things.label), height, width)
-    small = np.bincount(painted.label, painted.area) <= _SMALL * height * width
+    share = np.bincount(painted.label, painted.area) / (height * width)
+    small = (share >= _SMALL[0]) & (share <= _SMALL[1])
     painted = replace(painted, label=np.where(small[painted.label], painted.label, 0))
     found = prompt(photo, spread_prompts(painted, width, set(), params), model, params.speckle)
     shown = [
