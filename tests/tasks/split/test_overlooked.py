@@ -72,6 +72,14 @@ def test_what_stands_on_a_chest_is_found_but_not_its_front():
     assert np.array_equal(found(cloud, np.ones(len(of)), [seeing(of >= 0)] * 3) > 0, above(cloud, of == 2))
 
 
+@pytest.mark.parametrize(("label", "rise", "is_found"), [(0, 3, True), (0, 4, False), (1, 6, True), (1, 8, False)])
+def test_what_stands_on_a_label_needs_to_rise_half_as_far(label, rise, is_found):
+    """Half of the block is 3.5 steps high or more; of what counts as standing on the floor, 4."""
+    cloud, of = scene(jar(height=6))
+    things = found(cloud, np.where(of == 0, 1, label), [seeing(of >= 0)] * 3, rise=rise)
+    assert things.any() == is_found
+
+
 def test_a_part_of_what_has_no_large_side_or_a_large_part_is_no_thing():
     cloud, of = scene(jar())
     cloud.points[of == 0, 2] -= np.random.default_rng(0).uniform(0, 0.4, len(FLOOR))
