@@ -11,7 +11,7 @@ import numpy as np
 
 from ss_flow.running import progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Bool, Float32, Frame, MaskSet
+from ss_flow.tasks.artifacts import Bool, Frame, MaskSet
 from ss_flow.tasks.geometry.images import decode_rgb, decode_valid, encode_png, encode_valid
 from ss_flow.tasks.masks.pool import with_more
 from ss_flow.tasks.models.catalogue import Model
@@ -72,7 +72,8 @@ def close_ups(
         return whole
     settings = _in_close_ups(segmenting, params)
     rgb, valid = decode_rgb(frame), decode_valid(frame)
-    masks, predicted_iou, stability = list[Bool](), list[Float32](), list[Float32]()
+    none = np.zeros(0, np.float32)
+    masks, predicted_iou, stability = [np.zeros((0, frame.height, frame.width), bool)], [none], [none]
     boxes = list(_boxes(frame, params))
     for number, box in enumerate(boxes, 1):
         if not valid[box].any():

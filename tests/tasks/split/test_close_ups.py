@@ -135,6 +135,14 @@ def test_pixels_that_do_not_count_are_in_no_mask_and_a_close_up_of_nothing_else_
     assert len(far_sighted.seen) == 3  # the photo, and the two on the right
 
 
+def test_where_no_close_up_holds_a_pixel_that_counts_the_masks_of_the_photo_stay(far_sighted):
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[: HEIGHT // 5, : WIDTH // 5] = False
+    corner = replace(CLOSE, side=1, share=0.1)
+    whole, both = found(frame("box", valid=valid), params=corner)
+    assert len(whole) == 1 and both.same(whole)
+
+
 def test_areas_are_shares_of_the_close_up(far_sighted):
     area = drawn("coin").sum() / (HEIGHT * WIDTH * CLOSE.share**2)
     for least, count in ((0.9 * area, 1), (1.1 * area, 0)):
