@@ -16,11 +16,9 @@ import numpy as np
 
 from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import (
-    Bool,
     Cameras,
     Float32,
     Float64,
-    Int32,
     Int64,
     MaskSet,
     PointCloud,
@@ -97,7 +95,9 @@ def overlooked(
     for view in visibility:
         seen[view.point_index] += 1
     tree = cKDTree(points.points)
-    free, standing = _pieces(points, labels.label, middle_of(cameras), params.min_points)
+    rows_of, eye = rows_by_label(labels.label), middle_of(cameras)
+    free = _pieces(points, rows_of.pop(0, np.zeros(0, np.int64)), params.min_points)
+    standing = [own for rows in rows_of.values() for own in _standing(points, rows, eye, params.min_points)]
     things = [
         own
         for least, pieces in ((params.rise, free), (params.rise / 2, standing))
@@ -112,25 +112,24 @@ def overlooked(
     return PointLabels(label, (label > 0).astype(np.float32), len(things), nothing, nothing, nothing)
 
 
-def _pieces(points: PointCloud, label: Int32, eye: Float64, least: int) -> tuple[list[Int64], list[Int64]]:
-    """What hangs together, at least so many points (rows) each: of those without a label, and of those of each label
-    that stand on its largest side."""
-    free, standing = list[Int64](), list[Int64]()
-    for name, rows in rows_by_label(label).items():
-        found, most = (standing, _PART * len(rows)) if name else (free, np.inf)
-        if most >= least:
-            of_it = rows[_on_side(points.points[rows].astype(np.float64), points.spacing, eye)] if name else rows
-            piece = dbscan(points.points[of_it], _REACH * points.spacing, min_samples=1)
-            found += [of_it[own] for own in rows_by_label(piece).values() if least <= len(own) <= most]
-    return free, standing
+def _pieces(points: PointCloud, rows: Int64, least: int) -> list[Int64]:
+    """What hangs together of some points (rows), at least so many each."""
+    piece = dbscan(points.points[rows], _REACH * points.spacing, min_samples=1)
+    return [rows[own] for own in rows_by_label(piece).values() if len(own) >= least]
 
 
-def _on_side(places: Float64, spacing: float, eye: Float64) -> Bool:
-    """[N] which points of a label are before its largest side, as seen from `eye`; none where it has no large one."""
-    centre, normal = largest_plane(thinned(places), _THICKNESS * spacing, _ROUNDS)
+def _standing(points: PointCloud, rows: Int64, eye: Float64, least: int) -> list[Int64]:
+    """What hangs together, at least so many points each, of those of a label (rows) that are before its largest side as
+    seen from `eye`; nothing where it has no large one."""
+    most = _PART * len(rows)
+    if most < least:
+        return []
+    places, thickness = points.points[rows].astype(np.float64), _THICKNESS * points.spacing
+    centre, normal = largest_plane(thinned(places), thickness, _ROUNDS)
     height = (places - centre) @ towards(normal, centre, eye)
-    flat = (np.abs(height) <= _THICKNESS * spacing).mean() >= _FLAT
-    return (height > _THICKNESS * spacing) & flat
+    if (np.abs(height) <= thickness).mean() < _FLAT:
+        return []
+    return [own for own in _pieces(points, rows[height > thickness], least) if len(own) <= most]
 
 
 def _rise(points: PointCloud, tree: cKDTree, own: Int64) -> float:
