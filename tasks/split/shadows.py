@@ -2,8 +2,9 @@
 
 One lamp lights the whole scene: of each colour of light, a shadow leaves a share that depends on how a surface is
 turned towards lamp and sky, and not on its own colour (Lambert). So a step that parallel surfaces of different colours
-show alike is a shadow's; paint would have to be darker by the same factor on both. Where no step repeats so, no shadow
-is presumed.
+show alike is a shadow's; paint would have to be darker by the same factor on both. So is white paper on a grey wall,
+wherever it hangs: a wall that is brighter in one place than in another is no different colour. Where no step repeats
+so, no shadow is presumed.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ _SAME = 0.12
 """Difference between two steps, in each logarithm, up to which they are the same."""
 OTHER = 0.3
 """Difference between two colours, in one logarithm, from which on their surfaces are of different colours."""
+_HUE = 0.2
+"""Spread of the differences between two colours, in the logarithms, from which on more than the light may differ."""
 _PARALLEL = 0.95
 """Cosine of the normals of surfaces on which a shadow makes the same step."""
 _REST = 0.15
@@ -55,7 +58,7 @@ class Step:
     def repeats(self, other: Step) -> bool:
         """Whether parallel surfaces of different colours show the same step."""
         same = (np.abs(self.change - other.change) <= _SAME).all()
-        different = (np.abs(self.lit - other.lit) >= OTHER).any()
+        different = np.ptp(self.lit - other.lit) >= _HUE
         return bool(same and different and self.normal @ other.normal >= _PARALLEL)
 
 

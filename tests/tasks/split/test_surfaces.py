@@ -45,6 +45,12 @@ def test_a_step_that_only_surfaces_of_the_same_colour_repeat_may_be_a_print():
     assert surfaces(*table(), *table(y=2)) == [1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("light", [0.5, 0.7])
+def test_a_step_that_only_the_same_colour_repeats_in_another_light_may_be_a_print(light):
+    darker = [(places, light * color) for places, color in table(y=2)]
+    assert surfaces(*table(), *darker) == [1, 2, 3, 4]
+
+
 def test_a_step_of_another_tint_is_no_shadow():
     blue = np.array([0.3, 0.5, 0.9])
     assert surfaces(*floor(blue), patch(BROWN, 0, 0), patch(blue * BROWN, 0.5, 0)) == [1, 2, 3, 4]
