@@ -56,7 +56,7 @@ class Step:
     """[3] of the surface there, towards the cameras."""
 
     def repeats(self, other: Step) -> bool:
-        """Whether parallel surfaces of different colours show the same step."""
+        """Whether parallel surfaces of different hues show the same step."""
         same = (np.abs(self.change - other.change) <= _SAME).all()
         different = np.ptp(self.lit - other.lit) >= _HUE
         return bool(same and different and self.normal @ other.normal >= _PARALLEL)

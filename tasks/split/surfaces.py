@@ -45,7 +45,7 @@ class ShadowParams:
     agreement: Fraction = 0.6
     """What this counts as beside the agreement of views (see `split.granularity`); 0 = surfaces are not looked for."""
     repeats: Count = 2
-    """Other borders, on parallel surfaces of other colours, that must show the same step: one may be chance."""
+    """Other borders, on parallel surfaces of another hue, that must show the same step: one may be chance."""
     alike: Fraction = 0.75
     """Share of their common border at which the colour stays, or changes as into a shadow."""
     colors: Fraction = 0.95
