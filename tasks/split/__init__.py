@@ -11,7 +11,7 @@ The steps, in the order in which they run:
    asked for things without a label of their own.
 5. `tally`, `hierarchy`, `cut`: labels that the views show as one thing become one instance. `unions`: which sets of
    them are weighed. What `hierarchy` asks of labels: `agreement`, `contact`, `stuff` with `casts`, `surfaces` with
-   `shadows` and `gaps`, `mounds`, `sheets`, `supports`, `edges`, `inlays`; `looks`: what views see at a place.
+   `shadows` and `gaps`, `mounds`, `supports`, `edges`, `inlays`; `looks`: what views see at a place.
    `parts`: masks inside the masks of a label.
 6. `boards`: what rises from a flat one becomes an instance. `walls`: the pieces of a wall or a floor become one.
    `correct`, with its `part_masks`: instances that the user joins or divides.

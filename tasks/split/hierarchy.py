@@ -33,7 +33,6 @@ from ss_flow.tasks.split.edges import convex_edges
 from ss_flow.tasks.split.inlays import find_inlays
 from ss_flow.tasks.split.looks import Looks
 from ss_flow.tasks.split.mounds import find_mounds
-from ss_flow.tasks.split.sheets import find_sheets
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 from ss_flow.tasks.split.supports import find_supports
 from ss_flow.tasks.split.surfaces import ShadowParams, lit_surfaces
@@ -66,9 +65,6 @@ class HierarchyParams:
     bulge: Fraction = 0.09
     """How far it must rise from there, as a share of its extent, where its colours are half like those around it; the
     farther, the more they are alike. A bag on a sofa is no part of the sofa, but its arm is."""
-    flush: Fraction = 0.4
-    """Share of its border along which a flat piece goes on without an edge into something larger: a mug on a page that
-    lies on a table is no part of the page. 1 = none does."""
     stuff: StuffParams = field(default_factory=StuffParams)
     """What is a wall or a floor rather than a thing."""
     shadows: ShadowParams = field(default_factory=ShadowParams)
@@ -115,16 +111,14 @@ def hierarchy(
     is_stuff = (is_stuff | find_casts(points, labels.label, surface, ends, is_stuff))[surface_of]
     mounds = find_mounds(points, cameras, labels, tallies, ends, around=params.around, height=params.bulge)
     contact = find_contact(ends, labels.label)
-    sheets = find_sheets(points, labels, ends, flush=params.flush, height=params.bulge)
     supports = find_supports(points, cameras, labels, height=params.bulge)
     edges = np.zeros((len(leaves), len(leaves)), bool)
     if params.convex:
         edges = convex_edges(points, cameras, visibility, labels.label, ends)
-    inlays = find_inlays(looks, labels.label, ~is_stuff & (params.inlaid > 0))
+    inlays = find_inlays(looks, labels.label, ends, ~is_stuff & (params.inlaid > 0))
     own: list[Members] = [(row,) for row in range(len(leaves))]
-    size, sure = np.bincount(labels.label)[leaves].astype(np.float64), np.ones(len(leaves))
     views = views_of(leaves, tallies)
-    pieces = Pieces(views, is_stuff, size, sure, contact, edges, own, mounds, sheets, supports, inlays, params)
+    pieces = Pieces(views, is_stuff, contact, edges, own, mounds, supports, inlays, params)
     node, parent, agreement, stuff = leaves.tolist(), [0] * len(leaves), [1.0] * len(leaves), is_stuff.tolist()
     top = list(range(len(leaves)))  # the tree's row of each piece
     lit = [tuple(rows.tolist()) for rows in rows_by_label(surface_of.astype(np.int32)).values() if len(rows) > 1]
@@ -140,7 +134,7 @@ def hierarchy(
                 parent[top[piece]] = node[row]
             top.append(row)
         left = sorted(set(range(len(top))) - {piece for members, _ in united for piece in members})
-        pieces = pieces.united(united)
+        pieces = pieces.united([members for members, _ in united])
         top = [top[piece] for piece in left]
         united = pieces.best_unions()
     return Hierarchy(

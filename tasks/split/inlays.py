@@ -16,6 +16,7 @@ from ss_flow.tasks.artifacts import Bool, Float64, Int32
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import Plane, axes_in, middle_of, on_plane, plane_of_most, thinned, towards
 from ss_flow.tasks.split.looks import Looks
+from ss_flow.tasks.split.votes.touching import Borders
 
 _FEW = 100
 """Points below which a label has no outline."""
@@ -37,6 +38,9 @@ _AROUND = 0.8
 """Share of these at which views mostly see the other thing."""
 _SHARE = 0.1
 """Share of the points of both that lie within at least: more than a page on a table."""
+_MOSTLY = 0.6
+"""Share of the points that touch the other thing at which a piece must go on into that without an edge: halfway between
+what lies in another thing (.77 and more) and what does not (.41 and less), in 45 scenes."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +53,14 @@ class Inlays:
     """[L] places around each that some view sees, or looks at in vain."""
     shown: Float64
     """[L, L] those at which views mostly see each label."""
+    meets: Float64
+    """[L, L] points at the border of each that touch each other one."""
+    smooth: Float64
+    """[L, L] those that do so without an edge."""
 
     def pairs(self, pieces: Sequence[tuple[int, ...]]) -> list[tuple[int, int]]:
-        """Which pieces, each some labels (rows), lie in which other one: (inner, outer) by number."""
+        """Which pieces, each some labels (rows), lie in which other one, and mostly go on into it without an edge where
+        they touch: (inner, outer) by number."""
         member = np.zeros((len(pieces), len(self.size)))
         for row, labels in enumerate(pieces):
             member[row, list(labels)] = 1
@@ -60,14 +69,17 @@ class Inlays:
         np.fill_diagonal(shown, 0)
         found = (shown >= _AROUND * places[:, None]) & (places[:, None] >= _SEEN)
         found &= size[:, None] >= _SHARE * (size[:, None] + size)
+        meets, smooth = (member @ touches @ member.T for touches in (self.meets, self.smooth))
+        found &= smooth >= np.maximum(_MOSTLY * meets, 1)
         return [(inner, outer) for inner, outer in np.argwhere(found).tolist()]
 
 
-def find_inlays(looks: Looks, label: Int32, asked: Bool) -> Inlays:
+def find_inlays(looks: Looks, label: Int32, ends: Borders, asked: Bool) -> Inlays:
     """What views see around those labels of a cloud that are flat.
 
-    label: [N] of its points, 0 = none. asked: [L] whether one wants to know it of each. Where all that is seen rises
-    from the label's plane, that is hidden, and tells nothing; where what is seen lies behind it, nothing is around.
+    label: [N] of its points, 0 = none; ends: the borders of the labels. asked: [L] whether one wants to know it of
+    each. Where all that is seen rises from the label's plane, that is hidden, and tells nothing; where what is seen
+    lies behind it, nothing is around.
     """
     names, size = np.unique(label[label > 0], return_counts=True)
     rows_of, cloud, eye = rows_by_label(label), looks.cloud, middle_of(looks.cameras)
@@ -87,7 +99,16 @@ def find_inlays(looks: Looks, label: Int32, asked: Bool) -> Inlays:
         around, labelled = np.array(own)[of], told & (most > 0)
         np.add.at(count, around[told], 1)
         np.add.at(shown, (around[labelled], np.searchsorted(names, most[labelled])), 1)
-    return Inlays(size.astype(np.float64), count, shown)
+    meets, smooth = (_counts(names, label[ends.rows], touches) for touches in (ends.touches, ends.smooth))
+    return Inlays(size.astype(np.float64), count, shown, meets, smooth)
+
+
+def _counts(names: Int32, own: Int32, touches: Int32) -> Float64:
+    """[L, L] how many points of each label, called `names`, touch each label. own: [R] the label of each point.
+    touches: [2, T] which of the points touches which label."""
+    counts = np.zeros((len(names), len(names)))
+    np.add.at(counts, (np.searchsorted(names, own[touches[0]]), np.searchsorted(names, touches[1])), 1)
+    return counts
 
 
 def _beside(points: Float64, plane: Plane, cell: float) -> Float64:

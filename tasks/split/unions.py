@@ -19,7 +19,6 @@ from ss_flow.tasks.split.agreement import View, agreement_of
 from ss_flow.tasks.split.contact import Contact
 from ss_flow.tasks.split.inlays import Inlays
 from ss_flow.tasks.split.mounds import Mounds
-from ss_flow.tasks.split.sheets import Sheets
 from ss_flow.tasks.split.supports import Supports
 
 if TYPE_CHECKING:
@@ -35,8 +34,6 @@ on it."""
 _TOGETHER = 0.5
 """Share of the views which see two pieces that must hold them under one mask, whatever else it holds, so that a convex
 edge between them makes them faces of one thing."""
-_CRUMB = 0.02
-"""Share of its points below which what is added to a piece tells less and less of the whole: few views see it."""
 _MOST_SETS = 2000
 """Sets of pieces that are weighed in a round: those that the most masks show."""
 
@@ -49,17 +46,12 @@ class Pieces:
     """K."""
     stuff: Bool
     """[G]."""
-    size: Float64
-    """[G] points of each."""
-    agreement: Float64
-    """[G] on each being one; of a label 1."""
     contact: Contact
     edges: Bool
     """[G, G] which meet in a convex edge."""
     labels: list[Members]
     """G x the labels (rows) that each is made of."""
     mounds: Mounds
-    sheets: Sheets
     supports: Supports
     inlays: Inlays
     params: HierarchyParams
@@ -71,13 +63,12 @@ class Pieces:
         least, share = self.params.min_points, self.params.min_visible
         return [view.only((view.seen >= least) & (view.seen >= share * most)) for view in self.views]
 
-    def united(self, unions: list[tuple[Members, float]]) -> Pieces:
-        """What is left when each of these sets has become one piece, with this agreement: the others first, then the
-        unions."""
+    def united(self, unions: list[Members]) -> Pieces:
+        """What is left when each of these sets has become one piece: the others first, then the unions."""
         count = len(self.stuff)
-        gone = {piece for members, _ in unions for piece in members}
+        gone = {piece for members in unions for piece in members}
         left = [piece for piece in range(count) if piece not in gone]
-        groups: list[Members] = [*((piece,) for piece in left), *(members for members, _ in unions)]
+        groups: list[Members] = [*((piece,) for piece in left), *unions]
         joined = np.zeros((count, len(groups)), np.float32)
         for column, members in enumerate(groups):
             joined[list(members), column] = 1
@@ -85,8 +76,6 @@ class Pieces:
             self,
             views=[view.joined(joined) for view in self.views],
             stuff=self.stuff[[members[0] for members in groups]],
-            size=self.size @ joined,
-            agreement=np.array([*self.agreement[left], *(agreement for _, agreement in unions)]),
             contact=self.contact.joined(joined),
             edges=joined.T @ self.edges @ joined * ~np.eye(len(groups), dtype=bool) > 0,
             labels=[self._labels_of(members) for members in groups],
@@ -103,8 +92,7 @@ class Pieces:
         member = np.zeros((len(sets), len(self.stuff)), np.float32)
         for row, members in enumerate(sets):
             member[row, list(members)] = 1
-        agreement = np.maximum(self._agreements(sets, member, groups), least)
-        agreement = self._with_crumbs(member, agreement).round(6)
+        agreement = np.maximum(self._agreements(sets, member, groups), least).round(6)
         taken: set[int] = set()
         chosen = []
         for row in sorted(range(len(sets)), key=lambda row: (-agreement[row], len(sets[row]), sets[row])):
@@ -114,13 +102,6 @@ class Pieces:
                 chosen.append((sets[row], float(agreement[row])))
             taken |= set(sets[row])
         return chosen
-
-    def _with_crumbs(self, member: Float32, agreement: Float64) -> Float64:
-        """The agreements on sets [S], but on a piece and a crumb hardly more than on that piece: of the views that see
-        it, few were asked about the crumb. member: [S, G] 1 for the pieces of each set, else 0."""
-        size = member * self.size
-        rest, before = 1 - size.max(axis=1) / size.sum(axis=1), self.agreement[size.argmax(axis=1)]
-        return agreement - np.maximum(agreement - before, 0) * np.maximum(1 - rest / _CRUMB, 0)
 
     def _agreements(self, sets: list[Members], member: Float32, groups: dict[Members, tuple[Members, ...]]) -> Float64:
         """How far the views agree on each set, less or more by what its places tell: [S]. member: [S, G] 1 for the
@@ -170,11 +151,7 @@ class Pieces:
     def _presumed(self) -> dict[Members, float]:
         """The pairs of things that are faces of one, or of which one lies in the other, unless the views deny it; with
         the agreement that each has at least."""
-        lying = [
-            (min(inner, outer), max(inner, outer))
-            for inner, outer in self.inlays.pairs(self.labels)
-            if self.sheets.lies_in(self.labels[inner], self.labels[outer])
-        ]
+        lying = [(min(pair), max(pair)) for pair in self.inlays.pairs(self.labels)]
         faces = self._together(self.counted, np.argwhere(np.triu(self.edges)))
         inlaid = self._together(self.views, np.array(lying, np.intp).reshape(-1, 2))
         least = dict.fromkeys(inlaid, self.params.inlaid)
@@ -194,12 +171,9 @@ class Pieces:
         """Those of these pieces that do not stand on the others."""
         labels = [row for piece in members for row in self.labels[piece]]
         on_top = dict(zip(labels, self.mounds.standing(labels).tolist(), strict=True))
-        on_sheet = self.sheets.standing([self.labels[piece] for piece in members])
         on_level = self._on_level(members)
         return tuple(
-            piece
-            for piece, rises in zip(members, on_sheet.tolist(), strict=True)
-            if not (rises or piece in on_level or all(on_top[row] for row in self.labels[piece]))
+            piece for piece in members if not (piece in on_level or all(on_top[row] for row in self.labels[piece]))
         )
 
     def _on_level(self, members: Members) -> set[int]:

@@ -4,6 +4,7 @@ from flat_patches import BROWN, GREY, RED, WHITE, Patch, patch, scene, views_of
 
 from ss_flow.tasks.split.inlays import Inlays, find_inlays
 from ss_flow.tasks.split.looks import Looks
+from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
 EYES = [(0.5, 0.4, 2.7), (0.2, -0.6, 2.4), (0.8, 1.1, 2.4)]
 HIGH = 0.7
@@ -28,7 +29,8 @@ def without(board: Patch, *holes: Patch) -> Patch:
 def found(*patches: Patch, unlabelled: int = 0, asked: list[bool] | None = None, eyes=EYES) -> Inlays:
     cloud, _, label = scene(*patches, unlabelled=unlabelled)
     of = len(patches) - unlabelled
-    return find_inlays(Looks(cloud, *views_of(cloud, *eyes)), label, np.array(asked or [True] * of))
+    ends = borders(label, cloud, TouchingParams())
+    return find_inlays(Looks(cloud, *views_of(cloud, *eyes)), label, ends, np.array(asked or [True] * of))
 
 
 def lies_in(*patches: Patch, **how) -> list[list[int]]:
@@ -47,6 +49,13 @@ def test_a_picture_lies_in_its_mount():
     inlays = found(MOUNT, PICTURE)
     assert inlays.size.tolist() == [len(MOUNT[0]), len(PICTURE[0])]
     assert inlays.shown[1, 0] == inlays.places[1] >= 100
+
+
+@pytest.mark.parametrize(("smooth", "lies"), [(59, False), (60, True)])
+def test_it_must_go_on_into_the_other_without_an_edge_along_most_of_where_they_touch(smooth, lies):
+    around, touch = np.array([[0.0, 0], [20, 0]]), np.array([[0.0, 100], [100, 0]])
+    inlays = Inlays(np.full(2, 100.0), np.array([0.0, 20]), around, touch, smooth / 100 * touch)
+    assert inlays.pairs([(0,), (1,)]) == [(1, 0)] * lies
 
 
 def test_what_is_small_in_it_does_not():
