@@ -30,11 +30,11 @@ def tally(masks: list[tuple[set[int], float]], sees: set[int], points: int = SEE
     )
 
 
-def tree(tallies: list[Tally], labels: int, unused: int = 0, sizes: tuple[int, ...] = (), **changes) -> Hierarchy:
-    """Labels 1.., each a ball of 20 points (`sizes`) far from the others, so that none is flat; higher ones are unused.
+def tree(tallies: list[Tally], labels: int, unused: int = 0, **changes) -> Hierarchy:
+    """Labels 1.., each a ball of 20 points far from the others, so that none is flat; higher ones are unused.
     What touches what does not count, if not asked for."""
     rng = np.random.default_rng(0)
-    label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), sizes or 20)
+    label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), 20)
     places = rng.normal(size=(len(label), 3)).astype(np.float32)
     places[:, 0] += 9 * (label - 1)
     cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.1)
