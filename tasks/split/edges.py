@@ -14,7 +14,7 @@ from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, Visibility
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.shape import normals_of
-from ss_flow.tasks.split.votes.touching import Borders
+from ss_flow.tasks.split.votes.touching import Borders, counts_between
 
 _REACH = 8.0
 """Distance up to which points tell how two labels meet, in multiples of the cloud's spacing. It is twice the one at
@@ -49,13 +49,10 @@ def convex_edges(
     borders. Both labels must fall off behind the other's plane at most of the points where they touch.
     """
     labels = np.unique(label[label > 0])
-    row, other = ends.touches
     sinks = _sinking(points, _towards_cameras(points, cameras, visibility), label, ends)
-    a, b = np.searchsorted(labels, label[ends.rows[row]]), np.searchsorted(labels, other)
-    meets, convex = np.zeros((2, len(labels), len(labels)))
-    np.add.at(meets, (a, b), 1)
-    np.add.at(convex, (a, b), sinks >= _SINKS)
-    border = np.bincount(np.searchsorted(labels, label[ends.rows[np.unique(row)]]), minlength=len(labels))
+    touches = ends.touches, ends.touches[:, sinks >= _SINKS]
+    meets, convex = (counts_between(labels, label[ends.rows], of) for of in touches)
+    border = np.bincount(np.searchsorted(labels, label[ends.rows[np.unique(ends.touches[0])]]), minlength=len(labels))
     mostly = convex > _CONVEX * meets
     along = convex >= _ALONG * (border[:, None] + _PRESUMED)
     return np.asarray(mostly & mostly.T & (along | along.T))

@@ -16,7 +16,7 @@ from ss_flow.tasks.artifacts import Bool, Float64, Int32
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.geometry.shape import Plane, axes_in, middle_of, on_plane, plane_of_most, thinned, towards
 from ss_flow.tasks.split.looks import Looks
-from ss_flow.tasks.split.votes.touching import Borders
+from ss_flow.tasks.split.votes.touching import Borders, counts_between
 
 _FEW = 100
 """Points below which a label has no outline."""
@@ -69,9 +69,16 @@ class Inlays:
         np.fill_diagonal(shown, 0)
         found = (shown >= _AROUND * places[:, None]) & (places[:, None] >= _SEEN)
         found &= size[:, None] >= _SHARE * (size[:, None] + size)
-        meets, smooth = (member @ touches @ member.T for touches in (self.meets, self.smooth))
-        found &= smooth >= np.maximum(_MOSTLY * meets, 1)
-        return [(inner, outer) for inner, outer in np.argwhere(found).tolist()]
+        return [
+            (inner, outer)
+            for inner, outer in np.argwhere(found).tolist()
+            if self._goes_on(pieces[inner], pieces[outer])
+        ]
+
+    def _goes_on(self, piece: tuple[int, ...], other: tuple[int, ...]) -> bool:
+        """Whether a piece, some labels (rows), goes on without an edge into another one, mostly, where they touch."""
+        here = np.ix_(piece, other)
+        return bool(self.smooth[here].sum() >= max(_MOSTLY * self.meets[here].sum(), 1))
 
 
 def find_inlays(looks: Looks, label: Int32, ends: Borders, asked: Bool) -> Inlays:
@@ -99,16 +106,8 @@ def find_inlays(looks: Looks, label: Int32, ends: Borders, asked: Bool) -> Inlay
         around, labelled = np.array(own)[of], told & (most > 0)
         np.add.at(count, around[told], 1)
         np.add.at(shown, (around[labelled], np.searchsorted(names, most[labelled])), 1)
-    meets, smooth = (_counts(names, label[ends.rows], touches) for touches in (ends.touches, ends.smooth))
+    meets, smooth = (counts_between(names, label[ends.rows], touches) for touches in (ends.touches, ends.smooth))
     return Inlays(size.astype(np.float64), count, shown, meets, smooth)
-
-
-def _counts(names: Int32, own: Int32, touches: Int32) -> Float64:
-    """[L, L] how many points of each label, called `names`, touch each label. own: [R] the label of each point.
-    touches: [2, T] which of the points touches which label."""
-    counts = np.zeros((len(names), len(names)))
-    np.add.at(counts, (np.searchsorted(names, own[touches[0]]), np.searchsorted(names, touches[1])), 1)
-    return counts
 
 
 def _beside(points: Float64, plane: Plane, cell: float) -> Float64:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 
 from ss_flow.running import cores
-from ss_flow.tasks.artifacts import Bool, Float32, Int32, PointCloud
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, PointCloud
 from ss_flow.tasks.geometry.shape import normals_of
 from ss_flow.tasks.ranges import Fraction, Positive, Range
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
@@ -127,6 +127,16 @@ def borders(label: Int32, cloud: PointCloud, params: TouchingParams) -> Borders:
     touches = i * base + label[rows[j]]
     some, smooth = (np.stack(np.divmod(np.unique(of), base)).astype(np.int32) for of in (touches, touches[even]))
     return Borders(rows, beside, some, smooth)
+
+
+def counts_between(names: Int32, own: Int32, touches: Int32) -> Float64:
+    """[L, L] how many points at the border of each label, called `names`, ascending, touch each other one.
+
+    own: [R] the label of each point. touches: [2, T] which of the points touches which label, as in `Borders`.
+    """
+    counts = np.zeros((len(names), len(names)))
+    np.add.at(counts, (np.searchsorted(names, own[touches[0]]), np.searchsorted(names, touches[1])), 1)
+    return counts
 
 
 def _nearest(tree: cKDTree, rows: Int32, count: int, reach: float) -> Int32:
