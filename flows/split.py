@@ -135,7 +135,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     if segmenter is not None and capture.masks is None:
         prompted = _prompted(capture, embeddings, seen, shown, labels, segmenter, params)
     in_views = _in_views(capture, seen, shown, labels, prompted, params)
-    instances = reproject(points, labels, parts, in_views, min_views=params.reproject.min_views)
+    instances = reproject(points, labels, parts, tree, in_views, min_views=params.reproject.min_views)
     seen_in = appearances(labels, seen)
     return Split(points, seen, masks, voted, pieces, tree, labels, parts, instances, seen_in, embeddings, hinted)
 

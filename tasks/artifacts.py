@@ -328,10 +328,6 @@ class InstancesInView(PhotoMasks):
     """[N] instance id of each mask, ascending, 0 = background."""
     origin: UInt8
     """[N] where the mask came from: FOUND, PROMPTED or DRAWN."""
-    held: Int32
-    """[N] pixels of the mask on which a dense point falls."""
-    contradicted: Int32
-    """[N] those of them whose point has another label."""
 
 
 @dataclass(frozen=True)
@@ -349,7 +345,7 @@ class InstanceMasks(ViewMasks):
     point_part: Int32
     """[N] part of the instance, 0 = the whole."""
     confidence: float
-    """Mean vote share, less what other labels contradict."""
+    """Probability that it is one whole thing."""
     origin: UInt8
     """[V] where the mask came from: FOUND, PROMPTED, REFINED or DRAWN."""
     weak: bool

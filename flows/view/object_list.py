@@ -16,6 +16,7 @@ from ss_flow.flows.view.search import Search
 from ss_flow.flows.view.session import Session
 from ss_flow.tasks.artifacts import UInt8
 from ss_flow.tasks.deliver.compressed import compressed, data_uri
+from ss_flow.tasks.deliver.instances_json import is_doubtful
 from ss_flow.tasks.deliver.palette import instance_color
 from ss_flow.tasks.semantics.query import QueryResult
 
@@ -101,9 +102,10 @@ class ObjectList:
             self.turn.label = f"{first + 1}-{first + len(listed)} of {len(order)}" if order else "none"
 
     def _order(self) -> list[int]:
-        """The ids to list, those that are asked for first."""
+        """The ids to list, those that are asked for first, what is doubtful last."""
         objects, pieces = self._session.state.objects, self._session.state.pieces
-        by_size = sorted(objects.entries, key=lambda i: -len(pieces[i].rows) if i in pieces else 0)
+        size = {i: len(pieces[i].rows) if i in pieces else 0 for i in objects.entries}
+        by_size = sorted(size, key=lambda i: (is_doubtful(objects.entries[i]), -size[i]))
         if self._found is None:
             by_size += [BACKGROUND] if BACKGROUND in pieces else []
         ranked = [] if self._found is None else [i for i in self._found.instance_id.tolist() if i in objects.entries]

@@ -23,6 +23,7 @@ from ss_flow.tasks.artifacts import Float32, Gaussians
 from ss_flow.tasks.deliver.compressed import Thumbnail, compressed, data_uri
 from ss_flow.tasks.deliver.export.content import morton_order
 from ss_flow.tasks.deliver.export.spz import spz
+from ss_flow.tasks.deliver.instances_json import is_doubtful
 from ss_flow.tasks.deliver.palette import instance_colors
 from ss_flow.tasks.deliver.report import title_of
 from ss_flow.tasks.gaussians.initialise import select
@@ -45,7 +46,7 @@ def write_page(file: Path, run: FinishedRun) -> None:
     pictured = {one.instance_id: one for one in results.thumbnails()}
     start = start_view(cameras, scene.means)
     objects = [(entry, pictured.get(entry["id"])) for entry in run.instances["instances"]]
-    objects.sort(key=lambda of: -of[1].share if of[1] else 0.0)
+    objects.sort(key=lambda of: (is_doubtful(of[0]), -of[1].share if of[1] else 0.0))
     title = title_of(PurePath(str(run.document["scene"])))
     write_atomically(file, page_html(title, scene, start, objects))
 
@@ -70,7 +71,7 @@ def page_html(
     for entry, picture in objects:
         own = seen.means[seen.instance_id == entry["id"]]
         if len(own):
-            about = f"{_counted(len(own), 'Gaussian')}, {entry['confidence']:.0%} agreement"
+            about = f"{_counted(len(own), 'Gaussian')}, confidence {entry['confidence']:.2f}"
             fields.append(_object(entry["id"], entry["name"], about, picture) | _place(own, origin, unit))
     behind = seen.means[seen.instance_id == BACKGROUND]
     if len(behind):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,8 @@ _FAINT = 0.15
 """Opacity below which a Gaussian does not widen a box: strays far off all points are hardly to be seen."""
 _CRUMB = 0.001
 """Share of the views that show an instance which it must fill not to be a crumb."""
+_DOUBTFUL = 0.1
+"""Confidence below which lists put a thing last: of twenty such, one is right."""
 
 
 def instances_document(
@@ -46,7 +48,7 @@ def instances_document(
     entries = []
     for instance in known:
         rows = rows_of.get(instance.instance_id, np.zeros(0, np.intp))
-        crumb = _is_crumb(instance)
+        crumb = is_crumb(instance)
         entry = {
             "id": instance.instance_id,
             "name": called[instance.instance_id],
@@ -73,6 +75,11 @@ def instances_document(
         "instances": entries,
         "groups": _groups([entry["id"] for entry in entries], tree, parents),
     }
+
+
+def is_doubtful(entry: Mapping[str, Any]) -> bool:
+    """Whether an instance of the document is no crumb, but hardly a whole thing; walls and floors are none anyway."""
+    return bool(entry["kind"] == "thing" and not entry["crumb"] and entry["confidence"] < _DOUBTFUL)
 
 
 def instance_file(instance_id: int) -> str:
@@ -108,7 +115,8 @@ def _parts(instance: InstanceMasks) -> list[dict[str, Any]]:
     return found
 
 
-def _is_crumb(instance: InstanceMasks) -> bool:
+def is_crumb(instance: InstanceMasks) -> bool:
+    """Whether an instance is weak, or hardly fills anything of the views that show it."""
     return instance.weak or int(instance.areas().sum()) < _CRUMB * int(instance.sizes.prod(axis=1).sum())
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import PointLabels
 from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, data_uri
 from ss_flow.tasks.deliver.edit_words import EditWords
+from ss_flow.tasks.deliver.instances_json import is_doubtful
 from ss_flow.tasks.deliver.timeline import timeline
 
 _KINDS = {
@@ -119,8 +120,8 @@ def report_html(
     run: the document of run.json ("status", "scene", "params", "models", "metrics", "nodes", "warnings", "failures",
     "edit"; any may be missing). pictures: named "VIEW/KIND" with the kinds photo, masks_split, masks, render, depth,
     which are shown in one row a view ("VIEW/KIND, NOTE" adds to the caption), or by their caption. instances: the
-    document of instances.json. Those that fill most of the views come first, walls and floors after things, and crumbs
-    are folded away.
+    document of instances.json. Those that fill most of the views come first, walls and floors after things; what is
+    doubtful, and crumbs, are folded away.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -151,7 +152,8 @@ def report_html(
         peak=max((float(node.get("peak_rss_mb") or 0) for node in nodes), default=0.0),
         views=views,
         others=others,
-        instances=[entry for entry in listed if not entry["crumb"]],
+        instances=[entry for entry in listed if not (entry["crumb"] or is_doubtful(entry))],
+        doubtful=[entry for entry in listed if is_doubtful(entry)],
         crumbs=[entry for entry in listed if entry["crumb"]],
         shares=shares,
         thumbnails={i: data_uri(one.content) for i, one in thumbnails.items()},

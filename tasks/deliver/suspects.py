@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from ss_flow.tasks.artifacts import Float32, Hierarchy, InstanceMasks
+from ss_flow.tasks.deliver.instances_json import is_doubtful
 from ss_flow.tasks.geometry.clustering import dbscan
 from ss_flow.tasks.words import first_of
 
 _FEW_VIEWS = 3
 _FEW_SHARE = 0.05
 """An object has few views below three, and below a twentieth of all."""
-_UNSURE = 0.6
-"""Confidence below which an object is told of."""
+_UNSURE = 0.5
+"""Confidence below which an object is told of: it is likelier no whole thing than one."""
 _NEARLY_ONE = 0.4
 """Share of the views that show several objects as one thing, from which they may be fragments of it."""
 _HARDLY_ONE = 0.5
@@ -38,9 +39,10 @@ def suspects(
     """The suspicious objects, by rising id: id, name, and reasons in words.
 
     instances: after refinement. document: that of instances.json; crumbs, which say of themselves that they are small
-    or hardly seen, are left out. tree: what is part of what. spacing: of the dense points, world units.
+    or hardly seen, and what is doubtful, which stands apart in lists, are left out. tree: what is part of what.
+    spacing: of the dense points, world units.
     """
-    entries = {entry["id"]: entry for entry in document["instances"] if not entry["crumb"]}
+    entries = {entry["id"]: entry for entry in document["instances"] if not (entry["crumb"] or is_doubtful(entry))}
     own = {one.instance_id: one for one in instances if one.instance_id in entries}
     things = [i for i in own if entries[i]["kind"] == "thing"]
     reasons: dict[int, list[str]] = {i: [] for i in sorted(own)}
@@ -52,7 +54,7 @@ def suspects(
         if (count := entries[i]["num_gaussians"]) < _HARDLY_THERE * len(one.points):
             many = "1 Gaussian" if count == 1 else f"{count} Gaussians"
             reasons[i].append(f"hardly anything of it was reconstructed: {many} for {len(one.points):,} points")
-        if one.confidence < _UNSURE:
+        if i in things and one.confidence < _UNSURE:
             reasons[i].append(f"low confidence: {one.confidence:.0%}")
         if i in things and (pieces := _pieces(one.points, _APART * spacing)) > 1:
             reasons[i].append(f"in pieces: its points lie in {pieces} places apart")

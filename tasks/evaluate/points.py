@@ -178,11 +178,8 @@ def quality_by_kind(truth: Labels, predicted: Labels, stuff: Int32) -> dict[str,
 
 
 def _scores(instances: Sequence[InstanceMasks]) -> dict[int, float]:
-    """How sure each instance is, for the average precision: mean confidence of its labels times the root of its views
-    (spec 2.1 a)."""
-    return {
-        one.instance_id: one.confidence * len(one.views) ** 0.5 for one in (instances[i] for i in range(len(instances)))
-    }
+    """How sure each instance is, for the average precision."""
+    return {one.instance_id: one.confidence for one in (instances[i] for i in range(len(instances)))}
 
 
 def point_metrics(

@@ -108,13 +108,3 @@ def stack_exclusive(shown: dict[int, Bool], height: int, width: int) -> Int32:
     for label in sorted(shown, key=lambda label: (-int(np.count_nonzero(shown[label])), -label)):
         ids[shown[label]] = label
     return ids
-
-
-def contradicted(painted: PaintedView, ids: Int32, labels: Int32) -> tuple[Int32, Int32]:
-    """For each of some labels [L] the painted pixels that its mask holds, and those of them with another label: [L]
-    each. ids: [H, W] the label whose mask holds each pixel."""
-    under = ids.ravel()[painted.pixel]
-    other = (painted.label > 0) & (painted.label != under)
-    count = int(labels.max(initial=0)) + 1
-    held, against = (np.bincount(of, minlength=count)[labels].astype(np.int32) for of in (under, under[other]))
-    return held, against

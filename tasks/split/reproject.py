@@ -14,6 +14,7 @@ from ss_flow.tasks.artifacts import (
     FOUND,
     PROMPTED,
     Bool,
+    Hierarchy,
     InstanceMasks,
     InstancesInView,
     MaskSet,
@@ -29,7 +30,6 @@ from ss_flow.tasks.masks.painting import (
     PaintedView,
     agreement,
     agreements,
-    contradicted,
     labels_in_front,
     nearest_painted,
     stack_exclusive,
@@ -38,6 +38,7 @@ from ss_flow.tasks.masks.pool import smoothed
 from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
 from ss_flow.tasks.packed import Masks
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
+from ss_flow.tasks.split.confidence import confidence, evidence, pieces
 from ss_flow.tasks.unread import by_default
 
 _DENSE = 2.5
@@ -87,7 +88,6 @@ def instances_in_view(
     shown, origin = _masks_of_view(painted, view, pool, prompted, params)
     ids = stack_exclusive(shown, view.height, view.width)
     label = np.unique(ids)
-    held, against = contradicted(painted, ids, label)
     return InstancesInView(
         **vars(Masks.of(ids == i for i in label)),
         name=view.name,
@@ -95,8 +95,6 @@ def instances_in_view(
         width=view.width,
         label=label,
         origin=np.array([origin.get(int(i), FOUND) for i in label], np.uint8),
-        held=held,
-        contradicted=against,
     )
 
 
@@ -105,41 +103,38 @@ def reproject(
     points: PointCloud,
     labels: PointLabels,
     parts: PointParts,
+    tree: Hierarchy,
     views: Sequence[InstancesInView],
     *,
     min_views: int,
 ) -> tuple[InstanceMasks, ...]:
     """The instances that the labelled points make, with their masks in all views.
 
-    The first instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id. An
-    instance's confidence is its points' mean share of votes, less the share of its painted pixels that other labels
-    contradict. min_views: as in `ReprojectParams`. Warns where there is none but the background, and where every other
-    one is weak.
+    The first instance is the background (id 0): unlabelled points, and what no mask covers; the others follow by id.
+    tree: what is part of what, for the confidence of each. min_views: as in `ReprojectParams`. Warns where there is
+    none but the background, and where every other one is weak.
     """
-    num_labels = int(labels.label.max(initial=0))
-    held, against = np.zeros(num_labels + 1), np.zeros(num_labels + 1)
+    alone = pieces(tree)
     shown_in: dict[int, list[tuple[InstancesInView, int]]] = {}
     for view in views:
-        held[view.label] += view.held
-        against[view.label] += view.contradicted
         for row, label in enumerate(view.label.tolist()):
             shown_in.setdefault(label, []).append((view, row))
-    agreed = 1 - against / np.maximum(held, 1)
     found = []
     for label in np.union1d([0], labels.label).tolist():
         rows, shown = labels.label == label, shown_in.get(label, [])
-        share = labels.confidence[rows]
+        masks = Masks.joined([view.rows([row]) for view, row in shown])
+        origin = np.array([view.origin[row] for view, row in shown], np.uint8)
         found.append(
             InstanceMasks(
                 instance_id=label,
                 points=points.points[rows],
                 colors=points.colors[rows],
-                point_confidence=share,
+                point_confidence=labels.confidence[rows],
                 point_part=parts.part[rows],
-                confidence=float(share.mean(dtype=np.float64)) * float(agreed[label]) if share.size else 0.0,
+                confidence=confidence(evidence(masks, origin, piece=label in alone)) if shown else 0.0,
                 views=tuple(view.name for view, _ in shown),
-                **vars(Masks.joined([view.rows([row]) for view, row in shown])),
-                origin=np.array([view.origin[row] for view, row in shown], np.uint8),
+                **vars(masks),
+                origin=origin,
                 weak=label > 0 and len(shown) < min_views,
             )
         )

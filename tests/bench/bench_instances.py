@@ -194,7 +194,7 @@ def score(room: Scene, masks: tuple[MaskSet, ...], split: SplitParams) -> dict[s
     in_views = tuple(
         instances_in_view(view, pool, labels, params=split.reproject) for view, pool in zip(seen, masks, strict=True)
     )
-    instances = reproject(room.cloud, labels, whole, in_views, min_views=split.reproject.min_views)
+    instances = reproject(room.cloud, labels, whole, tree, in_views, min_views=split.reproject.min_views)
     maps = resolve(room.cameras, instances)
     values = evaluate_masks(maps, room.truth, tree).values
     known = room.true_label >= 0

@@ -46,6 +46,15 @@ def test_what_is_typed_is_answered_as_by_the_command(viewer: Viewer, tiny) -> No
     assert "nothing follows" in objects.answer.content or "empty" in objects.answer.content
 
 
+def test_what_is_hardly_a_whole_thing_stands_last(viewer: Viewer) -> None:
+    objects = viewer.panel.objects
+    first, *others = (i for i in _listed(objects) if i)
+    entries = viewer.panel.session.state.objects.entries
+    entries[first] = entries[first] | {"confidence": 0.05}
+    objects.show()
+    assert [i for i in _listed(objects) if i] == [*others, first]
+
+
 def test_an_object_is_found_by_its_name_too(viewer: Viewer) -> None:
     panel, objects = viewer.panel, viewer.panel.objects
     last = _listed(objects)[-1] or _listed(objects)[-2]

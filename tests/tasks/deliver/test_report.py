@@ -84,13 +84,20 @@ def test_what_the_run_says_is_on_the_page():
         assert text in page.text, text
 
 
-def test_crumbs_are_folded_away_and_stuff_comes_after_things():
+def test_what_is_doubtful_and_crumbs_are_folded_away_and_stuff_comes_after_things():
     def entry(name: str, **changes):
         return INSTANCE | {"name": name, "weak": False} | changes
 
-    listed = [entry("wall", kind="stuff", num_points=9), entry("speck", crumb=True), entry("mug", num_points=5)]
+    unlikely = {"confidence": 0.09}
+    listed = [
+        entry("wall", kind="stuff", num_points=9, **unlikely),
+        entry("speck", crumb=True, **unlikely),
+        entry("patch", num_points=99, **unlikely),
+        entry("mug", num_points=5),
+    ]
     text = Page(report_html(RUN, pictures=(), instances={"instances": listed})).text
-    assert text.index("mug") < text.index("wall") < text.index("1 crumb: ") < text.index("speck")
+    order = ("2, 1 doubtful", "mug", "wall", "1 that is hardly a whole thing: ", "patch", "1 crumb: ", "speck")
+    assert [text.index(words) for words in order] == sorted(text.index(words) for words in order)
 
 
 def test_metrics_read_as_words_and_counts_as_whole_numbers():

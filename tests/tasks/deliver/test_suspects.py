@@ -44,6 +44,7 @@ def _found(
             "name": f"thing {one.instance_id}",
             "kind": (kinds or {}).get(one.instance_id, "thing"),
             "crumb": one.instance_id in crumbs,
+            "confidence": one.confidence,
             "num_gaussians": (gaussians or {}).get(one.instance_id, len(one.points)),
         }
         for one in instances
@@ -73,8 +74,14 @@ def test_what_was_hardly_reconstructed_is_told_of() -> None:
 
 
 def test_few_views_and_low_confidence_are_told_with_their_figures() -> None:
-    told = _found(_instance(1, _block(0), views=2), _instance(2, _block(1), confidence=0.55), _instance(3, _block(2)))
-    assert told == {1: "few views: it is seen in 2 of 20", 2: "low confidence: 55%"}
+    told = _found(_instance(1, _block(0), views=2), _instance(2, _block(1), confidence=0.45), _instance(3, _block(2)))
+    assert told == {1: "few views: it is seen in 2 of 20", 2: "low confidence: 45%"}
+
+
+def test_what_is_doubtful_and_walls_without_confidence_are_not_told_of() -> None:
+    assert _found(_instance(1, _block(0), views=2, confidence=0.09)) == {}
+    assert _found(_instance(1, _block(0), confidence=0.09), kinds={1: "stuff"}) == {}
+    assert _found(_instance(1, _block(0), confidence=0.1)) == {1: "low confidence: 10%"}
 
 
 def test_an_object_in_places_apart_is_in_pieces_but_its_specks_and_walls_are_not() -> None:

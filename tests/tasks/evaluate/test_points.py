@@ -148,13 +148,12 @@ def test_below_one_half_the_first_prediction_is_taken_and_the_surest_counts() ->
     assert twice == pytest.approx(1 / 2 + (1 + 2 / 3) / 2 / 2)
 
 
-def test_the_surer_predictions_are_those_of_more_confidence_and_of_more_views() -> None:
+def test_the_surer_predictions_are_those_of_more_confidence() -> None:
     count = [200, 200, 40, 160, 300]
     truth, predicted = np.repeat([0, 1, -1, 2, 2], count), np.repeat([5, 6, 7, 7, 0], count)
     place = np.arange(len(truth))[:, None] * np.float32([1, 0, 0])
     instances = [
-        SimpleNamespace(instance_id=i, confidence=confidence, views=("v",) * views)
-        for i, confidence, views in ((5, 0.5, 16), (7, 0.9, 4), (6, 0.2, 25))  # times the root: 2, 1.8 and 1
+        SimpleNamespace(instance_id=i, confidence=confidence) for i, confidence in ((5, 0.9), (7, 0.5), (6, 0.2))
     ]
     found = evaluate_points(
         _cloud(place), labels_of(predicted.tolist()), instances, TruePoints(place, truth.astype(np.int32))
