@@ -15,6 +15,6 @@ The steps, in the order in which they run:
    `parts`: masks inside the masks of a label.
 6. `boards`: what rises from a flat one becomes an instance. `walls`: the pieces of a wall or a floor become one.
    `correct`, with its `part_masks`: instances that the user joins or divides.
-7. `reprompt`, `instances_in_view`, `reproject`: the instances' masks in each view. `appearances`: the views that show
-   each instance.
+7. `reprompt`, `instances_in_view`, `reproject`: the instances' masks in each view. `confidence`: how likely each is to
+   be one whole thing. `appearances`: the views that show each instance.
 """

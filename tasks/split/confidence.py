@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import expit
 
 from ss_flow.tasks.artifacts import DRAWN, FOUND, Float64, Hierarchy, UInt8
 from ss_flow.tasks.packed import Masks
@@ -33,7 +32,7 @@ def confidence(told: Float64) -> float:
 
     A share of votes does not tell: what is drawn wrongly is drawn wrongly in all views alike.
     """
-    return float(expit(_WEIGHTS @ told + _CONSTANT))
+    return float(1 / (1 + np.exp(-(_WEIGHTS @ told + _CONSTANT))))
 
 
 def pieces(tree: Hierarchy) -> frozenset[int]:
