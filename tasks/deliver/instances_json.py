@@ -18,7 +18,7 @@ _FAINT = 0.15
 """Opacity below which a Gaussian does not widen a box: strays far off all points are hardly to be seen."""
 _CRUMB = 0.001
 """Share of the views that show an instance which it must fill not to be a crumb."""
-_DOUBTFUL = 0.1
+DOUBTFUL = 0.1
 """Confidence below which lists put a thing last: of twenty such, one is right."""
 
 
@@ -79,7 +79,7 @@ def instances_document(
 
 def is_doubtful(entry: Mapping[str, Any]) -> bool:
     """Whether an instance of the document is no crumb, but hardly a whole thing; walls and floors are none anyway."""
-    return bool(entry["kind"] == "thing" and not entry["crumb"] and entry["confidence"] < _DOUBTFUL)
+    return bool(entry["kind"] == "thing" and not entry["crumb"] and entry["confidence"] < DOUBTFUL)
 
 
 def instance_file(instance_id: int) -> str:

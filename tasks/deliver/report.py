@@ -13,7 +13,7 @@ import numpy as np
 from ss_flow.tasks.artifacts import PointLabels
 from ss_flow.tasks.deliver.compressed import Picture, Thumbnail, data_uri
 from ss_flow.tasks.deliver.edit_words import EditWords
-from ss_flow.tasks.deliver.instances_json import is_doubtful
+from ss_flow.tasks.deliver.instances_json import DOUBTFUL, is_doubtful
 from ss_flow.tasks.deliver.timeline import timeline
 
 _KINDS = {
@@ -154,6 +154,7 @@ def report_html(
         others=others,
         instances=[entry for entry in listed if not (entry["crumb"] or is_doubtful(entry))],
         doubtful=[entry for entry in listed if is_doubtful(entry)],
+        doubtful_below=DOUBTFUL,
         crumbs=[entry for entry in listed if entry["crumb"]],
         shares=shares,
         thumbnails={i: data_uri(one.content) for i, one in thumbnails.items()},

@@ -37,6 +37,5 @@ def confidence(told: Float64) -> float:
 
 def pieces(tree: Hierarchy) -> frozenset[int]:
     """The labels that were not put together from others, and that some views show as one with others."""
-    united = np.unique(tree.parent)
-    alone = (tree.parent > 0) & ~np.isin(tree.node, united)
-    return frozenset(tree.node[alone].tolist())
+    of_more = (tree.parent > 0) & ~np.isin(tree.node, tree.parent)
+    return frozenset(tree.node[of_more].tolist())

@@ -114,7 +114,7 @@ def reproject(
     tree: what is part of what, for the confidence of each. min_views: as in `ReprojectParams`. Warns where there is
     none but the background, and where every other one is weak.
     """
-    alone = pieces(tree)
+    of_more = pieces(tree)
     shown_in: dict[int, list[tuple[InstancesInView, int]]] = {}
     for view in views:
         for row, label in enumerate(view.label.tolist()):
@@ -131,7 +131,7 @@ def reproject(
                 colors=points.colors[rows],
                 point_confidence=labels.confidence[rows],
                 point_part=parts.part[rows],
-                confidence=confidence(evidence(masks, origin, piece=label in alone)) if shown else 0.0,
+                confidence=confidence(evidence(masks, origin, piece=label in of_more)) if shown else 0.0,
                 views=tuple(view.name for view, _ in shown),
                 **vars(masks),
                 origin=origin,

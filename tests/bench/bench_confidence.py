@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 from bench_composite import ROOM, crowded_of, folder_of, other_of
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 from scipy.stats import rankdata
@@ -88,21 +89,25 @@ def judged(kind: str, folder: Path, params: Params, store: Store) -> Judged:
     table = replace(table, truth_ids=np.where(table.truth_ids == 0, -1, table.truth_ids))
     ap50 = scannet_ap(table, {one.instance_id: one.confidence for one in instances}, 0.5)
     best = dict(zip(table.predicted_ids.tolist(), table.iou[table.truth_ids > 0].max(axis=0, initial=0), strict=True))
-    stuff, alone = set(tree.node[tree.stuff].tolist()), pieces(tree)
+    stuff, of_more = set(tree.node[tree.stuff].tolist()), pieces(tree)
     listed = [i for i in instances if i.instance_id and i.instance_id not in stuff and not is_crumb(i)]
     return Judged(
         kind,
-        np.array([evidence(i, i.origin, piece=i.instance_id in alone) for i in listed]).reshape(-1, 4),
+        np.array([evidence(i, i.origin, piece=i.instance_id in of_more) for i in listed]).reshape(-1, 4),
         np.array([i.confidence for i in listed]),
         np.array([best.get(i.instance_id, 0) >= 0.5 for i in listed], bool),
         ap50,
     )
 
 
+def bin_of(confidence: Float64) -> NDArray[np.intp]:
+    """[N] which of the bins each falls in."""
+    return np.minimum((confidence * BINS).astype(np.intp), BINS - 1)
+
+
 def calibration_error(confidence: Float64, right: Bool) -> float:
     """The mean difference of confidence and share that is right, over the bins."""
-    place = np.minimum((confidence * BINS).astype(int), BINS - 1)
-    return float(np.abs(np.bincount(place, confidence - right, BINS)).sum() / len(right))
+    return float(np.abs(np.bincount(bin_of(confidence), confidence - right)).sum() / len(right))
 
 
 def auc(confidence: Float64, right: Bool) -> float:
@@ -113,7 +118,7 @@ def auc(confidence: Float64, right: Bool) -> float:
 
 def bins(confidence: Float64, right: Bool) -> Iterator[str]:
     """A line for each bin that is not empty."""
-    place = np.minimum((confidence * BINS).astype(int), BINS - 1)
+    place = bin_of(confidence)
     for low in np.unique(place):
         own = place == low
         yield f"| {low / BINS:.1f} | {own.sum()} | {confidence[own].mean():.2f} | {right[own].mean():.2f} |"
