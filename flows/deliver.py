@@ -212,7 +212,7 @@ def write_report(
         results.all("refine"),
         instances,
         results.one("hierarchy"),
-        spacing=results.one("dense").spacing,
+        spacing=results.one("dense").spacing_of(),
         num_views=len(results.digests["ingest"]),
     )
     votes = Votes.of(results.one("propagate"), document["params"]["split.propagate.tau_label"])

@@ -179,10 +179,15 @@ class PointCloud:
     """[N, 3] RGB."""
     unit: float
     """The length, in world units, that plays the part of one metre in an average room (1.0 when metric)."""
-    spacing: float
-    """Median distance to the nearest neighbour, in world units."""
+    spacing: Float32
+    """[N] distance at which neighbours lie there, in world units: larger where only far views look."""
     noise: float = 0.0
     """Standard deviation of the views' depth from the points, as a share of the depth."""
+
+    def spacing_of(self, rows: NDArray[np.integer] | slice = slice(None)) -> float:
+        """The usual spacing, by its median, of some of the points; 0.0 where there are none."""
+        spacing = self.spacing[rows]
+        return float(np.median(spacing)) if len(spacing) else 0.0
 
 
 @dataclass(frozen=True)

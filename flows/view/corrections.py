@@ -103,7 +103,7 @@ class Corrections:
     @property
     def spacing(self) -> float:
         """Median distance of the dense points, world units."""
-        return self._cloud.spacing
+        return self._cloud.spacing_of()
 
     def told(self) -> list[str]:
         """What the points say that the run does not know yet, a sentence each."""

@@ -267,22 +267,22 @@ def _(value: DepthMap, scene: SceneApi, name: str, around: Around) -> None:
 
 @_draw.register(PointCloud)
 def _(value: PointCloud, scene: SceneApi, name: str, around: Around) -> None:
-    add_points(scene, name, value.points, value.colors, value.spacing)
+    add_points(scene, name, value.points, value.colors, value.spacing_of())
 
 
 @_draw.register(PointLabels)
 def _(value: PointLabels, scene: SceneApi, name: str, around: Around) -> None:
     """The dense points by their labels, and, as a node beside it, by how far the views agree."""
     dense = around.labelled_points(value.label)
-    add_points(scene, f"{name}/labels", dense.points, label_colors(value.label), dense.spacing)
+    add_points(scene, f"{name}/labels", dense.points, label_colors(value.label), dense.spacing_of())
     agreement = agreement_colors(value.confidence)
-    add_points(scene, f"{name}/agreement", dense.points, agreement, dense.spacing).visible = False
+    add_points(scene, f"{name}/agreement", dense.points, agreement, dense.spacing_of()).visible = False
 
 
 @_draw.register(PointParts)
 def _(value: PointParts, scene: SceneApi, name: str, around: Around) -> None:
     dense = around.labelled_points(value.part)
-    add_points(scene, name, dense.points, label_colors(value.part), dense.spacing)
+    add_points(scene, name, dense.points, label_colors(value.part), dense.spacing_of())
 
 
 @_draw.register(Visibility)
@@ -291,7 +291,7 @@ def _(value: Visibility, scene: SceneApi, name: str, around: Around) -> None:
     if around.points is None:
         raise InputError("what a view sees can be placed only with the dense points.")
     seen = around.points.points[value.point_index]
-    add_points(scene, name, seen, depth_colors(value.depth)[0], around.points.spacing)
+    add_points(scene, name, seen, depth_colors(value.depth)[0], around.points.spacing_of())
 
 
 @_draw.register(InstanceMasks)

@@ -107,13 +107,13 @@ def _log_points(stream: Any, run: FinishedRun) -> None:
         points("sparse", sparse, np.full((len(sparse), 3), 90, np.uint8), spacing_of(sparse) / 4)
     if not results.missing(["dense"]):
         dense = results.one("dense")
-        points("dense/photo", dense.points, dense.colors, dense.spacing / 2)
+        points("dense/photo", dense.points, dense.colors, dense.spacing_of() / 2)
         if not results.missing(["propagate"]):
             agreement = agreement_colors(results.one("propagate").confidence)
-            points("dense/agreement", dense.points, agreement, dense.spacing / 2)
+            points("dense/agreement", dense.points, agreement, dense.spacing_of() / 2)
         if not results.missing(["cut"]):
             label = results.one("cut").label
-            points("dense/labels", dense.points, label_colors(label), dense.spacing / 2, label.astype(np.uint16))
+            points("dense/labels", dense.points, label_colors(label), dense.spacing_of() / 2, label.astype(np.uint16))
     if not results.missing(["scene"]):
         scene: Gaussians = results.one("scene")
         solid = scene.opacities >= _SOLID

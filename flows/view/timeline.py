@@ -77,7 +77,7 @@ def stages(run: FinishedRun, share: float = 1.0) -> list[Stage]:
     def of_labels(name: str, said: str, told: str, colors: Callable[[PointLabels], UInt8]) -> Iterator[Stage]:
         def drawn(scene: SceneApi, node: str) -> None:
             dense = results.one("dense")
-            add_points(scene, node, dense.points, colors(results.one(name)), dense.spacing)
+            add_points(scene, node, dense.points, colors(results.one(name)), dense.spacing_of())
 
         if not results.missing([name, "dense"]):
             yield Stage(said, told, drawn)

@@ -188,7 +188,7 @@ def _(value: InstanceMasks, context: Context) -> UInt8:
 
 @_draw.register
 def _(value: PointCloud, context: Context) -> UInt8:
-    return _points_picture(value.points, value.colors, value.spacing, context)
+    return _points_picture(value.points, value.colors, value.spacing_of(), context)
 
 
 @_draw.register
@@ -212,7 +212,7 @@ def _numbered_points(title: str, number: Int32, words: tuple[str, str], context:
         return table_picture(title, rows)
     colors = instance_colors(int(number.max(initial=0)) + 1)
     colors[0] = (190, 190, 190)
-    return _points_picture(context.points.points, colors[number], context.points.spacing, context)
+    return _points_picture(context.points.points, colors[number], context.points.spacing_of(), context)
 
 
 def _points_picture(points: Float32, colors: UInt8, spacing: float, context: Context) -> UInt8:

@@ -56,8 +56,8 @@ def clear(
         np.maximum(shown, _weights(before, camera, ~left), out=shown)
         if left.any():
             np.maximum(uncovered, _weights(rest, camera, left), out=uncovered)
-    distance, _ = cKDTree(surface.points.points[surface.rows]).query(rest.means, workers=1)
-    grown = np.where(distance <= surface.points.spacing, _GROWN_ON_SURFACE, _GROWN)
+    distance, nearest = cKDTree(surface.points.points[surface.rows]).query(rest.means, workers=1)
+    grown = np.where(distance <= surface.points.spacing[surface.rows][nearest], _GROWN_ON_SURFACE, _GROWN)
     goes = np.zeros(len(after), bool)
     goes[stays(after, before, instances)] = (uncovered > grown * shown[stayed]) & (rest.filled == 0)
     return select(after, ~goes)

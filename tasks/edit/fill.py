@@ -79,13 +79,14 @@ def fill(
     gone: labels of the dense points that are no longer there, those of the instances among them.
     """
     points, cameras = measured.points, measured.cameras
-    spacing = points.spacing
     views = list(uncovered(before, after, cameras, instances))
     if not views:
         return after
     remains = Remains.of(measured, gone)
-    arounds = [_around(remains, box) for box in _places_left(before, instances, _TOUCHING * spacing)]
-    near = points.points[np.concatenate(arounds)].astype(np.float64)
+    reach = _TOUCHING * points.spacing_of(remains.rows)
+    arounds = [_around(remains, box) for box in _places_left(before, instances, reach)]
+    rows = np.concatenate(arounds)
+    near, spacing = points.points[rows].astype(np.float64), points.spacing_of(rows)
     thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))
     found = [(plane, around) for around in arounds for plane in flat_surfaces(points, around, thickness)]
     planes = [plane for plane, _ in found]
@@ -100,7 +101,14 @@ def fill(
     # What has moved, or come instead, may lie nearer to the floor that it left than the rest of the floor does.
     solid = select(after, stays(after, before, instances) & (after.opacities >= _SOLID))
     fillings = [
-        _continued(places[plane_of == number], plane, points, _lying(plane.rows, around, measured.labels.label), solid)
+        _continued(
+            places[plane_of == number],
+            plane,
+            points,
+            _lying(plane.rows, around, measured.labels.label),
+            solid,
+            spacing,
+        )
         for number, (plane, around) in enumerate(found)
         if (plane_of == number).any()
     ]
@@ -127,7 +135,7 @@ def _places_left(before: EditedScene, instances: tuple[int, ...], reach: float) 
 def _around(remains: Remains, box: Float64) -> Int32:
     """Rows of the dense points near what has left its place."""
     low, high = box
-    margin = max(_NEARBY * float(np.linalg.norm(high - low)), 10 * remains.points.spacing)
+    margin = max(_NEARBY * float(np.linalg.norm(high - low)), 10 * remains.points.spacing_of(remains.rows))
     places = remains.points.points[remains.rows]
     return remains.rows[((places >= low - margin) & (places <= high + margin)).all(axis=1)]
 
@@ -222,13 +230,13 @@ def _lying(rows: Int32, around: Int32, labels: Int32) -> Int32:
 
 
 def _continued(
-    places: Float64, plane: FlatSurface, points: PointCloud, lenders: Int32, solid: EditedScene
+    places: Float64, plane: FlatSurface, points: PointCloud, lenders: Int32, solid: EditedScene, spacing: float
 ) -> EditedScene:
     """Gaussians at places [M, 3] of a plane, of the instance that has most weight there, and in its colours.
 
     lenders: rows of the points that these come from. solid: what stayed and is not faint; each lender is of the
     instance and the part of what is nearest to it there. (What is nearest to a place may be what lay on the thing that
-    has left: it hangs above the floor now.)
+    has left: it hangs above the floor now.) spacing: of the places.
     """
     from scipy.spatial import cKDTree
     from scipy.spatial.distance import cdist
@@ -245,12 +253,12 @@ def _continued(
     heaviest = np.zeros(len(places), np.int32)
     for first in range(0, len(places), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        weights = (cdist(places[some], lent) + points.spacing) ** -3
+        weights = (cdist(places[some], lent) + spacing) ** -3
         shares = weights @ votes
         heaviest[some] = np.where(which == shares.argmax(axis=1)[:, None], weights, 0).argmax(axis=1)
         weights *= shares[:, which]
         colors[some] = weights @ colors_lent / weights.sum(axis=1, keepdims=True)
-    flat = _flat(places, np.rint(colors).astype(np.uint8), plane, points.spacing)
+    flat = _flat(places, np.rint(colors).astype(np.uint8), plane, spacing)
     return replace(flat, instance_id=ids[heaviest], part_id=parts[heaviest])
 
 

@@ -44,7 +44,7 @@ def flat_surfaces(points: PointCloud, rows: Int32, thickness: float) -> list[Fla
 
     rows: [R] of these points. thickness: how far from a plane a point still lies on it, world units.
     """
-    places, spacing = points.points[rows].astype(np.float64), points.spacing
+    places, spacing = points.points[rows].astype(np.float64), points.spacing_of(rows)
     rng = np.random.default_rng(0)
     rest = np.arange(len(places), dtype=np.int32)
     least = max(_FEWEST, len(places) // 20)

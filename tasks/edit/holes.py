@@ -83,6 +83,7 @@ class Remains:
         camera = view.camera
         wide = camera.cropped(-_MARGIN, -_MARGIN, camera.width + _MARGIN, camera.height + _MARGIN)
         places = np.concatenate([self.points.points[self.rows], more]).astype(np.float64)
+        spacing = np.append(self.points.spacing[self.rows], np.full(len(more), self.points.spacing_of(self.rows)))
         seen = pixels_in_view(places, wide)[0]
         covered = np.zeros(view.left.shape, bool)
         if not len(seen):
@@ -90,7 +91,7 @@ class Remains:
         uv, z = project(places[seen], camera)
         asked = np.argwhere(view.left)
         distance, near = cKDTree(uv).query(asked[:, ::-1] + 0.5, k=min(_NEIGHBOURS, len(uv)), workers=1)
-        reach = np.maximum(1.0, self.points.spacing * camera.fx / z)
+        reach = np.maximum(1.0, spacing[seen] * camera.fx / z)
         within = distance.reshape(len(asked), -1) <= reach[near.reshape(len(asked), -1)]
         covered[tuple(asked.T)] = within.any(axis=1)
         return covered

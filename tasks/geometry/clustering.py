@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.running import cores
-from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32
+from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, Int64
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 
-def dbscan(points: Float32 | Float64, eps: float, min_samples: int) -> Int32:
+def dbscan(points: Float32 | Float64, eps: float | Float32, min_samples: int) -> Int32:
     """DBSCAN (Ester et al. 1996): [N] cluster of each point, -1 for noise.
 
-    points: [N, 3]; eps: neighbourhood radius, inclusive, in the points' unit; min_samples: how many points, itself
-    among them, make a core point. Clusters are numbered by their first core point; a border point within reach of
-    several clusters joins the lowest.
+    points: [N, 3]; eps: neighbourhood radius, inclusive, in the points' unit, of all or [N] of each, of which the
+    larger one of two points counts; min_samples: how many points, itself among them, make a core point. Clusters are
+    numbered by their first core point; a border point within reach of several clusters joins the lowest.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
 
     count = len(points)
     cluster = np.full(count, -1, np.int32)
     if not count:
         return cluster
-    pairs = cKDTree(points).query_pairs(eps, output_type="ndarray")
+    pairs = _pairs(points, eps)
     core = np.bincount(pairs.ravel(), minlength=count) + 1 >= min_samples
     a, b = pairs[core[pairs].all(axis=1)].T
     _, component = connected_components(
@@ -42,8 +46,30 @@ def dbscan(points: Float32 | Float64, eps: float, min_samples: int) -> Int32:
     return cluster
 
 
+def _pairs(points: Float32 | Float64, eps: float | Float32) -> NDArray[np.intp]:
+    """[P, 2] the pairs of points that lie no farther apart than `eps`, or than the larger one of theirs."""
+    from scipy.spatial import cKDTree
+
+    radii, group = np.unique(eps, return_inverse=True)
+    if len(radii) == 1:
+        return np.asarray(cKDTree(points).query_pairs(float(radii[0]), output_type="ndarray"))
+    rows = [np.flatnonzero(group == number) for number in range(len(radii))]
+    trees = [cKDTree(points[some]) for some in rows]
+    pairs = []
+    for number, radius in enumerate(radii.tolist()):
+        pairs.append(rows[number][trees[number].query_pairs(radius, output_type="ndarray")])
+        for smaller in range(number):
+            near = trees[smaller].sparse_distance_matrix(trees[number], radius, output_type="ndarray")
+            pairs.append(np.stack([rows[smaller][near["i"]], rows[number][near["j"]]], axis=1))
+    return np.concatenate(pairs)
+
+
 def main_clusters(
-    points: Float32 | Float64, eps: float, min_samples: int, keep_share: float, max_clusters: int = 0
+    points: Float32 | Float64,
+    eps: float | Float32,
+    min_samples: int,
+    keep_share: float,
+    max_clusters: int = 0,
 ) -> Bool:
     """[N] which points lie in a cluster worth keeping: the largest, and all with at least `keep_share` of the points.
 
@@ -59,6 +85,15 @@ def main_clusters(
     keep = size >= keep_share * len(points)
     keep[size.argmax()] = True
     return (cluster >= 0) & keep[cluster]
+
+
+def nearest_within(tree: cKDTree, places: Float32, count: int, reach: Float32) -> Int64:
+    """[M, count] the points of a tree nearest to each of some places [M, 3], no farther away than `reach` [M]; the
+    tree's size where there are fewer."""
+    farthest = float(reach.max(initial=0))
+    which = np.arange(1, count + 1)
+    distance, near = tree.query(places, k=which, distance_upper_bound=farthest, workers=cores())
+    return np.where(distance < reach[:, None], near, tree.n)
 
 
 def nearest_spacing(points: Float32 | Float64) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.running import in_threads
-from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Int32
+from ss_flow.tasks.artifacts import Bool, Cameras, DepthMap, Float32, Float64, Int32, Int64
 from ss_flow.tasks.geometry.cameras import camera_of, pixels_in_view
 from ss_flow.tasks.geometry.images import pixels_under
 from ss_flow.tasks.geometry.zbuffer import nearest_per_pixel
@@ -43,6 +43,10 @@ class VoxelSums:
         """Mean position and colour of each voxel: [N, 3], [N, 3]."""
         return self.position / self.weight[:, None], self.color / self.weight[:, None]
 
+    def sides(self, voxel: float) -> Float64:
+        """[N] the sides of their cubes: `voxel`, twice that, four times and so on."""
+        return np.asarray(voxel * 2 ** np.floor(np.log2(np.maximum(self.side / (self.weight * voxel), 1))))
+
     def take(self, keep: Bool) -> VoxelSums:
         """The voxels where `keep` [N] holds."""
         return VoxelSums(self.position[keep], self.color[keep], self.weight[keep], self.side[keep])
@@ -65,23 +69,41 @@ def sum_by_voxel(parts: Iterable[VoxelSums], voxel: float) -> VoxelSums:
     return _added_up(held, voxel)
 
 
+def finest(sums: VoxelSums, voxel: float) -> VoxelSums:
+    """The points but those in whose cubes others lie that are in smaller ones: what a view shows from far away says
+    nothing where another was near. sums: as `sum_by_voxel` gives them."""
+    sides = sums.sides(voxel)
+    places, _ = sums.means()
+    kept = np.ones(len(sides), bool)
+    for side in np.unique(sides)[1:].tolist():
+        own, finer = np.flatnonzero(sides == side), np.flatnonzero(sides < side)
+        code = _codes(places[np.concatenate([own, finer])], side)
+        kept[own] = ~np.isin(code[: len(own)], code[len(own) :])
+    return sums.take(kept)
+
+
 def _added_up(parts: list[VoxelSums], voxel: float) -> VoxelSums:
     sums = _all_of(parts)
-    doublings = np.floor(np.log2(np.maximum(sums.side / (sums.weight * voxel), 1)))
-    sizes = np.unique(doublings)
-    if len(sizes) < 2:
-        return _in_cubes(sums, voxel * 2 ** sizes.max(initial=0))
-    return _all_of([_in_cubes(sums.take(doublings == size), voxel * 2**size) for size in sizes])
+    sides = sums.sides(voxel)
+    found = np.unique(sides)
+    if len(found) < 2:
+        return _in_cubes(sums, float(found.max(initial=voxel)))
+    return _all_of([_in_cubes(sums.take(sides == side), side) for side in found.tolist()])
 
 
 def _all_of(parts: list[VoxelSums]) -> VoxelSums:
     return VoxelSums(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(VoxelSums)))
 
 
-def _in_cubes(sums: VoxelSums, voxel: float) -> VoxelSums:
+def _codes(places: Float64, side: float) -> Int64:
+    """[N] a number for the cube in which each of some places [N, 3] lies."""
+    cell = np.floor(places / side + 0.5).astype(np.int64) & (_CELLS - 1)
+    return np.asarray((cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2])
+
+
+def _in_cubes(sums: VoxelSums, side: float) -> VoxelSums:
     position, weight = sums.position, sums.weight
-    cell = np.floor(position / weight[:, None] / voxel + 0.5).astype(np.int64) & (_CELLS - 1)
-    code = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
+    code = _codes(position / weight[:, None], side)
     # Neighbours in a photo, and sums that came from earlier ones, stand nearly in order already, which makes a stable
     # sort three to seven times as fast as the one that np.unique takes.
     order = np.argsort(code, kind="stable")

@@ -74,8 +74,9 @@ def part_boards(
     names = sorted(rows_of.keys() - {0, *tree.node[tree.stuff].tolist()})
 
     def board_in(name: int) -> Bool | None:
-        places = points.points[rows_of[name]].astype(np.float64)
-        return board_of(places, points.spacing, eye, rises=params.rises, around=params.around)
+        rows = rows_of[name]
+        places = points.points[rows].astype(np.float64)
+        return board_of(places, points.spacing_of(rows), eye, rises=params.rises, around=params.around)
 
     for name, board in zip(names, in_threads(board_in, names), strict=True):
         if board is None:

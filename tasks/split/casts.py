@@ -59,7 +59,7 @@ def find_casts(points: PointCloud, label: Int32, surface: Int32, ends: Borders, 
         color = np.median(brightness[rows], axis=0)
         even = np.median(np.abs(brightness[rows] - color), axis=0).max() <= _EVEN
         if even and may_shade(color - np.median(brightness[ground], axis=0)):
-            thickness = _THICKNESS * points.spacing
+            thickness = _THICKNESS * points.spacing_of(ground)
             plane = plane_of_most(thinned(points.points[ground]), thickness, _ROUNDS)
             casts[name] = on_plane(thinned(places), plane, thickness).mean() >= _FLAT
     return casts

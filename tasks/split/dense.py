@@ -11,10 +11,9 @@ import numpy as np
 from ss_flow.errors import InputError
 from ss_flow.running import in_threads, progress
 from ss_flow.task import Resources, task
-from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Float64, Frame, PointCloud, SceneUnit
+from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Float32, Float64, Frame, PointCloud, SceneUnit
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
-from ss_flow.tasks.geometry.clustering import nearest_spacing
-from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_noise, sum_by_voxel
+from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_noise, finest, sum_by_voxel
 from ss_flow.tasks.geometry.images import decode_valid, resampled, scene_rgb
 from ss_flow.tasks.ranges import Count, NonNegative, Positive, Range
 
@@ -24,6 +23,8 @@ move all points, those of objects that it does not show too."""
 _COARSEST = 4.0
 """Sides of a cube that a step between two float32 numbers at the points may have. A generated room, moved away, keeps
 its masks at steps of 3 (IoU .99) and loses them at 5.7 (.73); at 11 things fell on one place, and Split failed."""
+_JUMP = 0.05
+"""Share of the depth by which neighbouring pixels of one surface may differ."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,13 @@ class DenseParams:
     """How densely the scene's surfaces are sampled."""
 
     voxel: Positive = 0.02
-    """Upper limit of the side of a sampling cube, in scene units (metres where the scale is known); cubes where pixels
-    cover more are twice, four times and so on as large."""
+    """Upper limit of the side of the smallest sampling cubes, in scene units (metres where the scale is known); others
+    are twice, four times and so on as large."""
     voxel_pixels: Positive = 2.0
-    """The cube's side in median pixel footprints, where that is finer than `voxel`."""
+    """How many pixels a cube has a side, where the nearest view sees it, or more; and the smallest ones, of median
+    pixels, where that is less than `voxel`."""
     max_points: Annotated[int, Range(100, float("inf"))] = 400_000
-    """Cubes grow until no more points than this remain."""
+    """Cubes take more pixels until no more points than this remain."""
     tolerance: Positive = 0.02
     """How far two views' depths may differ at one point, in scene units."""
     relative_tolerance: NonNegative = 0.01
@@ -71,7 +73,9 @@ def dense(
             yield view
 
     def sums(view: int) -> VoxelSums:
-        return sum_by_voxel([depth_samples(frames[view], cameras, view, depths[view], colours)], voxel)
+        return sum_by_voxel(
+            [depth_samples(frames[view], cameras, view, depths[view], colours, params.voxel_pixels)], voxel
+        )
 
     summed = sum_by_voxel(in_threads(sums, views()), voxel)
     cloud = consistent_cloud(summed, cameras, depths, voxel=voxel, unit=unit, params=params)
@@ -97,7 +101,7 @@ def consistent_cloud(
     Raises InputError when the scene is so far from the origin that float32 cannot tell its points apart.
     """
     while True:
-        means, colors = cloud.means()
+        means, _ = cloud.means()
         kept = consistent_points(
             means,
             cameras,
@@ -106,21 +110,29 @@ def consistent_cloud(
             tau_relative=params.relative_tolerance,
             min_views=params.min_views,
         )
-        if kept.sum() <= params.max_points:
+        cloud = finest(cloud.take(kept), voxel)
+        if len(cloud.weight) <= params.max_points:
             break
         # On surfaces the count falls with the square of the side; far and near ones grow alike.
-        grown = _one_of_few(voxel * np.sqrt(kept.sum() / params.max_points), np.ceil)
-        cloud = cloud.take(kept)
-        cloud, voxel = sum_by_voxel([replace(cloud, side=cloud.side * (grown / voxel))], grown), grown
-    _refuse_coarse(means[kept], voxel)
-    points = means[kept].astype(np.float32)
-    rounded = np.rint(colors[kept]).astype(np.uint8)
-    return PointCloud(points, rounded, unit.length, nearest_spacing(points), depth_noise(means[kept], cameras, depths))
+        grown = _one_of_few(np.sqrt(len(cloud.weight) / params.max_points), np.ceil)
+        cloud = sum_by_voxel([replace(cloud, side=cloud.side * grown)], voxel)
+    means, colors = cloud.means()
+    spacing = cloud.sides(voxel)
+    _refuse_coarse(means, spacing)
+    return PointCloud(
+        means.astype(np.float32),
+        np.rint(colors).astype(np.uint8),
+        unit.length,
+        spacing=spacing.astype(np.float32),
+        noise=depth_noise(means, cameras, depths),
+    )
 
 
-def _refuse_coarse(places: Float64, side: float) -> None:
-    """Raise InputError where float32 rounds points [N, 3] by many sides of their cubes; both in world units."""
-    away = float(np.median(np.abs(places).max(axis=1))) if len(places) else 0.0
+def _refuse_coarse(places: Float64, sides: Float64) -> None:
+    """Raise InputError where float32 rounds points [N, 3] by many sides [N] of their cubes; both in world units."""
+    if not len(places):
+        return
+    away, side = float(np.median(np.abs(places).max(axis=1))), float(np.median(sides))
     step = float(np.spacing(np.float32(away)))
     if step > _COARSEST * side:
         raise InputError(
@@ -154,19 +166,39 @@ def _pixel_footprint(cameras: Cameras, depths: tuple[DepthMap, ...]) -> float:
 
 
 def depth_samples(
-    frame: Frame, cameras: Cameras, view: int, depth: DepthMap, colours: tuple[ColourTransform, ...]
+    frame: Frame, cameras: Cameras, view: int, depth: DepthMap, colours: tuple[ColourTransform, ...], pixels: float
 ) -> VoxelSums:
     """The known depth pixels of one view as points with the colours of its photo, or those of the scene there, in cubes
-    of a pixel's size at least.
+    of `pixels` a side at least.
 
-    In smaller ones each pixel of each view would be a point of its own, and far walls would leave hardly any of
-    `max_points` to what is near.
+    In cubes of less than one each pixel of each view would be a point of its own, and far walls would leave hardly any
+    of `max_points` to what is near.
     """
     height, width = depth.depth.shape
     known = ((depth.depth > 0) & resampled(decode_valid(frame), height, width)).ravel()
     camera = camera_of(cameras, view).scaled(width, height)
-    points = backproject(depth.depth, camera)[known]
+    points = backproject(depth.depth, camera)
+    sides = _footprints(points.reshape(height, width, 3), depth.depth, camera.fx).ravel()[known]
+    points = points[known]
     photo = scene_rgb(frame, *colours[view : view + 1])  # as it is where there are none
     colors = resampled(photo, height, width).reshape(-1, 3)[known].astype(np.float64)
-    sides = depth.depth.ravel()[known].astype(np.float64) / camera.fx
-    return VoxelSums(points, colors, np.ones(len(points)), sides)
+    return VoxelSums(points, colors, np.ones(len(points)), pixels * sides)
+
+
+def _footprints(points: Float64, depth: Float32, focal: float) -> Float64:
+    """[H, W] how far apart the places lie that neighbouring pixels show, world units: farther on what is looked at from
+    the side. As if it were looked at head-on where both neighbours are on other surfaces, or unknown.
+
+    points, depth: [H, W, 3] and [H, W], of the pixels, 0 = unknown; focal: focal length, px.
+    """
+    sides = depth.astype(np.float64) / focal
+    for axis in (0, 1):
+        ahead, back = [(slice(None),) * axis + (some,) for some in (slice(1, None), slice(None, -1))]
+        apart = np.linalg.norm(points[ahead] - points[back], axis=2)
+        nearer = np.minimum(depth[ahead], depth[back])
+        apart[~(np.abs(depth[ahead] - depth[back]) < _JUMP * nearer)] = np.inf
+        nearest = np.full(depth.shape, np.inf)
+        for some in (ahead, back):
+            nearest[some] = np.minimum(nearest[some], apart)
+        sides = np.where(np.isfinite(nearest), np.maximum(sides, nearest), sides)
+    return sides

@@ -80,7 +80,7 @@ def dense_splatting(
     known = depths if any(depth.depth.any() for depth in depths) else seeds
     voxel = voxel_side(cameras, known, unit, params)
     samples = (
-        sum_by_voxel([depth_samples(frame, cameras, view, seed, colours)], voxel)
+        sum_by_voxel([depth_samples(frame, cameras, view, seed, colours, params.voxel_pixels)], voxel)
         for view, (frame, seed) in enumerate(zip(frames, seeds, strict=True))
     )
     initial = _first_gaussians(sum_by_voxel(samples, voxel), voxel, splatting.initial_points)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Cameras, Float32, Float64, Int32, PointCloud, Visibility
 from ss_flow.tasks.geometry.cameras import camera_of
+from ss_flow.tasks.geometry.clustering import nearest_within
 from ss_flow.tasks.geometry.shape import normals_of
 from ss_flow.tasks.split.votes.touching import Borders, counts_between
 
@@ -78,9 +78,7 @@ def _sinking(points: PointCloud, outwards: Float32, label: Int32, ends: Borders)
     for some in np.array_split(order, max(1, -(-len(order) // _AT_ONCE))):
         row, of = np.unique(ends.touches[0][some], return_inverse=True)
         here = ends.rows[row]
-        _, near = tree.query(
-            points.points[here], k=_NEAREST, distance_upper_bound=_REACH * points.spacing, workers=cores()
-        )
+        near = nearest_within(tree, points.points[here], _NEAREST, _REACH * points.spacing[here])
         found = near < tree.n
         near = np.where(found, near, 0)
         offset = np.where(found[..., None], points.points[near] - points.points[here][:, None], 0)

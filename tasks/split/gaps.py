@@ -38,11 +38,12 @@ def bridged(
     A look misses the surface that goes behind it, or meets in its plane a label with more points there than the smaller
     one has: that does not lie on the surface, but both in that, like two pages in a table.
     """
-    places = _across(looks.cloud.points[of == smaller], looks.cloud.points[of == larger], looks.cloud.spacing, longest)
+    cloud, own = looks.cloud, of == smaller
+    places = _across(cloud.points[own], cloud.points[of == larger], cloud.spacing_of(own), longest)
     if not len(places):
         return False
     centre, normal = plane
-    height = (looks.cloud.points - centre) @ normal
+    height = (cloud.points - centre) @ normal
     flat = np.abs(height) <= _OFF * thickness
     size = np.bincount(of[flat], minlength=int(of.max()) + 1)
     beyond = size > size[smaller]

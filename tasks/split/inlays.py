@@ -90,19 +90,21 @@ def find_inlays(looks: Looks, label: Int32, ends: Borders, asked: Bool) -> Inlay
     """
     names, size = np.unique(label[label > 0], return_counts=True)
     rows_of, cloud, eye = rows_by_label(label), looks.cloud, middle_of(looks.cameras)
-    thickness = _THICKNESS * cloud.spacing
-    own, places, planes = list[int](), list[Float64](), list[Float64]()
+    own, places, planes, thick = list[int](), list[Float64](), list[Float64](), list[float]()
     for row in np.flatnonzero(asked & (size >= _FEW)).tolist():
-        points = cloud.points[rows_of[int(names[row])]].astype(np.float64)
+        rows = rows_of[int(names[row])]
+        points, spacing = cloud.points[rows].astype(np.float64), cloud.spacing_of(rows)
+        thickness = _THICKNESS * spacing
         centre, normal = plane_of_most(thinned(points), thickness, _ROUNDS)
         if on_plane(points, (centre, normal), thickness).mean() >= _FLAT:
             own.append(row)
-            places.append(_beside(points, (centre, normal), _CELL * cloud.spacing))
+            places.append(_beside(points, (centre, normal), _CELL * spacing))
+            thick.append(thickness)
             planes.append(np.stack([centre, towards(normal, centre, eye)]))
     count, shown = np.zeros(len(names)), np.zeros((len(names), len(names)))
     if own:
         of = np.repeat(np.arange(len(own)), [len(some) for some in places])
-        told, most = _seen_at(looks, label, np.concatenate(places), np.stack(planes)[of], thickness)
+        told, most = _seen_at(looks, label, np.concatenate(places), np.stack(planes)[of], np.array(thick)[of])
         around, labelled = np.array(own)[of], told & (most > 0)
         np.add.at(count, around[told], 1)
         np.add.at(shown, (around[labelled], np.searchsorted(names, most[labelled])), 1)
@@ -130,11 +132,12 @@ def _beside(points: Float64, plane: Plane, cell: float) -> Float64:
 
 
 def _seen_at(
-    looks: Looks, label: Int32, places: Float64, planes: Float64, thickness: float
+    looks: Looks, label: Int32, places: Float64, planes: Float64, thickness: Float64
 ) -> tuple[Bool, NDArray[np.intp]]:
     """[P] whether views tell what is at places, and [P] the label that most see there, 0 for none.
 
-    places: [P, 3]. planes: [P, 2, 3] point and normal, towards the cameras, of the plane of each.
+    places: [P, 3]. planes: [P, 2, 3] point and normal, towards the cameras, of the plane of each; thickness: [P]
+    how far from it a point still lies on it.
     """
     span = int(label.max()) + 1
     looked, hidden, found = np.zeros(len(places), bool), np.zeros(len(places), bool), [np.zeros(0, np.intp)]
@@ -143,8 +146,8 @@ def _seen_at(
         looked[place] = True
         place, point = place[point >= 0], point[point >= 0]
         height = ((looks.cloud.points[point] - planes[place, 0]) * planes[place, 1]).sum(axis=1)
-        hidden[place[height > thickness]] = True
-        flat = np.abs(height) <= thickness
+        hidden[place[height > thickness[place]]] = True
+        flat = np.abs(height) <= thickness[place]
         found.append(place[flat] * span + label[point[flat]])
     pair, times = np.unique(np.concatenate(found), return_counts=True)
     order = np.lexsort((times, pair // span))  # the last of each place is the label of most

@@ -37,8 +37,9 @@ class Looks:
         point = np.full(len(place), -1, np.intp)
         if len(place) and len(visible.pixel):
             distance, nearest = self._pixels[view].query(np.stack([row, column], axis=1))
-            here = distance <= np.maximum(_NEAR * self.cloud.spacing * camera.fx / z, _NEAR)
-            point[here] = visible.point_index[nearest[here]]
+            found = visible.point_index[nearest]
+            here = distance <= np.maximum(_NEAR * self.cloud.spacing[found] * camera.fx / z, _NEAR)
+            point[here] = found[here]
         return place.astype(np.intp), point
 
     @functools.cached_property

@@ -94,7 +94,7 @@ def find_mounds(
         alike = likeness(histogram(bins[inside], spread), histogram(bins[rest], spread))
         enough = height * max(2 * alike, _LEAST) * extent_of(own)
         noise = points.noise * float(np.linalg.norm(centre - eye))
-        return bool(rise >= max(enough, 2 * points.spacing, _CLEAR * noise))
+        return bool(rise >= max(enough, 2 * points.spacing_of(inside), _CLEAR * noise))
 
     asked = np.flatnonzero((size >= _FEW) & apart & (share > _BESIDE).any(axis=1)).tolist()
     bulges[asked] = list(in_threads(rises, asked))

@@ -44,8 +44,8 @@ class ClusterParams:
         """As by default where all points are kept, so that what is not read does not enter the key."""
         return self if self.eps else ClusterParams(eps=0.0)
 
-    def kept(self, points: Float32 | Float64, spacing: float) -> Bool:
-        """[N] which of the points [N, 3] belong together; spacing: of the cloud that they are from."""
+    def kept(self, points: Float32 | Float64, spacing: Float32) -> Bool:
+        """[N] which of the points [N, 3] belong together; spacing: [N] of them."""
         if not self.eps:
             return np.ones(len(points), bool)
         return main_clusters(points, self.eps * spacing, self.min_samples, self.keep_share, self.max_clusters)
@@ -87,8 +87,9 @@ def observe(
         whole[interior.whole] = inner[interior.pixels] = False
         standing = np.where(inside, INSIDE, BORDER).astype(np.uint8)
         if params.clusters.eps:  # else all are kept, and each mask's points need not be looked up
-            places = points.points[visibility.point_index[row[inside]]]
-            standing[inside] = np.where(params.clusters.kept(places, points.spacing), INSIDE, STRAY)
+            under = visibility.point_index[row[inside]]
+            kept = params.clusters.kept(points.points[under], points.spacing[under])
+            standing[inside] = np.where(kept, INSIDE, STRAY)
         mask.append(interior.mask)
         rows.append(row)
         standings.append(standing)

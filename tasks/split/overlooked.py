@@ -114,7 +114,7 @@ def overlooked(
 
 def _pieces(points: PointCloud, rows: Int64, least: int) -> list[Int64]:
     """What hangs together of some points (rows), at least so many each."""
-    piece = dbscan(points.points[rows], _REACH * points.spacing, min_samples=1)
+    piece = dbscan(points.points[rows], _REACH * points.spacing[rows], min_samples=1)
     return [rows[own] for own in rows_by_label(piece).values() if len(own) >= least]
 
 
@@ -124,7 +124,7 @@ def _standing(points: PointCloud, rows: Int64, eye: Float64, least: int) -> list
     most = _PART * len(rows)
     if most < least:
         return []
-    places, thickness = points.points[rows].astype(np.float64), _THICKNESS * points.spacing
+    places, thickness = points.points[rows].astype(np.float64), _THICKNESS * points.spacing_of(rows)
     centre, normal = largest_plane(thinned(places), thickness, _ROUNDS)
     height = (places - centre) @ towards(normal, centre, eye)
     if (np.abs(height) <= thickness).mean() < _FLAT:
@@ -134,12 +134,13 @@ def _standing(points: PointCloud, rows: Int64, eye: Float64, least: int) -> list
 
 def _rise(points: PointCloud, tree: cKDTree, own: Int64) -> float:
     """How far half of some points (rows) are from the plane that most points round them lie on, in spacings."""
-    near = tree.query_ball_point(points.points[own], _AROUND * points.spacing)
+    near = tree.query_ball_point(points.points[own], _AROUND * points.spacing[own])
     around = np.setdiff1d(np.concatenate(near).astype(np.int64), own)
     if len(around) < _FEW:
         return np.inf
-    centre, normal = plane_of_most(points.points[around].astype(np.float64), points.spacing, _ROUNDS)
-    return float(np.median(np.abs((points.points[own] - centre) @ normal)) / points.spacing)
+    spacing = points.spacing_of(own)
+    centre, normal = plane_of_most(points.points[around].astype(np.float64), spacing, _ROUNDS)
+    return float(np.median(np.abs((points.points[own] - centre) @ normal)) / spacing)
 
 
 @task(name="split.asked", resources=Resources(cores=1, memory_mb=1500, gpus=0.1), environment=network_identity)

@@ -190,8 +190,8 @@ def _settle(label: Int32, points: PointCloud, sightings: tuple[Int32, Float64], 
     reach = params.label_clusters.eps * points.spacing
     for label_id, rows in rows_by_label(label).items():
         if label_id:
-            rest = rows[~params.label_clusters.kept(points.points[rows], points.spacing)]
-            piece = dbscan(points.points[rest], reach, min_samples=1)
+            rest = rows[~params.label_clusters.kept(points.points[rows], points.spacing[rows])]
+            piece = dbscan(points.points[rest], reach[rest], min_samples=1)
             seen, shown = (np.bincount(piece, of[rest]) for of in sightings)
             label[rest[(shown <= params.tau_piece * seen)[piece]]] = 0
     size = np.bincount(label)

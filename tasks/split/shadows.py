@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float64, Int32, PointCloud, UInt8
+from ss_flow.tasks.geometry.clustering import nearest_within
 from ss_flow.tasks.geometry.shape import plane_through, towards
 from ss_flow.tasks.split.votes.touching import Borders, TouchingParams, borders
 
@@ -172,8 +172,8 @@ def _around(cloud: PointCloud, ends: Borders) -> Int32:
 
     tree = cKDTree(cloud.points)
     reach = TouchingParams().reach * cloud.spacing
-    places = cloud.points[ends.rows[ends.smooth[0]]]
-    _, near = tree.query(places, k=np.arange(1, _NEAR + 1), distance_upper_bound=reach, workers=cores())
+    rows = ends.rows[ends.smooth[0]]
+    near = nearest_within(tree, cloud.points[rows], _NEAR, reach[rows])
     return np.where(near < tree.n, near, -1).astype(np.int32)
 
 

@@ -93,7 +93,7 @@ class Supports:
         if plane is None:
             return False
         if (level, labels) not in self._shares:
-            on = on_plane(self._places(labels), plane, self._thickness)
+            on = on_plane(self._places(labels), plane, self._thickness(level))
             self._shares[level, labels] = float(on.mean())
         return self._shares[level, labels] >= _FLAT
 
@@ -110,28 +110,29 @@ class Supports:
             self._planes[labels] = None
             places = self._places(labels)
             if len(places) >= _FEW:
-                plane = plane_of_most(places, self._thickness, _ROUNDS)
-                on = on_plane(places, plane, self._thickness)
-                if self._level(plane) and on.mean() >= _FLAT and self._wide(places[on], plane):
+                thickness = self._thickness(labels)
+                plane = plane_of_most(places, thickness, _ROUNDS)
+                on = on_plane(places, plane, thickness)
+                if self._level(plane) and on.mean() >= _FLAT and _wide(places[on], plane, thickness):
                     self._planes[labels] = plane[0], towards(plane[1], plane[0], self.eye)
                 else:
-                    self._planes[labels] = self._top_of(places)
+                    self._planes[labels] = self._top_of(places, thickness)
         return self._planes[labels]
 
-    def _top_of(self, places: Float64) -> Plane | None:
+    def _top_of(self, places: Float64, thickness: float) -> Plane | None:
         """The level plane on which most points [N, 3] lie, if it is a top: with hardly any above it, and no others amid
         it, as the sides of a chest are not."""
         level = [plane for plane in planes_of_patches(places) if self._level(plane)]
         if not level:
             return None
-        best = max(level, key=lambda plane: on_plane(places, plane, self._thickness).sum())
-        centre, normal = refitted(places, best, self._thickness, _ROUNDS)
+        best = max(level, key=lambda plane: on_plane(places, plane, thickness).sum())
+        centre, normal = refitted(places, best, thickness, _ROUNDS)
         normal = towards(normal, centre, self.eye)
         height, along = (places - centre) @ normal, (places - centre) @ axes_in(normal).T
-        on = np.abs(height) <= self._thickness
-        if normal @ self.up < _LEVEL or on.mean() < _TOP or (height > self._thickness).mean() > _ABOVE:
+        on = np.abs(height) <= thickness
+        if normal @ self.up < _LEVEL or on.mean() < _TOP or (height > thickness).mean() > _ABOVE:
             return None
-        if not self._wide(places[on], (centre, normal)):
+        if not _wide(places[on], (centre, normal), thickness):
             return None
         spread = np.linalg.pinv(np.cov(along[on].T))
         amid = np.einsum("ni,ij,nj->n", along, spread, along) <= _AMID**2
@@ -140,24 +141,20 @@ class Supports:
     def _level(self, plane: Plane) -> bool:
         return bool(towards(plane[1], plane[0], self.eye) @ self.up >= _LEVEL)
 
-    def _wide(self, places: Float64, plane: Plane) -> bool:
-        """Whether points [N, 3] on a plane show that it is one: they are spread farther along it than across."""
-        along = places @ axes_in(plane[1]).T
-        return bool(np.linalg.eigvalsh(np.cov(along.T))[0] >= (_WIDE * self._thickness) ** 2)
-
     def _stands(self, plane: Plane, level: Labels, labels: Labels) -> bool:
         """Whether labels rise from the plane of others, which go on round their foot."""
         own = self._places(labels)
         if len(own) < _FEW:
             return False
         centre, normal = plane
+        thickness = self._thickness(level)
         height, extent = (own - centre) @ normal, extent_of(own)
         low, high = np.quantile(height, (0.1, 0.9))
-        if high < max(self.height * extent, _RISES * self.points.spacing) or low < -self._thickness:
+        if high < max(self.height * extent, _RISES * self._spacing(labels)) or low < -thickness:
             return False
         along = axes_in(normal)
         ground = self._places(level)
-        ground = ground[on_plane(ground, plane, self._thickness)]
+        ground = ground[on_plane(ground, plane, thickness)]
         lies, ground = (own - centre) @ along.T, (ground - centre) @ along.T
         if _spread(lies) >= _SMALL * _spread(ground):
             return False
@@ -167,12 +164,17 @@ class Supports:
         beside = ground[np.linalg.norm(ground - middle, axis=1) <= reach] - middle
         return len(np.unique(sector_of(beside, _SECTORS))) >= _ROUND * _SECTORS
 
-    @property
-    def _thickness(self) -> float:
-        return _THICKNESS * self.points.spacing
+    def _thickness(self, labels: Labels) -> float:
+        return _THICKNESS * self._spacing(labels)
+
+    def _spacing(self, labels: Labels) -> float:
+        return self.points.spacing_of(self._rows(labels))
+
+    def _rows(self, labels: Labels) -> NDArray[np.intp]:
+        return np.concatenate([self.rows[row] for row in labels])
 
     def _places(self, labels: Labels) -> Float64:
-        return thinned(self.points.points[np.concatenate([self.rows[row] for row in labels])])
+        return thinned(self.points.points[self._rows(labels)])
 
 
 def find_supports(points: PointCloud, cameras: Cameras, labels: PointLabels, *, height: float) -> Supports:
@@ -180,6 +182,12 @@ def find_supports(points: PointCloud, cameras: Cameras, labels: PointLabels, *, 
     rows_of = rows_by_label(labels.label)
     rows = [rows_of[name] for name in np.unique(labels.label[labels.label > 0]).tolist()]
     return Supports(rows, points, up_of(cameras.world_to_camera), middle_of(cameras), height)
+
+
+def _wide(places: Float64, plane: Plane, thickness: float) -> bool:
+    """Whether points [N, 3] on a plane show that it is one: they are spread farther along it than across."""
+    along = places @ axes_in(plane[1]).T
+    return bool(np.linalg.eigvalsh(np.cov(along.T))[0] >= (_WIDE * thickness) ** 2)
 
 
 def _spread(places: Float64) -> float:

@@ -170,7 +170,8 @@ class _Surfaces:
     def _common_plane(self, rows: tuple[NDArray[np.intp], NDArray[np.intp]]) -> tuple[Float64, Float64, float] | None:
         """The plane of the larger of two sets of points, with its thickness; None where not most of each lies on it."""
         larger, smaller = (thinned(self._cloud.points[part]) for part in sorted(rows, key=len, reverse=True))
-        thickness = max(self._params.thickness * extent_of(smaller), self._cloud.spacing)
+        spacing = max(self._cloud.spacing_of(part) for part in rows)
+        thickness = max(self._params.thickness * extent_of(smaller), spacing)
         plane = plane_of_most(larger, thickness, _ROUNDS)
         if any(on_plane(part, plane, thickness).mean() < self._params.flat for part in (larger, smaller)):
             return None

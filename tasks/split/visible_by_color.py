@@ -54,7 +54,7 @@ def visible_by_color(
     unknown = depth_at(depth, column, row, camera.width, camera.height) <= 0
     visible = np.zeros(len(points.points), bool)
     visible[seen.point_index] = True
-    front = _in_front(points, camera, (column, row, z), unknown | visible[rows])
+    front = _in_front(points, camera, (rows, column, row, z), unknown | visible[rows])
     asked = unknown & front & decode_valid(frame)[row, column]
     if not asked.any():
         return seen
@@ -73,21 +73,22 @@ def visible_by_color(
     )
 
 
-def _in_front(points: PointCloud, camera: Camera, at: tuple[Int32, Int32, Float64], counts: Bool) -> Bool:
-    """[M] which points no other one hides: pixel columns, rows, z-depths [M]; only those that `counts` [M] hide.
+def _in_front(points: PointCloud, camera: Camera, at: tuple[Int32, Int32, Int32, Float64], counts: Bool) -> Bool:
+    """[M] which points no other one hides; only those that `counts` [M] hide. at: their rows, pixel columns and rows,
+    z-depths [M].
 
     A point hides what lies in its square of pixels and in those around, each as wide as the points lie apart.
     """
     import cv2
 
-    column, row, z = at
+    own, column, row, z = at
     if not counts.any():
         return np.zeros(len(z), bool)
-    side = max(1, math.ceil(points.spacing * max(camera.fx, camera.fy) / float(np.median(z[counts]))))
+    side = max(1, math.ceil(points.spacing_of(own[counts]) * max(camera.fx, camera.fy) / float(np.median(z[counts]))))
     nearest = np.full((camera.height // side + 1, camera.width // side + 1), np.inf)
     np.minimum.at(nearest, (row[counts] // side, column[counts] // side), z[counts])
     around = cv2.erode(nearest, np.ones((3, 3), np.uint8))
-    return np.asarray((z - _SPACINGS * points.spacing) / (1 + _BEHIND) <= around[row // side, column // side])
+    return np.asarray((z - _SPACINGS * points.spacing[own]) / (1 + _BEHIND) <= around[row // side, column // side])
 
 
 def _differences(photo: UInt8, column: Int32, row: Int32, colors: UInt8) -> Float32:

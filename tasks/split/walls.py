@@ -59,11 +59,12 @@ def join_walls(
     largest_first = sorted(rows_of, key=lambda name: (-len(rows_of[name]), name))
     places = {name: thinned(points.points[rows]) for name, rows in rows_of.items()}
     bins = bins_of(points.colors) if rows_of else np.zeros(0, np.int32)
-    walls, thickness = set(tree.node[tree.stuff].tolist()), _THICKNESS * points.spacing
+    walls = set(tree.node[tree.stuff].tolist())
     wall_of = dict[int, int]()
     for rank, wall in enumerate(largest_first):
         if wall not in walls:
             continue
+        thickness = _THICKNESS * points.spacing_of(rows_of[wall])
         planes = [refitted(places[wall], plane, thickness, _ROUNDS) for plane in planes_of(places[wall], stuff)]
         often = histogram(bins[rows_of[wall]], _SPREAD)
         has = often >= _RARE * often.max()

@@ -21,6 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from clouds import even_cloud
 
 from ss_flow.cache.store import Store
 from ss_flow.execute import Stream
@@ -28,7 +29,7 @@ from ss_flow.flows import settings
 from ss_flow.flows.generated import Room, RoomParams, generate
 from ss_flow.flows.generated.masks import DegradeParams, degrade
 from ss_flow.flows.params import Params
-from ss_flow.tasks.artifacts import DepthMap, PointCloud
+from ss_flow.tasks.artifacts import DepthMap
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
 from ss_flow.tasks.geometry.clustering import nearest_spacing
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -77,7 +78,7 @@ def main() -> None:
     taken = min(options.views, options.distinct)
     room = generate(RoomParams(objects=50, views=taken, width=options.width, height=options.height, held_out=0))
     points, colors = sampled(room, options.points)
-    cloud = PointCloud(points, colors, 1.0, nearest_spacing(points))
+    cloud = even_cloud(points, colors, 1.0, nearest_spacing(points))
     depths = [DepthMap(name, d, "sensor") for name, d in zip(room.cameras.names, room.depth, strict=True)]
     ids = degrade(room.ids, DegradeParams(), seed=0)
     cameras, names = room.cameras, room.cameras.names

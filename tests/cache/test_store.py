@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ss_flow_toy as toy
+from clouds import even_cloud
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -18,7 +19,7 @@ from ss_flow.cache.canonical import digest
 from ss_flow.cache.errors import Gone
 from ss_flow.cache.store import GRACE_SECONDS, Store
 from ss_flow.cache.verify import verify
-from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, Metrics, PointCloud
+from ss_flow.tasks.artifacts import Cameras, Gaussians, LabelMap, Metrics
 
 arrays = st.integers(0, 5).flatmap(lambda rows: hnp.arrays(np.float32, (rows, 3)))
 
@@ -26,7 +27,7 @@ arrays = st.integers(0, 5).flatmap(lambda rows: hnp.arrays(np.float32, (rows, 3)
 @given(arrays, st.floats(allow_nan=False), st.floats(allow_nan=False))
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_what_is_stored_reads_back_equal_to_the_bit(store, points, unit, spacing):
-    cloud = PointCloud(points, np.zeros(points.shape, np.uint8), unit, spacing)
+    cloud = even_cloud(points, np.zeros(points.shape, np.uint8), unit, spacing)
     object_digest = store.put(cloud)
     back = Store(store.root).get(object_digest)
     assert digest(back) == object_digest

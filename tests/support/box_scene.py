@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from clouds import even_cloud
 
 from ss_flow.tasks.artifacts import (
     Bool,
@@ -13,7 +14,6 @@ from ss_flow.tasks.artifacts import (
     EditedScene,
     Frame,
     MaskSet,
-    PointCloud,
     PointLabels,
     Visibility,
 )
@@ -109,7 +109,7 @@ def measured(spacing: float) -> tuple[Measured, EditedScene]:
     points, labels = points[near][first], labels[near][first]
     none, ones = np.zeros(0, np.int32), np.ones(len(points), np.float32)
     known = PointLabels(labels, ones, 3, none, none, none)
-    cloud = PointCloud(points, COLORS[labels], 1.0, spacing)
+    cloud = even_cloud(points, COLORS[labels], 1.0, spacing)
     return Measured(seen, depths(), cloud, known), edited(
         initialise(points, COLORS[labels], labels, 1.0, opacity=0.9), filled=0
     )

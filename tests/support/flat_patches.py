@@ -1,6 +1,7 @@
 """Flat rectangles of even colours, as points, and what views see of them."""
 
 import numpy as np
+from clouds import even_cloud
 from labelled_points import one_camera
 
 from ss_flow.tasks.artifacts import Cameras, PointCloud, Visibility
@@ -33,7 +34,7 @@ def scene(*patches: Patch, unlabelled: int = 0) -> tuple[PointCloud, Cameras, np
     label[label > len(patches) - unlabelled] = 0
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = (0.5, 0.5, 3)
-    return PointCloud(places, colors, 1.0, STEP), one_camera(pose), label
+    return even_cloud(places, colors, 1.0, STEP), one_camera(pose), label
 
 
 def views_of(cloud: PointCloud, *eyes: tuple[float, float, float]) -> tuple[Cameras, list[Visibility]]:
@@ -51,11 +52,11 @@ def _seen(cloud: PointCloud, cameras: Cameras, view: int) -> Visibility:
     """The nearest points of a view, each hiding what lies behind it within as many pixels as points are apart."""
     camera = camera_of(cameras, view)
     rows, column, row, z = pixels_in_view(cloud.points, camera)
-    side = int(np.ceil(2 * camera.fx * cloud.spacing / z.min()))
+    side = int(np.ceil(2 * camera.fx * STEP / z.min()))
     cell = (row // side) * camera.width + column // side
     nearest = np.full(camera.width * camera.height, np.inf)
     np.minimum.at(nearest, cell, z)
-    front = z <= nearest[cell] + 2 * cloud.spacing
+    front = z <= nearest[cell] + 2 * STEP
     pixel = row[front] * camera.width + column[front]
     return Visibility(
         str(view), rows[front], pixel.astype(np.int32), z[front].astype(np.float32), camera.height, camera.width

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 from box_scene import mask_set, row_of_points
+from clouds import even_cloud
 
-from ss_flow.tasks.artifacts import Observation, PointCloud
+from ss_flow.tasks.artifacts import Observation
 from ss_flow.tasks.split.observe import ClusterParams, ObserveParams, observe
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
 from ss_flow.tasks.split.votes.in_turn import SequentialParams
@@ -32,7 +33,7 @@ def run(points, visible, masks, params, observing=ObserveParams()):
 
 def points(count):
     places = np.stack([np.arange(count), np.zeros(count), np.ones(count)], axis=-1).astype(np.float32)
-    return PointCloud(places, np.zeros((count, 3), np.uint8), 1.0, 1.0)
+    return even_cloud(places, np.zeros((count, 3), np.uint8), 1.0, 1.0)
 
 
 def views_of(*views):

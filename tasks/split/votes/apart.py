@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ss_flow.tasks.artifacts import Int32, Observation, PointCloud
+from ss_flow.tasks.artifacts import Float32, Int32, Observation, PointCloud
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
 from ss_flow.tasks.split.votes.at_once import correlation_clusters, evidence, membership
 
@@ -20,7 +20,7 @@ def part_labels(
     cloud: PointCloud,
     observations: Sequence[Observation],
     *,
-    reach: float,
+    reach: Float32,
     share: float,
     min_points: int,
     rate: float,
@@ -28,7 +28,7 @@ def part_labels(
 ) -> Int32:
     """Part the labels of points whose pieces the views hold apart: [N].
 
-    label: [N] of the cloud's points, 0 = none. reach: distance between two points of a piece, in the world's unit.
+    label: [N] of the cloud's points, 0 = none. reach: [N] distance between two points of a piece, in the world's unit.
     share, min_points: of a label's points that a piece needs to be asked about; smaller ones stay with the largest.
     rate: as for masks (`votes.at_once`), by whose rule the pieces of a label are clustered. first: the number of the
     first new label; the largest cluster keeps the old one, and so do those that no view sees together with it.
@@ -40,7 +40,7 @@ def part_labels(
     rows_of = rows_by_label(label)
     rows_of.pop(0, None)
     for label_id, rows in rows_of.items():
-        component = dbscan(cloud.points[rows], reach, min_samples=1)
+        component = dbscan(cloud.points[rows], reach[rows], min_samples=1)
         large = np.flatnonzero(np.bincount(component) >= max(min_points, share * len(rows)))
         if len(large) > 1:
             pieces += [rows[component == number].astype(np.int32) for number in large]

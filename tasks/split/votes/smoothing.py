@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Int32
+from ss_flow.tasks.geometry.clustering import nearest_within
 
 _NEIGHBOURS = 8
 _REACH = 3.0
 """How far a neighbour may be, in multiples of the cloud's spacing."""
 
 
-def smooth(label: Int32, contested: Bool, points: Float32, spacing: float, rounds: int) -> Int32:
+def smooth(label: Int32, contested: Bool, points: Float32, spacing: Float32, rounds: int) -> Int32:
     """Give contested points the label that most of their nearest neighbours carry; ties go to the lowest.
 
-    label: [N], 0 = none. contested: [N] which points may change. points: [N, 3]. spacing: the cloud's. rounds: how
+    label: [N], 0 = none. contested: [N] which points may change. points: [N, 3]. spacing: [N] theirs. rounds: how
     often; each round sees the labels of the one before. Points all of whose neighbours are unlabelled stay so.
     """
     from scipy.spatial import cKDTree
@@ -25,8 +25,7 @@ def smooth(label: Int32, contested: Bool, points: Float32, spacing: float, round
         return label
     count = min(_NEIGHBOURS + 1, len(points))
     tree = cKDTree(points)
-    _, near = tree.query(points[rows], k=count, distance_upper_bound=_REACH * spacing, workers=cores())
-    near = np.asarray(near).reshape(len(rows), count)
+    near = nearest_within(tree, points[rows], count, _REACH * spacing[rows])
     padded = np.append(label, np.int32(0))  # a neighbour out of reach has the number len(points)
     changed = np.ones(len(padded), bool)
     for _ in range(rounds):

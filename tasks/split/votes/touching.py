@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
-from ss_flow.running import cores
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, PointCloud
+from ss_flow.tasks.geometry.clustering import nearest_within
 from ss_flow.tasks.geometry.shape import normals_of
 from ss_flow.tasks.ranges import Fraction, Positive, Range
 from ss_flow.tasks.split.votes.color_histograms import bins_of, histogram, likeness
@@ -139,9 +139,10 @@ def counts_between(names: Int32, own: Int32, touches: Int32) -> Float64:
     return counts
 
 
-def _nearest(tree: cKDTree, rows: Int32, count: int, reach: float) -> Int32:
-    """The points nearest to some points of the tree: [R, count]; the point itself where there are fewer in reach."""
-    _, near = tree.query(tree.data[rows], k=np.arange(1, count + 1), distance_upper_bound=reach, workers=cores())
+def _nearest(tree: cKDTree, rows: Int32, count: int, reach: Float32) -> Int32:
+    """The points nearest to some points of the tree: [R, count]; the point itself where there are fewer in reach
+    of it [N]."""
+    near = nearest_within(tree, tree.data[rows], count, reach[rows])
     return np.where(near < tree.n, near, rows[:, None]).astype(np.int32)
 
 

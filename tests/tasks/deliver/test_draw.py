@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from clouds import even_cloud
 from view_masks import as_fields
 
 from ss_flow.tasks.artifacts import (
@@ -13,7 +14,6 @@ from ss_flow.tasks.artifacts import (
     LabelMap,
     MaskSet,
     Metrics,
-    PointCloud,
     PointLabels,
     PointParts,
     Visibility,
@@ -31,7 +31,7 @@ NONE_I, NONE_F = np.zeros(0, np.int32), np.zeros(0, np.float32)
 PHOTO = np.random.default_rng(0).integers(0, 256, (H, W, 3), np.uint8)
 FRAME = Frame("left", W, H, encode_png(PHOTO), np.zeros(0, np.uint8), W, H)
 POINTS = np.random.default_rng(1).uniform(-1, 1, (500, 3)).astype(np.float32) + np.float32([0, 0, 4])
-CLOUD = PointCloud(POINTS, np.full((500, 3), (10, 200, 30), np.uint8), 1.0, 0.1)
+CLOUD = even_cloud(POINTS, np.full((500, 3), (10, 200, 30), np.uint8), 1.0, 0.1)
 CAMERAS = Cameras(("left",), np.array([[W, H]], np.int32), np.array([[50.0, 50, 32, 24]]), np.eye(4)[None], True)
 HALF = np.zeros((H, W), bool)
 HALF[:, :32] = True
@@ -182,7 +182,7 @@ def test_a_long_list_is_cut_and_an_empty_one_says_so():
 @pytest.mark.parametrize(
     "value",
     [
-        CLOUD.__class__(POINTS[:0], CLOUD.colors[:0], 1.0, 0.0),
+        even_cloud(POINTS[:0], CLOUD.colors[:0], 1.0, 0.0),
         NO_GAUSSIANS,
         Cameras((), np.zeros((0, 2), np.int32), np.zeros((0, 4)), np.zeros((0, 4, 4)), False),
         masks_by_id(np.zeros((H, W), np.int32), "e"),

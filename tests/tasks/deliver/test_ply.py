@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -121,7 +122,7 @@ def cloud_of(n: int) -> tuple[PointCloud, PointLabels, PointParts]:
     points, colors = rng.normal(size=(n, 3)).astype(np.float32), rng.integers(0, 256, (n, 3), np.uint8)
     labels = rng.integers(0, 300, n).astype(np.int32)
     return (
-        PointCloud(points, colors, 1.0, 0.02),
+        even_cloud(points, colors, 1.0, 0.02),
         PointLabels(labels, rng.random(n).astype(np.float32), 300, nothing, nothing, nothing),
         PointParts(rng.integers(0, 5, n).astype(np.int32)),
     )

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -37,7 +38,7 @@ PREDICTED = np.array([5, 5, 5, 7, 7, 7, 5, 9])
 
 
 def _cloud(points: np.ndarray) -> PointCloud:
-    return PointCloud(points.astype(np.float32), np.zeros((len(points), 3), np.uint8), 1.0, 0.1)
+    return even_cloud(points.astype(np.float32), np.zeros((len(points), 3), np.uint8), 1.0, 0.1)
 
 
 def test_ig_protocol_gives_the_golden_values_e3() -> None:

@@ -2,13 +2,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
-from ss_flow.tasks.geometry.clustering import dbscan, main_clusters, nearest_spacing
+from ss_flow.tasks.geometry.clustering import dbscan, main_clusters, nearest_spacing, nearest_within
 
 
 def slow_dbscan(points, eps, min_samples):
     """The definition, point by point, with our rule for border points: the lowest cluster in reach."""
-    near = np.linalg.norm(points[:, None] - points[None], axis=-1) <= eps
+    reach = np.broadcast_to(eps, len(points))
+    near = np.linalg.norm(points[:, None] - points[None], axis=-1) <= np.maximum(reach[:, None], reach)
     core = near.sum(axis=1) >= min_samples
     cluster = np.full(len(points), -1)
     number = 0
@@ -32,6 +34,27 @@ def slow_dbscan(points, eps, min_samples):
 def test_dbscan_agrees_with_its_definition(seed, count, min_samples, eps):
     points = np.random.default_rng(seed).random((count, 3))
     assert dbscan(points, eps, min_samples).tolist() == slow_dbscan(points, eps, min_samples).tolist()
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 10_000), st.integers(0, 60), st.integers(1, 6), st.floats(0.05, 0.5))
+def test_of_two_points_the_farther_reach_counts(seed, count, min_samples, eps):
+    random = np.random.default_rng(seed)
+    points, reach = random.random((count, 3)), np.float32(eps) * 2.0 ** random.integers(-1, 2, count, np.int32)
+    assert dbscan(points, reach, min_samples).tolist() == slow_dbscan(points, reach, min_samples).tolist()
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 10_000), st.integers(1, 60), st.integers(1, 5))
+def test_the_points_within_reach_of_each_place_are_those_of_the_definition(seed, count, asked):
+    random = np.random.default_rng(seed)
+    points, places = random.random((count, 3)), random.random((7, 3))
+    reach = random.random(7).astype(np.float32)
+    distance = np.linalg.norm(places[:, None] - points, axis=-1)
+    order = np.argsort(distance, axis=1)[:, :asked]
+    expected = np.full((7, asked), count)
+    expected[:, : order.shape[1]] = np.where(np.take_along_axis(distance, order, axis=1) < reach[:, None], order, count)
+    assert nearest_within(cKDTree(points), places, asked, reach).tolist() == expected.tolist()
 
 
 def two_blobs():

@@ -7,11 +7,12 @@ from dataclasses import fields, replace
 import box_scene
 import numpy as np
 import pytest
+from clouds import even_cloud
 from hypothesis import given
 from hypothesis import strategies as st
 from made_gaussians import made_cameras, made_gaussians
 
-from ss_flow.tasks.artifacts import Gaussians, LabelMap, PointCloud, PointLabels, PointParts
+from ss_flow.tasks.artifacts import Gaussians, LabelMap, PointLabels, PointParts
 from ss_flow.tasks.gaussians.initialise import concatenate, initialise, select
 from ss_flow.tasks.gaussians.render import render, shares
 from ss_flow.tasks.geometry.cameras import backproject, camera_of
@@ -22,7 +23,7 @@ CAMERAS = [camera_of(box_scene.cameras(), view) for view in range(box_scene.VIEW
 FRAMES = box_scene.frames()
 TRUE = [LabelMap(frame.name, box_scene.cast(view)[1].astype(np.uint16)) for view, frame in enumerate(FRAMES)]
 NO_CLOUD = (
-    PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 1.0, 0.01),
+    even_cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 1.0, 0.01),
     PointLabels(*(np.zeros(0, kind) for kind in (np.int32, np.float32)), 0, *(np.zeros(0, np.int32),) * 3),
     PointParts(np.zeros(0, np.int32)),
 )

@@ -3,10 +3,11 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 from labelled_points import one_camera
 
 from ss_flow.running import Surroundings, running
-from ss_flow.tasks.artifacts import Hierarchy, PointCloud, PointLabels
+from ss_flow.tasks.artifacts import Hierarchy, PointLabels
 from ss_flow.tasks.split import boards
 from ss_flow.tasks.split.boards import BoardParams, board_of, part_boards
 
@@ -107,7 +108,7 @@ def parted(head_color=FUR, *, stuff=False, **params) -> tuple[PointLabels, Point
     sets = [BOARD, HEAD, alone, nothing]
     label = np.repeat(np.array([7, 7, 3, 0], np.int32), [len(part) for part in sets])
     colors = np.repeat(np.array([WOOD, head_color, FUR, WOOD], np.uint8), [len(part) for part in sets], axis=0)
-    cloud = PointCloud(np.concatenate(sets).astype(np.float32), colors, 1.0, STEP)
+    cloud = even_cloud(np.concatenate(sets).astype(np.float32), colors, 1.0, STEP)
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = (-EYE[0], EYE[1], EYE[2])
     rows = np.arange(3, dtype=np.int32)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
+from clouds import even_cloud
 
-from ss_flow.tasks.artifacts import PointCloud
 from ss_flow.tasks.split.contact import Contact, find_contact
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
@@ -18,7 +18,7 @@ def test_labels_touch_where_their_points_lie_side_by_side():
     one = strip()
     places = np.concatenate([one, *(one + np.array(at) for at in ((0.2, 0, 0), (0.6, 0, 0), (0.4, 0, 0.5)))])
     label = np.repeat(np.array([1, 3, 0, 4], np.int32), len(one))
-    cloud = PointCloud(places.astype(np.float32), np.zeros((len(places), 3), np.uint8), 1.0, STEP)
+    cloud = even_cloud(places.astype(np.float32), np.zeros((len(places), 3), np.uint8), 1.0, STEP)
     contact = find_contact(borders(label, cloud, TouchingParams()), label).points
     assert contact.tolist() == contact.T.tolist()
     assert contact[0, 1] >= 2 * 50  # a row of points on either side
@@ -30,13 +30,13 @@ def test_where_labels_touch_the_points_of_both_sides_count():
     coarse = one[np.rint(one[:, 1] / STEP).astype(int) % 2 == 0] + np.array([0.2, 0, 0])  # every second row
     label = np.repeat(np.array([1, 2], np.int32), [len(one), len(coarse)])
     places = np.concatenate([one, coarse]).astype(np.float32)
-    cloud = PointCloud(places, np.zeros((len(label), 3), np.uint8), 1.0, STEP)
+    cloud = even_cloud(places, np.zeros((len(label), 3), np.uint8), 1.0, STEP)
     contact = find_contact(borders(label, cloud, TouchingParams()), label).points
     assert contact[0, 1] == contact[1, 0] > 0
 
 
 def test_of_no_labels_none_touch():
-    cloud = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), 1.0, STEP)
+    cloud = even_cloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), 1.0, STEP)
     nothing = np.zeros(1, np.int32)
     assert find_contact(borders(nothing, cloud, TouchingParams()), nothing).points.shape == (0, 0)
 

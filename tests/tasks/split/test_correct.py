@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from box_scene import row_of_points
+from clouds import even_cloud
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,7 +25,7 @@ def sheet(*halves: tuple[int, int, int]) -> PointCloud:
     v, u = np.divmod(np.arange(SIDE * SIDE), SIDE)
     colors = np.where((u < SIDE // 2)[:, None], halves[0], halves[-1])
     points = np.stack([u, v, np.zeros(SIDE * SIDE)], axis=1)
-    return PointCloud(points.astype(np.float32), colors.astype(np.uint8), 1.0, 1.0)
+    return even_cloud(points.astype(np.float32), colors.astype(np.uint8), 1.0, 1.0)
 
 
 def view() -> Visibility:

@@ -40,8 +40,19 @@ def test_points_have_the_colours_of_the_scene_where_photos_differ():
     np.testing.assert_allclose(halved.colors, given.colors / 2, atol=1)
 
 
-def test_points_are_spaced_by_the_voxel():
-    assert fuse(voxel=0.1, voxel_pixels=100).spacing == pytest.approx(0.1, rel=0.3)
+def test_points_are_as_far_apart_as_they_tell():
+    from scipy.spatial import cKDTree
+
+    cloud = fuse(voxel=0.1, voxel_pixels=1)
+    nearest = cKDTree(cloud.points).query(cloud.points, k=2)[0][:, 1]
+    for spacing in np.unique(cloud.spacing):
+        own = cloud.spacing == spacing
+        if own.sum() > 100:
+            assert np.median(nearest[own]) == pytest.approx(spacing, rel=0.4)
+
+
+def test_a_cube_holds_pixels_as_the_nearest_view_shows_them():
+    assert fuse(voxel_pixels=4).spacing.min() == 2 * fuse(voxel_pixels=2).spacing.min()
 
 
 def test_no_more_points_remain_than_asked_for():

@@ -2,9 +2,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 from labelled_points import labels_of
 
-from ss_flow.tasks.artifacts import Cameras, PointCloud, Tally, Visibility
+from ss_flow.tasks.artifacts import Cameras, Tally, Visibility
 from ss_flow.tasks.geometry.cameras import looking
 from ss_flow.tasks.split.edges import convex_edges
 from ss_flow.tasks.split.hierarchy import HierarchyParams, hierarchy
@@ -38,7 +39,7 @@ def scene():
     places = np.concatenate(faces).astype(np.float32)
     places += np.random.default_rng(0).normal(scale=0.05, size=places.shape).astype(np.float32)
     label = np.repeat(np.array([TOP, FRONT, GROUND], np.int32), SIDE**2)
-    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 1.0)
+    cloud = even_cloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 1.0)
     every = np.arange(len(places), dtype=np.int32)
     view = Visibility("a", every, np.zeros_like(every), np.ones(len(every), np.float32), 8, 8)
     return cloud, cameras_at((12, -60, 80)), view, label

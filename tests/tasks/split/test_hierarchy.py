@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
+from clouds import even_cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from labelled_points import labels_of, one_camera
 
 from ss_flow.flows.params import Params
-from ss_flow.tasks.artifacts import Hierarchy, PointCloud, Tally
+from ss_flow.tasks.artifacts import Hierarchy, Tally
 from ss_flow.tasks.split import hierarchy as module
 from ss_flow.tasks.split.contact import Contact
 from ss_flow.tasks.split.cut import instances_of
@@ -37,7 +38,7 @@ def tree(tallies: list[Tally], labels: int, unused: int = 0, **changes) -> Hiera
     label = np.repeat(np.arange(1, labels + 1, dtype=np.int32), 20)
     places = rng.normal(size=(len(label), 3)).astype(np.float32)
     places[:, 0] += 9 * (label - 1)
-    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.1)
+    cloud = even_cloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.1)
     given = labels_of(label, labels + unused)
     params = HierarchyParams(**{"prior": 0.0, "contact": 0.0, "apart": 0.0, **changes})
     return hierarchy(cloud, one_camera(np.eye(4)), [], given, tallies, params=params)
@@ -184,7 +185,7 @@ def agreement_beside(neighbour: float, alone: float = 0.3) -> float:
         np.float32
     )
     label = np.repeat(np.arange(1, 4, dtype=np.int32), len(half))
-    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.02)
+    cloud = even_cloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.02)
     views = [tally([({1, 2}, 0.9)], {1, 2, 3}), tally([({1}, 0.9), ({2}, 0.9)], {1, 2, 3})]
     stuff = StuffParams(extent=1.0)  # nothing is
     params = HierarchyParams(prior=0.0, alone=alone, contact=0.0, stuff=stuff)

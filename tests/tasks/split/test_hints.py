@@ -9,6 +9,7 @@ import box_scene
 import numpy as np
 import pytest
 from box_scene import HEIGHT, VIEWS, WIDTH, row_of_points
+from clouds import even_cloud
 from labelled_points import labels_of
 
 from ss_flow.tasks.artifacts import Clicks, PointCloud, PointLabels, PromptedMasks, Visibility
@@ -71,7 +72,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def cloud(count: int) -> PointCloud:
-    return PointCloud(np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8), 1.0, 0.01)
+    return even_cloud(np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8), 1.0, 0.01)
 
 
 def labelled(*views, tau_label: float = 0.7) -> PointLabels:

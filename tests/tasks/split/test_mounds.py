@@ -2,9 +2,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 from labelled_points import labels_of, lying, one_camera
 
-from ss_flow.tasks.artifacts import PointCloud, Tally
+from ss_flow.tasks.artifacts import Tally
 from ss_flow.tasks.split.mounds import Mounds, find_mounds
 from ss_flow.tasks.split.votes.touching import TouchingParams, borders
 
@@ -25,9 +26,9 @@ def mounds(
     both = np.array([1, 2], np.int32)
     beside = np.array([[0, 40], [40, 0]], np.int32)
     seen = Tally("a", both, np.bincount(label)[1:].astype(np.int32), np.zeros((0, 2), np.int32), beside, np.zeros(0))
-    cloud = PointCloud(places.astype(np.float32), np.array([BEIGE, color], np.uint8)[label - 1], 1.0, STEP)
+    cloud = even_cloud(places.astype(np.float32), np.array([BEIGE, color], np.uint8)[label - 1], 1.0, STEP)
     ends = borders(label, cloud, TouchingParams())
-    cloud = replace(cloud, spacing=spacing, noise=noise)
+    cloud = replace(cloud, spacing=np.full_like(cloud.spacing, spacing), noise=noise)
     return find_mounds(cloud, one_camera(pose), labels_of(label), [seen], ends, around=0.8, height=asked)
 
 

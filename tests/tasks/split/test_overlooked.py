@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from box_scene import row_of_points
+from clouds import even_cloud
 from labelled_points import labels_of, lying, one_camera
 
 from ss_flow.tasks.artifacts import Frame, PointCloud, PromptedMasks, Visibility
@@ -34,7 +35,7 @@ def scene(*things: np.ndarray) -> tuple[PointCloud, np.ndarray]:
     """The floor, with label 1, and things on it without a label: the cloud, and which thing each point is of."""
     points = np.concatenate([FLOOR, *things]).astype(np.float32)
     of = np.repeat(np.arange(len(things) + 1), [len(FLOOR), *map(len, things)])
-    return PointCloud(points, np.zeros(points.shape, np.uint8), 1.0, STEP), of
+    return even_cloud(points, np.zeros(points.shape, np.uint8), 1.0, STEP), of
 
 
 def seeing(rows: np.ndarray) -> Visibility:
@@ -93,7 +94,7 @@ def test_of_very_many_things_the_largest_are_asked_for():
     tufts = [jar(height=9 if n % 4 == 3 else 8) + np.array([0.2 * (n % 12), 0.2 * (n // 12), 0]) for n in range(100)]
     points = np.concatenate(tufts).astype(np.float32)
     of = np.repeat(np.arange(100), [len(tuft) for tuft in tufts])
-    cloud = PointCloud(points, np.zeros(points.shape, np.uint8), 1.0, STEP)
+    cloud = even_cloud(points, np.zeros(points.shape, np.uint8), 1.0, STEP)
     things = found(cloud, np.zeros(len(points)), [seeing(np.ones(len(points), bool))] * 3)
     assert things.max() == 30 and {3, 7, 99} < set(of[things > 0].tolist())
 
@@ -117,7 +118,7 @@ def test_what_is_flat_or_small_is_no_thing():
 
 def test_what_stands_on_nothing_is_a_thing():
     points = jar().astype(np.float32)
-    cloud = PointCloud(points, np.zeros(points.shape, np.uint8), 1.0, STEP)
+    cloud = even_cloud(points, np.zeros(points.shape, np.uint8), 1.0, STEP)
     assert found(cloud, np.zeros(len(points)), [seeing(np.ones(len(points), bool))] * 3).all()
 
 

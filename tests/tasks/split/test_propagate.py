@@ -115,11 +115,11 @@ def test_clustering_keeps_stray_points_of_a_mask_from_voting(boxes):
     cloud, seen = boxes
     masks = list(true_masks())
     first = masks[0].dense().copy()
-    first[0, :6, :6] = True  # a patch of the far floor
+    first[0, :12, :12] = True  # a patch of the far floor
     masks[0] = mask_set(first, "0")
     only = (seen[0],), (masks[0],)
     cleaned = ObserveParams(clusters=ClusterParams(eps=5.0, keep_share=1.0))
-    stray = (seen[0].pixel % box_scene.WIDTH < 3) & (seen[0].pixel // box_scene.WIDTH < 3)
+    stray = (seen[0].pixel % box_scene.WIDTH < 9) & (seen[0].pixel // box_scene.WIDTH < 9)
     assert stray.any()
     rows = seen[0].point_index[stray]
     assert (run(cloud, *only, BARE).label[rows] > 0).all()

@@ -5,6 +5,7 @@ import box_scene
 import numpy as np
 import pytest
 from box_scene import mask_set
+from clouds import even_cloud
 from labelled_points import labels_of
 
 from ss_flow.tasks.artifacts import (
@@ -12,7 +13,6 @@ from ss_flow.tasks.artifacts import (
     FOUND,
     PROMPTED,
     Hierarchy,
-    PointCloud,
     PointLabels,
     PointParts,
     PromptedMasks,
@@ -51,7 +51,7 @@ def labelled(image, confidence=1.0):
     none = np.zeros(0, np.int32)
     labels = PointLabels(flat, np.full(H * W, confidence, np.float32), int(flat.max()), none, none, none)
     places = np.random.default_rng(0).random((H * W, 3)).astype(np.float32)
-    return PointCloud(places, np.zeros((H * W, 3), np.uint8), 1.0, 0.1), labels
+    return even_cloud(places, np.zeros((H * W, 3), np.uint8), 1.0, 0.1), labels
 
 
 def reproject(cloud, views, masks, labels, parts, prompted, *, params):
@@ -189,7 +189,7 @@ def test_the_masks_of_a_scene_take_the_room_of_the_things():
     pixel = np.arange(0, side * side, 7, dtype=np.int32)
     points = np.arange(len(pixel), dtype=np.int32)
     labels = labels_of(image.ravel()[pixel])
-    cloud = PointCloud(np.zeros((len(pixel), 3), np.float32), np.zeros((len(pixel), 3), np.uint8), 1.0, 0.1)
+    cloud = even_cloud(np.zeros((len(pixel), 3), np.float32), np.zeros((len(pixel), 3), np.uint8), 1.0, 0.1)
     parts = PointParts(np.zeros(len(pixel), np.int32))
 
     def peak(count: int) -> int:
@@ -389,7 +389,7 @@ def test_a_drawn_mask_has_no_gaps_in_a_close_view_whose_points_lie_far_apart(apa
     label = truth.ravel()[pixel].astype(np.int32)
     labels = labels_of(label)
     places = np.stack([u.ravel(), v.ravel(), np.zeros(pixel.size)], axis=-1).astype(np.float32)
-    cloud = PointCloud(places, np.zeros((pixel.size, 3), np.uint8), 1.0, float(apart))
+    cloud = even_cloud(places, np.zeros((pixel.size, 3), np.uint8), 1.0, float(apart))
     seen = Visibility("a", np.arange(pixel.size, dtype=np.int32), pixel, np.ones(pixel.size, np.float32), side, side)
     nothing = mask_set(np.zeros((0, side, side), bool), "a")
     parts = PointParts(np.zeros(pixel.size, np.int32))

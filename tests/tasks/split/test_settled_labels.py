@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from box_scene import mask_set, row_of_points
+from clouds import even_cloud
 from labelled_rows import BARE, lying, points, run, views_of
 
-from ss_flow.tasks.artifacts import BORDER, INSIDE, PointCloud, Visibility
+from ss_flow.tasks.artifacts import BORDER, INSIDE, Visibility
 from ss_flow.tasks.split import propagate as module
 from ss_flow.tasks.split.observe import ClusterParams
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
@@ -35,7 +36,7 @@ def test_ids_move_up_over_those_that_were_dropped_only_where_the_highest_would_n
 def test_halves_of_a_sheet_that_masks_part_are_united_only_where_asked(touching_merge, labels):
     v, u = np.divmod(np.arange(400), 20)
     places = np.stack([u, v, 0 * u], axis=1).astype(np.float32)
-    cloud = PointCloud(places, np.full((400, 3), 128, np.uint8), 1.0, 1.0)
+    cloud = even_cloud(places, np.full((400, 3), 128, np.uint8), 1.0, 1.0)
     every = np.arange(400, dtype=np.int32)
     view = Visibility("0", every, every, np.ones(400, np.float32), 20, 20)
     left = (u < 10).reshape(20, 20)

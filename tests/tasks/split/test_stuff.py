@@ -1,7 +1,7 @@
 import numpy as np
+from clouds import even_cloud
 from labelled_points import labels_of, one_camera
 
-from ss_flow.tasks.artifacts import PointCloud
 from ss_flow.tasks.split.stuff import StuffParams, find_stuff
 
 RNG = np.random.default_rng(0)
@@ -18,7 +18,7 @@ def kinds(*pieces, **values) -> list[bool]:
     label = np.repeat(np.arange(1, len(pieces) + 1, dtype=np.int32), [len(p) for p in pieces])
     pose = np.eye(4)
     pose[:3, 3] = (0, 0, -1.5)
-    cloud = PointCloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.05)
+    cloud = even_cloud(places, np.zeros((len(places), 3), np.uint8), 1.0, 0.05)
     return find_stuff(cloud, one_camera(pose), labels_of(label), StuffParams(**values)).tolist()
 
 

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 from labelled_points import labels_of, lying, one_camera
 
 from ss_flow.tasks.artifacts import Cameras, PointCloud, PointLabels, Tally
@@ -31,7 +32,7 @@ def scene(pieces: list[np.ndarray], turn: float = 0.0) -> tuple[PointCloud, Came
     pose[:3, :3] = [(1, 0, 0), down, np.cross((1, 0, 0), down)]
     pose[:3, 3] = -pose[:3, :3] @ (0, -2, 2)
     colors = np.array([(118, 76, 46), (45, 85, 200), (240, 238, 230), (205, 40, 40)], np.uint8)[label - 1]
-    return PointCloud(places.astype(np.float32), colors, 1.0, STEP), one_camera(pose), labels_of(label)
+    return even_cloud(places.astype(np.float32), colors, 1.0, STEP), one_camera(pose), labels_of(label)
 
 
 def table_with(*pieces: np.ndarray, turn: float = 0.0) -> Supports:
@@ -105,7 +106,7 @@ def test_a_crumpled_cloth_is_nothing_to_stand_on():
 )
 def test_what_lies_near_a_plane_but_no_wider_than_that_is_nothing_to_stand_on(width, spacing, is_level):
     cloud, cameras, labels = scene([block(width, width, 0.1)])
-    supports = find_supports(replace(cloud, spacing=spacing), cameras, labels, height=0.09)
+    supports = find_supports(replace(cloud, spacing=np.full_like(cloud.spacing, spacing)), cameras, labels, height=0.09)
     assert supports.levels((0,)) == ([(0,)] if is_level else [])
 
 

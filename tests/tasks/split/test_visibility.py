@@ -2,10 +2,11 @@ from dataclasses import replace
 
 import box_scene
 import numpy as np
+from clouds import even_cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ss_flow.tasks.artifacts import Cameras, DepthMap, PointCloud
+from ss_flow.tasks.artifacts import Cameras, DepthMap
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.visibility import VisibilityParams
 from ss_flow.tasks.split.visibility import visibility
@@ -13,7 +14,7 @@ from ss_flow.tasks.split.visibility import visibility
 
 def cloud(points, unit=1.0):
     points = np.asarray(points, np.float32)
-    return PointCloud(points, np.zeros((len(points), 3), np.uint8), unit, 0.01)
+    return even_cloud(points, np.zeros((len(points), 3), np.uint8), unit, 0.01)
 
 
 def one_camera(depth):

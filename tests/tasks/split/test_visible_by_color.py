@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 
-from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Frame, PointCloud
+from ss_flow.tasks.artifacts import Cameras, ColourTransform, DepthMap, Frame
 from ss_flow.tasks.geometry.cameras import camera_of
 from ss_flow.tasks.geometry.images import encode_png
 from ss_flow.tasks.geometry.visibility import VisibilityParams
@@ -24,7 +25,7 @@ def looks():
     frame = Frame("a", WIDTH, HEIGHT, encode_png(photo), np.zeros(0, np.uint8), WIDTH, HEIGHT)
 
     def look(points, colors, depth=None, color=8.0, frame=frame, colours=()):
-        cloud = PointCloud(np.asarray(points, np.float32), np.asarray(colors, np.uint8), 1.0, SPACING)
+        cloud = even_cloud(np.asarray(points, np.float32), np.asarray(colors, np.uint8), 1.0, SPACING)
         known = DepthMap("a", np.zeros((HEIGHT, WIDTH), np.float32) if depth is None else depth, "sensor")
         seen = visibility(cloud, camera, known, params=VisibilityParams())
         return visible_by_color(cloud, camera, known, frame, seen, colours, color=color)

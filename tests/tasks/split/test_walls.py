@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 from labelled_points import labels_of, lying
 
-from ss_flow.tasks.artifacts import Hierarchy, PointCloud
+from ss_flow.tasks.artifacts import Hierarchy
 from ss_flow.tasks.split.correct import corrected_tree
 from ss_flow.tasks.split.stuff import StuffParams
 from ss_flow.tasks.split.walls import WallParams, join_walls
@@ -29,7 +30,7 @@ def joined(*parts, stuff=(1,), **params):
     places = [np.asarray(own) for own, _ in parts]
     label = np.repeat(np.arange(1, len(parts) + 1), [len(own) for own in places])
     colors = np.concatenate([np.broadcast_to(color, own.shape) for own, color in parts])
-    cloud = PointCloud(np.concatenate(places).astype(np.float32), colors.astype(np.uint8), 1.0, STEP)
+    cloud = even_cloud(np.concatenate(places).astype(np.float32), colors.astype(np.uint8), 1.0, STEP)
     node = np.arange(1, len(parts) + 1, dtype=np.int32)
     tree = Hierarchy(node, 0 * node, np.ones(len(node), np.float32), np.isin(node, stuff))
     rows = np.arange(len(parts), dtype=np.int32)
@@ -130,7 +131,7 @@ def test_what_is_joined_gets_a_new_id_and_stays_stuff_and_all_else_keeps_its_own
 
 def test_without_labels_there_is_nothing_to_join():
     none = labels_of(np.zeros(0, np.int32))
-    cloud = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 1.0, STEP)
+    cloud = even_cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 1.0, STEP)
     node = np.zeros(0, np.int32)
     after = join_walls(cloud, none, Hierarchy(node, node, node.astype(np.float32), node > 0), params=WallParams())
     assert after.num_labels == 0 and not len(after.label)

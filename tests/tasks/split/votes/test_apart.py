@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
+from clouds import even_cloud
 
-from ss_flow.tasks.artifacts import INSIDE, Observation, PointCloud
+from ss_flow.tasks.artifacts import INSIDE, Observation
 from ss_flow.tasks.split.votes.apart import part_labels
 
 TABLE, FLOOR, CRUMB = range(20), range(20, 32), range(32, 34)
@@ -24,9 +25,11 @@ def parted(*views: Observation, label: int = 1) -> list[int]:
     place[:, 0] = np.arange(34)
     for piece, height in ((FLOOR, 50.0), (CRUMB, 90.0)):
         place[list(piece), 2] = height
-    cloud = PointCloud(place, np.zeros((34, 3), np.uint8), 1.0, 1.0)
+    cloud = even_cloud(place, np.zeros((34, 3), np.uint8), 1.0, 1.0)
     before = np.full(34, label, np.int32)
-    found = part_labels(before, cloud, views, reach=2.0, share=0.05, min_points=5, rate=0.4, first=9)
+    found = part_labels(
+        before, cloud, views, reach=np.full(34, 2.0, np.float32), share=0.05, min_points=5, rate=0.4, first=9
+    )
     assert all(len(set(found[list(piece)].tolist())) == 1 for piece in (TABLE, FLOOR, CRUMB))
     return [int(found[piece[0]]) for piece in (TABLE, FLOOR, CRUMB)]
 

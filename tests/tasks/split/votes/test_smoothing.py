@@ -8,9 +8,14 @@ def row(count):
     return np.stack([np.arange(count), np.zeros(count), np.zeros(count)], axis=1).astype(np.float32)
 
 
+def apart(distance, count):
+    """The spacing of so many points that lie evenly."""
+    return np.full(count, distance, np.float32)
+
+
 def smoothed(labels, contested, rounds=1):
     contested = np.isin(np.arange(len(labels)), contested)
-    return smooth(np.array(labels, np.int32), contested, row(len(labels)), 1.0, rounds).tolist()
+    return smooth(np.array(labels, np.int32), contested, row(len(labels)), apart(1.0, len(labels)), rounds).tolist()
 
 
 def test_a_contested_point_takes_what_most_of_its_neighbours_carry():
@@ -31,18 +36,25 @@ def test_labels_travel_one_reach_a_round():
 
 
 def test_points_far_from_all_others_stay_as_they_are():
-    points = row(3) * 10
-    assert smooth(np.array([1, 0, 2], np.int32), np.array([False, True, False]), points, 1.0, 1).tolist() == [1, 0, 2]
-    assert smooth(np.zeros(0, np.int32), np.zeros(0, bool), np.zeros((0, 3), np.float32), 0.0, 3).tolist() == []
+    label, contested, points = np.array([1, 0, 2], np.int32), np.array([False, True, False]), row(3) * 10
+    assert smooth(label, contested, points, apart(1.0, 3), 1).tolist() == [1, 0, 2]
+    assert smooth(label[:0], contested[:0], points[:0], apart(0.0, 0), 3).tolist() == []
+
+
+def test_a_neighbour_may_be_as_far_as_the_point_itself_lies_from_others():
+    label, contested, points = np.array([1, 0, 0, 2], np.int32), np.array([False, True, True, False]), row(4) * 3
+    spacing = np.array([9.0, 1.0, 2.0, 9.0], np.float32)
+    assert smooth(label, contested, points, spacing, 1).tolist() == [1, 0, 2, 2]
 
 
 def test_many_rounds_give_what_one_round_after_the_other_gives():
     random = np.random.default_rng(0)
+    spacing = apart(0.1, 500)
     points = random.random((500, 3)).astype(np.float32)
     label = np.where(random.random(500) < 0.4, random.integers(1, 5, 500), 0).astype(np.int32)
     contested = random.random(500) < 0.7
     step_by_step = label
     for _ in range(6):
-        step_by_step = smooth(step_by_step, contested, points, 0.1, 1)
-    assert (step_by_step != smooth(label, contested, points, 0.1, 1)).any()
-    assert smooth(label, contested, points, 0.1, 6).tolist() == step_by_step.tolist()
+        step_by_step = smooth(step_by_step, contested, points, spacing, 1)
+    assert (step_by_step != smooth(label, contested, points, spacing, 1)).any()
+    assert smooth(label, contested, points, spacing, 6).tolist() == step_by_step.tolist()

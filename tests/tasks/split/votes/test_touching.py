@@ -2,10 +2,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ss_flow.tasks.artifacts import PointCloud
 from ss_flow.tasks.split.votes.touching import TouchingParams, merge_touching
 
 BEIGE, BLUE = (200, 180, 150), (40, 60, 160)
@@ -24,7 +24,7 @@ def patch(corner, right, up, size, color, seed=0):
 def scene(*patches, labels=None):
     """The cloud of some patches, and labels 1, 2, ... of their points."""
     places, colors = (np.concatenate(part) for part in zip(*patches, strict=True))
-    cloud = PointCloud(places.astype(np.float32), colors.astype(np.uint8), 1.0, 1.0)
+    cloud = even_cloud(places.astype(np.float32), colors.astype(np.uint8), 1.0, 1.0)
     names = np.arange(1, len(patches) + 1) if labels is None else np.array(labels)
     return cloud, np.repeat(names, [len(p) for p, _ in patches]).astype(np.int32)
 
@@ -85,7 +85,7 @@ def test_a_step_is_an_edge():
 
 
 def test_labels_of_too_few_points_for_a_normal_stay_apart():
-    row = PointCloud(np.arange(6)[:, None] * X.astype(np.float32), np.full((6, 3), 99, np.uint8), 1.0, 1.0)
+    row = even_cloud(np.arange(6)[:, None] * X.astype(np.float32), np.full((6, 3), 99, np.uint8), 1.0, 1.0)
     assert left(row, np.array([1, 1, 1, 2, 2, 2], np.int32)) == [1, 2]
 
 
@@ -102,7 +102,7 @@ def test_labels_touch_along_enough_of_the_border(shift, share):
     x, y = np.rint(ground[:, 0]), np.rint(ground[:, 1])
     labels[(x >= 0) & (x < 20) & (y >= 0) & (y < 20)] = 1
     labels[(x >= 20) & (x < 40) & (y >= shift) & (y < shift + 20)] = 2
-    cloud = PointCloud(ground.astype(np.float32), shade.astype(np.uint8), 1.0, 1.0)
+    cloud = even_cloud(ground.astype(np.float32), shade.astype(np.uint8), 1.0, 1.0)
     assert left(cloud, labels) == [0, *share]
 
 
@@ -127,7 +127,7 @@ def test_labels_that_touch_along_the_larger_share_of_a_border_are_united_first()
     for number, shift in ((1, 0), (2, 0), (3, 10)):
         labels[(x >= 20 * (number - 1)) & (x < 20 * number) & (y >= shift) & (y < shift + 20)] = number
     grey = np.repeat(np.uint8([0, 104, 120, 136])[labels][:, None], 3, axis=1)
-    cloud = PointCloud(ground.astype(np.float32), grey, 1.0, 1.0)
+    cloud = even_cloud(ground.astype(np.float32), grey, 1.0, 1.0)
     assert left(cloud, labels, similarity=0.85, contact=0.1) == [0, 1, 3]
 
 
@@ -145,7 +145,7 @@ def test_unlabelled_points_stay_so():
     cloud, labels = scene(*two_halves(), labels=(0, 3))
     assert merged(cloud, labels).tolist() == labels.tolist()
     assert not merged(cloud, np.zeros_like(labels)).any()
-    nothing = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 1.0, 0.0)
+    nothing = even_cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), 1.0, 0.0)
     assert merged(nothing, np.zeros(0, np.int32)).tolist() == []
 
 
@@ -167,7 +167,7 @@ def pieces(seed):
 def test_scaling_the_world_changes_nothing(seed, power):
     cloud, labels = pieces(seed)
     scale = 2.0**power
-    scaled = replace(cloud, points=cloud.points * np.float32(scale), unit=scale, spacing=scale)
+    scaled = replace(cloud, points=cloud.points * np.float32(scale), unit=scale, spacing=cloud.spacing * scale)
     assert merged(cloud, labels).tobytes() == merged(scaled, labels).tobytes()
 
 
