@@ -180,7 +180,8 @@ class PointCloud:
     unit: float
     """The length, in world units, that plays the part of one metre in an average room (1.0 when metric)."""
     spacing: Float32
-    """[N] distance at which neighbours lie there, in world units: larger where only far views look."""
+    """[N] distance at which neighbours lie there, in world units: larger where views look only from far away, or from
+    the side."""
     noise: float = 0.0
     """Standard deviation of the views' depth from the points, as a share of the depth."""
 
