@@ -101,7 +101,7 @@ def dense_splatting(
         seed=0,
     ).gaussians
     cloud = consistent_cloud(
-        sum_by_voxel([_centres(trained, splatting.min_opacity)], voxel),
+        sum_by_voxel([_centres(trained, splatting.min_opacity, voxel)], voxel),
         cameras,
         tuple(_completed(depth, view, trained) for depth, view in zip(depths, views, strict=True)),
         voxel=voxel,
@@ -128,11 +128,12 @@ def _first_gaussians(samples: VoxelSums, voxel: float, limit: int) -> Gaussians:
     return replace(first, log_scales=first.log_scales + np.float32(np.log(_WIDTH)))
 
 
-def _centres(gaussians: Gaussians, min_opacity: float) -> VoxelSums:
-    """The centres of the opaque Gaussians, with their colours."""
+def _centres(gaussians: Gaussians, min_opacity: float, side: float) -> VoxelSums:
+    """The centres of the opaque Gaussians, with their colours, in cubes of a side."""
     opaque = gaussians.opacities >= min_opacity
     colors = np.clip(255 * (0.5 + SH_ZERO * gaussians.sh[opaque, 0].astype(np.float64)), 0, 255)
-    return VoxelSums(gaussians.means[opaque].astype(np.float64), colors, np.ones(len(colors)), np.zeros(len(colors)))
+    ones = np.ones(len(colors))
+    return VoxelSums(gaussians.means[opaque].astype(np.float64), colors, ones, side * ones)
 
 
 def _completed(depth: DepthMap, view: TrainView, gaussians: Gaussians) -> DepthMap:
