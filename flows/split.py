@@ -117,7 +117,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     # Which of these objects are pieces of one thing (beyond the paper).
     tallies = each(seen, shown, names=capture.names, build=lambda visible, pool: tally(visible, pool, pieces))
     tree = hierarchy(points, capture.cameras, seen, pieces, tallies, params=params.hierarchy)
-    things = cut(pieces, tree, granularity=granularity)
+    things = cut(points, pieces, tree, granularity=granularity)
     nested = find_parts(observed, masks, pieces, params=params.parts)
     labels = _divided(capture, embeddings, points, seen, pieces, tree, things, segmenter, params)
     if labels is not things:

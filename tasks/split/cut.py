@@ -8,27 +8,27 @@ import numpy as np
 
 from ss_flow.running import warn
 from ss_flow.task import task
-from ss_flow.tasks.artifacts import Hierarchy, Int32, PointLabels, PointParts
+from ss_flow.tasks.artifacts import Hierarchy, Int32, PointCloud, PointLabels, PointParts
 
 _WEAKEST = 2 / 3
 """Share of the granularity that each union below an instance must exceed: views that see all of an instance make up for
 those that doubt some of its unions, but not for those that deny them."""
 _MOST = 0.5
-"""Share of the labelled points above which a single instance is warned of."""
+"""Share of the labelled surface above which a single instance is warned of."""
 
 
 @task(name="split.cut")
-def cut(labels: PointLabels, tree: Hierarchy, *, granularity: float) -> PointLabels:
+def cut(points: PointCloud, labels: PointLabels, tree: Hierarchy, *, granularity: float) -> PointLabels:
     """The labels of points and masks at one level of the hierarchy.
 
-    labels: those that are the leaves of the tree. granularity: pieces on which the views agree more than this are one
+    labels: of the points, the leaves of the tree. granularity: pieces on which the views agree more than this are one
     instance (0..1); the highest such node counts, as long as no union in it has less than two thirds of that. So 1
     leaves the labels as they are, and lower values give things, then groups of things. Ids are those of the nodes.
-    Warns of an instance that gets more than half of the labelled points, unless it is stuff.
+    Warns of an instance that gets more than half of the labelled surface, unless it is stuff.
     """
     instance = instances_of(tree, labels.num_labels, granularity)
     highest = max(labels.num_labels, int(tree.node.max(initial=0)))
-    _warn_of_largest(instance[labels.label], tree)
+    _warn_of_largest(points, instance[labels.label], tree)
     return replace(labels, label=instance[labels.label], match_label=instance[labels.match_label], num_labels=highest)
 
 
@@ -55,14 +55,15 @@ def cut_parts(labels: PointLabels, parts: PointParts, instances: PointLabels) ->
     return PointParts(number[row].astype(np.int32))
 
 
-def _warn_of_largest(label: Int32, tree: Hierarchy) -> None:
+def _warn_of_largest(points: PointCloud, label: Int32, tree: Hierarchy) -> None:
     """label: [N] the instance of each point, 0 = none."""
-    size = np.bincount(label[label > 0], minlength=1)
+    # What is near has more points than as much surface farther away.
+    size = np.bincount(label, np.where(label > 0, points.spacing.astype(np.float64) ** 2, 0))
     largest = int(size.argmax())
     if size[largest] > _MOST * size.sum() and largest not in tree.node[tree.stuff]:
         warn(
-            f"Instance {largest} holds {size[largest] / size.sum():.0%} of the labelled points. Unless it is one thing "
-            "that fills the scene, its masks show several things as one: raise split.granularity "
+            f"Instance {largest} holds {size[largest] / size.sum():.0%} of the labelled surface. Unless it is one "
+            "thing that fills the scene, its masks show several things as one: raise split.granularity "
             "(--set split.granularity=0.7), or give masks (--masks) or clicked points (--hints)."
         )
 

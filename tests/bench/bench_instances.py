@@ -218,7 +218,7 @@ def labelled(
     pieces = propagate(room.cloud, seen, observed, params=split.propagate)
     counted = [tally(view, pool, pieces) for view, pool in zip(seen, masks, strict=True)]
     tree = hierarchy(room.cloud, room.cameras, seen, pieces, counted, params=split.hierarchy)
-    return cut(pieces, tree, granularity=split.granularity), tree
+    return cut(room.cloud, pieces, tree, granularity=split.granularity), tree
 
 
 def moved(before: Int32, after: Int32) -> float:

@@ -96,12 +96,12 @@ def test_a_changed_threshold_of_propagation_computes_it_and_nothing_before_it(wa
 @pytest.mark.parametrize(
     ("change", "steps"),
     [
-        # Two objects of this room collide.
-        ("merge.iterations_per_view=3", {"splat.merge_pair"}),
-        ("merge.max_iterations=7", {"splat.merge_pair"}),
-        ("merge.objective.alpha_weight=0.25", {"splat.merge_pair"}),
-        ("merge.collision_margin=0.1", {"splat.merge_pair"}),
-        ("merge.crop.margin_px=8", {"splat.merge_pair"}),
+        # No two objects of this room collide, so that no pair is merged.
+        ("merge.iterations_per_view=3", set()),
+        ("merge.max_iterations=7", set()),
+        ("merge.objective.alpha_weight=0.25", set()),
+        ("merge.collision_margin=0.1", set()),
+        ("merge.crop.margin_px=8", set()),
         ("merge.global_mask_weight=0.5", {"splat.global_pass"}),
         ("propagate.in_turn.passes=2", set()),  # the votes are counted at once
         ("propagate.at_once.rate=0.5", {"split.propagate"}),

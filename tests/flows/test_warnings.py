@@ -33,7 +33,7 @@ def test_an_instance_that_holds_most_points_is_warned_of_in_terminal_report_and_
     called = run_tiny(lumped, tmp_path / "store", out=tmp_path / "out")
     assert called.code == 0, called.err
     (told,) = [w for w in called.document()["warnings"] if w["label"] == "split.cut"]
-    assert told["text"].startswith("Instance 1 holds 100% of the labelled points.")
+    assert told["text"].startswith("Instance 1 holds 100% of the labelled surface.")
     assert "--set split.granularity=0.7" in told["text"]
     assert f"warning split.cut: {told['text']}\n" in called.err
     assert told in json.loads((tmp_path / "out/run.json").read_text())["warnings"]
@@ -43,9 +43,7 @@ def test_an_instance_that_holds_most_points_is_warned_of_in_terminal_report_and_
 
 
 def test_a_run_whose_instances_share_the_points_warns_of_none(tiny):
-    more = "--set", "split.dense.max_points=20000"  # of fewer, what is near has most
-    called = run_tiny(tiny.scene, tiny.store, "--until", "cut", *more)
-    assert "split.cut" not in [warning["label"] for warning in called.document()["warnings"]]
+    assert "split.cut" not in [warning["label"] for warning in tiny.called.document()["warnings"]]
 
 
 def test_a_run_without_weights_says_in_one_line_what_it_is_worth_and_what_would_change_it(room, tmp_path):

@@ -25,6 +25,7 @@ SHORT = [
         "reconstruct.min_iterations=10",
         "reconstruct.max_iterations=20",
         "plan.max_rounds=10",
+        "plan.min_score=0.05",  # what stands on a table touches it, but is no pair to merge
         "merge.iterations_per_view=2",
         "merge.min_iterations=4",
         "merge.max_iterations=8",
