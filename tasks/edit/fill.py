@@ -83,8 +83,8 @@ def fill(
     if not views:
         return after
     remains = Remains.of(measured, gone)
-    reach = _TOUCHING * points.spacing_of(remains.rows)
-    arounds = [_around(remains, box) for box in _places_left(before, instances, reach)]
+    places_left = _places_left(before, instances, _TOUCHING * remains.spacing)
+    arounds = [_around(remains, box) for box in places_left]
     rows = np.concatenate(arounds)
     near, spacing = points.points[rows].astype(np.float64), points.spacing_of(rows)
     thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))
@@ -135,7 +135,7 @@ def _places_left(before: EditedScene, instances: tuple[int, ...], reach: float) 
 def _around(remains: Remains, box: Float64) -> Int32:
     """Rows of the dense points near what has left its place."""
     low, high = box
-    margin = max(_NEARBY * float(np.linalg.norm(high - low)), 10 * remains.points.spacing_of(remains.rows))
+    margin = max(_NEARBY * float(np.linalg.norm(high - low)), 10 * remains.spacing)
     places = remains.points.points[remains.rows]
     return remains.rows[((places >= low - margin) & (places <= high + margin)).all(axis=1)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -71,6 +72,11 @@ class Remains:
     rows: Int32
     """Those that are still there, ascending."""
 
+    @functools.cached_property
+    def spacing(self) -> float:
+        """That of most of them, world units."""
+        return self.points.spacing_of(self.rows)
+
     @classmethod
     def of(cls, measured: Measured, gone: tuple[int, ...]) -> Remains:
         """All but those with the labels `gone`."""
@@ -83,7 +89,7 @@ class Remains:
         camera = view.camera
         wide = camera.cropped(-_MARGIN, -_MARGIN, camera.width + _MARGIN, camera.height + _MARGIN)
         places = np.concatenate([self.points.points[self.rows], more]).astype(np.float64)
-        spacing = np.append(self.points.spacing[self.rows], np.full(len(more), self.points.spacing_of(self.rows)))
+        spacing = np.append(self.points.spacing[self.rows], np.full(len(more), self.spacing))
         seen = pixels_in_view(places, wide)[0]
         covered = np.zeros(view.left.shape, bool)
         if not len(seen):

@@ -115,7 +115,7 @@ def consistent_cloud(
             break
         # On surfaces the count falls with the square of the side; far and near ones grow alike.
         grown = _one_of_few(np.sqrt(len(cloud.weight) / params.max_points), np.ceil)
-        if (cloud.sides(voxel) == voxel).all():
+        if (cloud.sides(voxel) == voxel).all():  # else points that are to have no larger cubes would never get fewer
             voxel *= grown
         cloud = sum_by_voxel([replace(cloud, side=cloud.side * grown)], voxel)
     means, colors = cloud.means()

@@ -17,7 +17,7 @@ from ss_flow.tasks.geometry.shape import normals_of
 from ss_flow.tasks.split.votes.touching import Borders, counts_between
 
 _REACH = 8.0
-"""Distance up to which points tell how two labels meet, in multiples of the cloud's spacing. It is twice the one at
+"""Distance up to which points tell how two labels meet, in spacings of the points. It is twice the one at
 which they touch: a sensor's depth is bent at the outline of what stands before a wall."""
 _NEAREST = 256
 """Points within it at most."""

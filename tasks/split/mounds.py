@@ -67,7 +67,7 @@ def find_mounds(
     neighbours along half of its border, as a part of something round does. Far enough is the share `height` of its
     extent where its colours are half like those of its neighbours; twice as far where they are the same, since the arm
     of a sofa rises from its seat too, and down to two thirds as far where they differ. In no case less than two
-    spacings of the cloud, or what the noise of the depth makes of something flat.
+    spacings of its points, or what the noise of the depth makes of something flat.
     """
     from scipy.spatial import cKDTree
 

@@ -31,7 +31,7 @@ class ClusterParams:
     """Which points of a group belong together (DBSCAN; spec rows 14 and 15)."""
 
     eps: NonNegative = 0.0
-    """Neighbourhood radius in multiples of the cloud's spacing; 0 keeps all points."""
+    """Neighbourhood radius in spacings of the points; 0 keeps all points."""
     min_samples: Count = 10
     """Neighbours that make a core point."""
     keep_share: Fraction = 0.1

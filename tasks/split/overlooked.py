@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 _REACH = 2.0
-"""Distance at which points hang together, in spacings of the cloud."""
+"""Distance at which points hang together, in their spacings."""
 _AROUND, _FEW = 5.0, 12
 """Up to which distance from a thing points are round it, in spacings; and below how many it stands on nothing."""
 _ROUNDS = 4

@@ -31,7 +31,7 @@ from ss_flow.tasks.geometry.shape import (
 _FEW = 20
 """Points below which nothing has a shape."""
 _THICKNESS = 2.0
-"""Distance from a plane up to which a point lies on it, in multiples of the cloud's spacing."""
+"""Distance from a plane up to which a point lies on it, in spacings of the surface's points."""
 _FLAT = 0.7
 """Share of its points that must lie on one plane: the rest is the edge of a table top, or noise."""
 _TOP = 0.15
@@ -50,7 +50,7 @@ _LEVEL = 0.5
 """Least cosine between the plane's normal and upwards: a handle does not stand on its door. Where cameras look down,
 what is up in photos leans away from them, and from such a door."""
 _RISES = 3.0
-"""Distance, in multiples of the cloud's spacing, that what stands rises at least."""
+"""Distance, in spacings of its points, that what stands rises at least."""
 _SMALL = 0.5
 """What stands on a surface spreads over less than this share of it."""
 _FOOT = 0.3
@@ -80,6 +80,7 @@ class Supports:
     _planes: dict[Labels, Plane | None] = field(default_factory=dict, init=False)
     _answers: dict[tuple[Labels, Labels, Labels], bool] = field(default_factory=dict, init=False)
     _shares: dict[tuple[Labels, Labels], float] = field(default_factory=dict, init=False)
+    _spacings: dict[Labels, float] = field(default_factory=dict, init=False)
     """What was found so far: many sets share their pieces."""
 
     def levels(self, labels: Labels) -> list[Labels]:
@@ -168,7 +169,9 @@ class Supports:
         return _THICKNESS * self._spacing(labels)
 
     def _spacing(self, labels: Labels) -> float:
-        return self.points.spacing_of(self._rows(labels))
+        if labels not in self._spacings:
+            self._spacings[labels] = self.points.spacing_of(self._rows(labels))
+        return self._spacings[labels]
 
     def _rows(self, labels: Labels) -> NDArray[np.intp]:
         return np.concatenate([self.rows[row] for row in labels])

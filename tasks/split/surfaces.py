@@ -58,7 +58,7 @@ class ShadowParams:
     """Share of the points of each that must lie on one plane."""
     thickness: Fraction = 0.01
     """Distance from the plane up to which they do, as a share of the extent of the smaller one: a book lies on a table,
-    not in it. At least the cloud's spacing."""
+    not in it. At least the points' spacing."""
     min_points: Count = 10
     """Points on both sides at which two labels must touch."""
     gap: Fraction = 0.3

@@ -29,7 +29,7 @@ from ss_flow.tasks.geometry.images import decode_valid, scene_rgb
 _BEHIND = 0.02
 """Share of the depth by which a point may lie behind the nearest one around."""
 _SPACINGS = 2.0
-"""And so many spacings of the cloud."""
+"""And so many spacings of the points."""
 
 
 @task()

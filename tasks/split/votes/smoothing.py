@@ -9,7 +9,7 @@ from ss_flow.tasks.geometry.clustering import nearest_within
 
 _NEIGHBOURS = 8
 _REACH = 3.0
-"""How far a neighbour may be, in multiples of the cloud's spacing."""
+"""How far a neighbour may be, in spacings of the point."""
 
 
 def smooth(label: Int32, contested: Bool, points: Float32, spacing: Float32, rounds: int) -> Int32:

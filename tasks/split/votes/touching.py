@@ -44,7 +44,7 @@ class TouchingParams:
     angle: Annotated[float, Range(0.0, 90.0)] = 25.0
     """Degrees between normals, and by which a surface may rise towards the other, above which there is an edge."""
     reach: Positive = 4.0
-    """Distance at which points touch, and within which a normal is found, in multiples of the cloud's spacing."""
+    """Distance at which points touch, and within which a normal is found, in spacings of the points."""
     color_spread: Positive = 10.0
     """Standard deviation of the smoothing of the histograms, in CIELAB units."""
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ss_flow.tasks.artifacts import Cameras, DepthMap
 from ss_flow.tasks.geometry import fusion
-from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_at, depth_noise, sum_by_voxel
+from ss_flow.tasks.geometry.fusion import VoxelSums, consistent_points, depth_at, depth_noise, finest, sum_by_voxel
 
 
 def samples(points, color=0.0, side=0.0):
@@ -63,6 +63,15 @@ def test_points_that_are_to_have_larger_cubes_have_them_and_follow_the_others():
     np.testing.assert_allclose(again.position, found.position)
     coarse = sum_by_voxel([found], 8.0)  # now all fit the same size
     assert coarse.weight.tolist() == [3, 3]
+
+
+def test_where_a_view_was_near_the_larger_cubes_of_far_views_are_left_out():
+    near = samples([[0.1, 0, 0], [1.2, 0, 0]], side=1.0)
+    far = samples([[0.9, 0, 0], [8.0, 0, 0], [30.0, 0, 0]], side=4.0)  # the first lies in a cube with both near ones
+    farther = samples([[9.0, 0, 0], [70.0, 0, 0]], side=16.0)
+    found = finest(sum_by_voxel([near, far, farther], 1.0), 1.0)
+    assert found.means()[0][:, 0].tolist() == [0.1, 1.2, 8.0, 30.0, 70.0]
+    assert found.sides(1.0).tolist() == [1, 1, 4, 4, 16]
 
 
 def test_depth_of_a_smaller_map_is_read_at_the_pixel_centre():
