@@ -15,6 +15,9 @@ _FAINT = 10.0
 """Points of a border with others that are presumed, so that a faint touch proves nothing."""
 _ALONE = 0.5
 """Share of what pieces touch, other than stuff, that must be of their own set for it to begin to stand alone."""
+_SLIVER = 0.05
+"""Share of what one of two pieces touches that must be the other, so that they hang together: a book that leans on a
+wall may meet it at three points."""
 _NEARLY_ALL = 0.95
 """Share of the points of a set that hangs together; the rest are crumbs."""
 
@@ -53,8 +56,11 @@ class Contact:
         return ((member @ stuff) == 0) * ramp(inside / (inside + outside + _FAINT), _ALONE, 1.0)
 
     def hang_together(self, member: Float32) -> Bool:
-        """[S] of which sets one gets from the largest piece to nearly all points, over pieces that touch each other."""
-        touch = (self.points > 0).astype(np.float32)
+        """[S] of which sets one gets from the largest piece to nearly all points, over pieces that touch each other by
+        more than a sliver."""
+        touched = self.points.sum(axis=1)
+        least = _SLIVER * np.minimum(touched[:, None], touched)
+        touch = ((self.points > 0) & (self.points >= least)).astype(np.float32)
         reached = np.zeros_like(member)
         reached[np.arange(len(member)), (member * self.size).argmax(axis=1)] = 1
         while True:

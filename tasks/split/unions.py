@@ -119,10 +119,11 @@ class Pieces:
         agreement = np.minimum(agreement * (1 + params.contact * (2 * self.contact.own(member) - 1)), 1)
         is_group = np.array([members in groups for members in sets])
         row_of = {members: row for row, members in enumerate(sets)}
-        # A mask that holds a page and the mug on it holds each of the two as one.
+        # A mask that holds a page and the mug on it holds each of the two as one, unless the views deny it: what stands
+        # on nothing else here may be several things.
         for members in groups.keys() & row_of.keys():
             for row in (row_of[part] for part in groups[members] if part in row_of):
-                if not is_group[row]:
+                if not is_group[row] and agreement[row] >= params.min_agreement:
                     agreement[row] = max(agreement[row], agreement[row_of[members]])
         agreement *= np.where(is_group, _ON_TOP, np.where(self.contact.hang_together(member), 1, 1 - params.apart))
         return agreement

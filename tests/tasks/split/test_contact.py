@@ -67,6 +67,13 @@ def test_a_set_hangs_together_over_its_own_pieces_but_for_crumbs():
     assert a_row().hang_together(sets).tolist() == [True, True, False, True, False]
 
 
+@pytest.mark.parametrize(("touching", "hang"), [(0, False), (5, False), (7, True), (50, True)])
+def test_a_sliver_holds_nothing_together(touching, hang):
+    # Each of the two touches others at 100 points besides: from 5.3 on it is a twentieth of what one touches.
+    points = np.array([[0, touching, 100, 0], [touching, 0, 0, 200], [100, 0, 0, 0], [0, 200, 0, 0]], np.float32)
+    assert Contact(points, np.full(4, 50, np.float32)).hang_together(of((0, 1))).tolist() == [hang]
+
+
 def test_pieces_that_become_one_touch_what_they_touched():
     member = np.array([[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     joined = a_row().joined(member)

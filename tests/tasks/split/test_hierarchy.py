@@ -312,19 +312,30 @@ def test_a_stool_and_the_teapot_on_it_are_two_instances_though_every_view_has_bo
     assert stool == other != pot
 
 
+def seat_of(pieces: Pieces, members: tuple[int, ...]) -> tuple[int, ...]:
+    """Those of some pieces that are of a seat, 1 and 2, on which the others stand."""
+    return tuple(piece for piece in members if set(pieces.labels[piece]) <= {0, 1}) or members
+
+
 @pytest.mark.parametrize("touch", [True, False])
 def test_masks_of_a_seat_and_the_bag_on_it_show_each_as_one_where_its_pieces_touch(touch, monkeypatch):
     both = ({1, 2, 3, 4}, 0.9)
     views = [tally([both], both[0]), tally([both, ({1, 2}, 0.9), ({3, 4}, 0.9)], both[0])]
     assert unions(tree(views, 4)) == {frozenset({1, 2, 3, 4}): 1.0}
 
-    def seat_of(pieces, members):
-        return tuple(piece for piece in members if set(pieces.labels[piece]) <= {0, 1}) or members
-
     monkeypatch.setattr(Pieces, "_below", seat_of)
     monkeypatch.setattr(Contact, "parted", lambda _, members: [members] if touch else [(one,) for one in members])
     each = {frozenset({1, 2}): 1.0, frozenset({3, 4}): 1.0 if touch else 0.5}  # two bags may stand on it
     assert unions(tree(views, 4)) == {**each, frozenset({1, 2, 3, 4}): 0.45}
+
+
+@pytest.mark.parametrize(("views", "agree"), [(5, True), (6, False)])
+def test_what_is_below_a_group_is_one_only_where_the_views_would_make_it_a_group_at_least(views, agree, monkeypatch):
+    monkeypatch.setattr(Pieces, "_below", seat_of)
+    both = ({1, 2, 3, 4}, 0.9)
+    silent = [tally([both], both[0], SEES - n) for n in range(1, views)]
+    found = tree([tally([both, ({1, 2}, 0.9)], both[0]), *silent], 4)  # one view of so many has a mask of the seat
+    assert unions(found) == {frozenset({1, 2, 3, 4}): 0.45} | ({frozenset({1, 2}): 1.0} if agree else {})
 
 
 def test_a_union_stands_on_something_only_where_all_its_pieces_do(monkeypatch):
