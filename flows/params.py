@@ -120,7 +120,7 @@ class SplitParams:
     overlooked: OverlookedParams = field(default_factory=OverlookedParams)
     parts: PartsParams = field(default_factory=PartsParams)
     hierarchy: HierarchyParams = field(default_factory=HierarchyParams)
-    granularity: Fraction = 0.45
+    granularity: Fraction = 0.41
     """How far pieces are put together: those that more than this share of the views show as one thing are one instance.
     1 leaves every part on its own, 0.3 gives groups of things."""
     boards: BoardParams = field(default_factory=BoardParams)

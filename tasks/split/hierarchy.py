@@ -77,11 +77,11 @@ class HierarchyParams:
     rises by it where it is each other."""
     apart: Fraction = 0.3
     """Share by which an agreement falls where the pieces do not touch each other: the views show a group."""
-    convex: Fraction = 0.46
+    convex: Fraction = 0.42
     """Agreement that two pieces have at least where they meet in a convex edge, as the faces of a box do, and half of
     the views that see both hold them under one mask. Just above the default of `split.granularity`, so that what the
     views show as one comes first. 0 = convex edges are not looked for."""
-    inlaid: Fraction = 0.46
+    inlaid: Fraction = 0.42
     """The same where one piece lies in the plane of the other, which is all round it, as a picture in its mount. 0 =
     not looked for."""
 

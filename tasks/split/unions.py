@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Members = tuple[int, ...]
 """Some pieces, or labels, by their rows, ascending."""
 
-_ON_TOP = 0.45
+_ON_TOP = 0.41
 """What is left of an agreement when one piece stands on the others: the views show a group. The default of
 `split.granularity`, above which no such set then is: of a stool alone on a floor all views have one mask with what is
 on it."""

@@ -43,7 +43,7 @@ TABLE = {
     "split.propagate.min_label_views": (1, 1, 2),
     "split.boards.rises": (0.0, 0.0, 0.15),
     "split.walls.colors": (0.0, 0.0, 0.9),
-    "split.granularity": (1.0, 1.0, 0.45),
+    "split.granularity": (1.0, 1.0, 0.41),
     "split.overlooked.rise": (0.0, 0.0, 2.5),
     # 7
     "split.segment.min_area": (0.0025, 0.0025, 0.0025),

@@ -132,7 +132,7 @@ def half_agree(views: int) -> list[tuple[list[tuple[set[int], float]], int]]:
 @pytest.mark.parametrize("views", [8, 10, 24, 60])
 def test_half_of_few_views_says_the_same_as_half_of_many(views):
     found = tree([tally(of, {1, 2}, points) for of, points in half_agree(views)], 2, prior=1.0)
-    assert 0.45 < unions(found)[frozenset({1, 2})].expected < 0.5  # a union at the default granularity
+    assert Params().split.granularity < unions(found)[frozenset({1, 2})].expected < 0.5
 
 
 def test_one_of_two_views_does_not_decide():
@@ -268,7 +268,7 @@ def test_pieces_that_do_not_touch_are_a_group_but_for_a_crumb(monkeypatch, touch
 def test_faces_and_what_lies_in_another_are_one_but_walls_are_not(monkeypatch, how, stuff, are_one):
     known(monkeypatch, stuff=stuff, **{how: [(1, 2)]})
     view = tally([({1, 2, 3}, 0.5), ({1}, 0.9), ({2}, 0.9), ({3}, 0.9)], {1, 2, 3})
-    assert unions(tree([view], 3)) == ({frozenset({1, 2}): 0.46} if are_one else {})
+    assert unions(tree([view], 3)) == ({frozenset({1, 2}): 0.42} if are_one else {})
     other = {"convex": "inlaid", "inlaid": "convex"}[how]
     assert unions(tree([view], 3, **{how: 0.4, other: 0.3})) == ({frozenset({1, 2}): 0.4} if are_one else {})
 
@@ -280,7 +280,7 @@ def test_that_they_are_one_half_of_the_views_must_show_in_some_mask(monkeypatch,
     together = [
         tally([({1, 2, 3}, 0.5), ({1}, 0.9), ({2}, 0.9), ({3}, 0.9)], {1, 2, 3}, points) for points in (100, 80)
     ]
-    assert unions(tree([*apart, *together], 3)) == {frozenset({1, 2}): 0.46}
+    assert unions(tree([*apart, *together], 3)) == {frozenset({1, 2}): 0.42}
     assert unions(tree([*apart, together[0]], 3)) == {}
 
 
@@ -291,14 +291,14 @@ def test_a_picture_lies_in_its_mount_when_that_is_one(monkeypatch):
     inlays = Inlays(np.full(3, 100.0), np.array([0, 0, 20.0]), around, around, around)
     monkeypatch.setattr(module, "find_inlays", lambda *_: inlays)
     view = tally([({1, 2}, 0.9), ({1, 2, 3}, 0.5), ({1}, 0.9), ({2}, 0.9), ({3}, 0.9)], {1, 2, 3})
-    assert unions(tree([view], 3)) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.46}
+    assert unions(tree([view], 3)) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.42}
 
 
 def test_a_mask_of_a_seat_and_the_bag_on_it_shows_the_seat_and_a_group(monkeypatch):
     view = tally([({1, 2, 3}, 0.9)], {1, 2, 3})
     known(monkeypatch, on_top=[3])
     # The mask's IoU with the seat alone is 2/3 only, but what it holds besides stands on the seat.
-    assert unions(tree([view], 3)) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.45}
+    assert unions(tree([view], 3)) == {frozenset({1, 2}): 1.0, frozenset({1, 2, 3}): 0.41}
     known(monkeypatch)
     assert unions(tree([view], 3)) == {frozenset({1, 2, 3}): 1.0}
 
@@ -307,7 +307,7 @@ def test_a_stool_and_the_teapot_on_it_are_two_instances_though_every_view_has_bo
     known(monkeypatch, on_top=[3], touching=[(1, 2), (2, 3)])
     views = [tally([({1, 2, 3}, 0.9)], {1, 2, 3}, points) for points in range(81, 101)]
     found = tree(views, 3, **vars(HierarchyParams()))
-    assert unions(found)[frozenset({1, 2, 3})].expected > 0.44  # nothing else speaks against it
+    assert unions(found)[frozenset({1, 2, 3})].expected > 0.4  # nothing else speaks against it
     stool, other, pot = instances_of(found, 3, Params().split.granularity)[1:].tolist()
     assert stool == other != pot
 
@@ -326,7 +326,7 @@ def test_masks_of_a_seat_and_the_bag_on_it_show_each_as_one_where_its_pieces_tou
     monkeypatch.setattr(Pieces, "_below", seat_of)
     monkeypatch.setattr(Contact, "parted", lambda _, members: [members] if touch else [(one,) for one in members])
     each = {frozenset({1, 2}): 1.0, frozenset({3, 4}): 1.0 if touch else 0.5}  # two bags may stand on it
-    assert unions(tree(views, 4)) == {**each, frozenset({1, 2, 3, 4}): 0.45}
+    assert unions(tree(views, 4)) == {**each, frozenset({1, 2, 3, 4}): 0.41}
 
 
 @pytest.mark.parametrize(("views", "agree"), [(5, True), (6, False)])
@@ -335,7 +335,7 @@ def test_what_is_below_a_group_is_one_only_where_the_views_would_make_it_a_group
     both = ({1, 2, 3, 4}, 0.9)
     silent = [tally([both], both[0], SEES - n) for n in range(1, views)]
     found = tree([tally([both, ({1, 2}, 0.9)], both[0]), *silent], 4)  # one view of so many has a mask of the seat
-    assert unions(found) == {frozenset({1, 2, 3, 4}): 0.45} | ({frozenset({1, 2}): 1.0} if agree else {})
+    assert unions(found) == {frozenset({1, 2, 3, 4}): 0.41} | ({frozenset({1, 2}): 1.0} if agree else {})
 
 
 def test_a_union_stands_on_something_only_where_all_its_pieces_do(monkeypatch):

@@ -168,7 +168,7 @@ def test_what_stands_on_a_table_is_no_part_of_it_though_every_mask_of_it_holds_t
     top = top[~((np.abs(top[:, :2]) < 0.04).all(axis=1))]
     found = tree([{1}, {1, 2, 3}, {2, 3}], [top, *mug()])
     assert found[frozenset({2, 3})] > 0.6
-    assert found.get(frozenset({1, 2, 3}), 0) < 0.45
+    assert found.get(frozenset({1, 2, 3}), 0) < 0.41
 
 
 @pytest.mark.parametrize("edge", [0.0, 0.1], ids=["an edge under it", "an edge beside it"])
@@ -178,7 +178,7 @@ def test_what_stands_on_a_rug_is_no_part_of_it_though_that_is_in_pieces(edge):
     stool = block(0.08, 0.08, 0.1)
     found = tree([{1, 2, 3}, {1}, {2}, {3}], [rug[rug[:, 0] < edge], rug[rug[:, 0] >= edge], stool])
     assert found[frozenset({1, 2})] > 0.6
-    assert found.get(frozenset({1, 2, 3}), 0) <= 0.45
+    assert found.get(frozenset({1, 2, 3}), 0) <= 0.41
 
 
 def test_two_things_on_a_table_are_not_one_because_a_mask_of_it_holds_both():
@@ -199,6 +199,6 @@ def test_things_that_touch_each_other_on_a_table_stand_on_it_though_together_the
         top = top[~((top[:, :2] >= low) & (top[:, :2] <= high)).all(axis=1)]
     pieces = [np.concatenate([top, *legs]), *things]
     everything = frozenset({1, 2, 3, 4})
-    assert tree([{1, 2, 3, 4}], pieces)[everything] == pytest.approx(0.45)  # a group
+    assert tree([{1, 2, 3, 4}], pieces)[everything] == pytest.approx(0.41)  # a group
     lower = [piece - np.array([0, 0, 0.3]) for piece in things]  # under the table, where they do not stand on it
     assert tree([{1, 2, 3, 4}], [pieces[0], *lower])[everything] > 0.6
