@@ -33,6 +33,7 @@ from ss_flow.tasks.splat.reconstruct import ReconstructParams
 from ss_flow.tasks.splat.refine import RefineParams
 from ss_flow.tasks.splat.render_masks import RenderMasksParams
 from ss_flow.tasks.splat.resolve import ResolveParams
+from ss_flow.tasks.split.agreement import ONE_THING
 from ss_flow.tasks.split.boards import BoardParams
 from ss_flow.tasks.split.close_ups import CloseUpParams
 from ss_flow.tasks.split.dense import DenseParams
@@ -120,7 +121,7 @@ class SplitParams:
     overlooked: OverlookedParams = field(default_factory=OverlookedParams)
     parts: PartsParams = field(default_factory=PartsParams)
     hierarchy: HierarchyParams = field(default_factory=HierarchyParams)
-    granularity: Fraction = 0.41
+    granularity: Fraction = ONE_THING
     """How far pieces are put together: those that more than this share of the views show as one thing are one instance.
     1 leaves every part on its own, 0.3 gives groups of things."""
     boards: BoardParams = field(default_factory=BoardParams)

@@ -83,8 +83,7 @@ def fill(
     if not views:
         return after
     remains = Remains.of(measured, gone)
-    places_left = _places_left(before, instances, _TOUCHING * remains.spacing)
-    arounds = [_around(remains, box) for box in places_left]
+    arounds = [_around(remains, box) for box in _places_left(before, instances, _TOUCHING * remains.spacing)]
     rows = np.concatenate(arounds)
     near, spacing = points.points[rows].astype(np.float64), points.spacing_of(rows)
     thickness = max(_THICK * spacing, _NOISE * _roughness(near, _PATCH * spacing))

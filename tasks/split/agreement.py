@@ -10,6 +10,8 @@ import numpy as np
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64, Int32, Tally
 
+ONE_THING = 0.41
+"""Agreement above which pieces are one thing, unless `split.granularity` says otherwise."""
 _IOU = (0.5, 0.8)
 """IoU of a mask with the pieces from which on it begins to show them as one, and from which it does."""
 _REST = (0.3, 0.7)

@@ -26,7 +26,7 @@ from ss_flow.tasks.artifacts import (
 )
 from ss_flow.tasks.geometry.clustering import rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, NonNegative
-from ss_flow.tasks.split.agreement import views_of
+from ss_flow.tasks.split.agreement import ONE_THING, views_of
 from ss_flow.tasks.split.casts import find_casts
 from ss_flow.tasks.split.contact import find_contact
 from ss_flow.tasks.split.edges import convex_edges
@@ -77,11 +77,11 @@ class HierarchyParams:
     rises by it where it is each other."""
     apart: Fraction = 0.3
     """Share by which an agreement falls where the pieces do not touch each other: the views show a group."""
-    convex: Fraction = 0.42
+    convex: Fraction = ONE_THING + 0.01
     """Agreement that two pieces have at least where they meet in a convex edge, as the faces of a box do, and half of
     the views that see both hold them under one mask. Just above the default of `split.granularity`, so that what the
     views show as one comes first. 0 = convex edges are not looked for."""
-    inlaid: Fraction = 0.42
+    inlaid: Fraction = ONE_THING + 0.01
     """The same where one piece lies in the plane of the other, which is all round it, as a picture in its mount. 0 =
     not looked for."""
 

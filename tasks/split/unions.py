@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ss_flow.tasks.artifacts import Bool, Float32, Float64
-from ss_flow.tasks.split.agreement import View, agreement_of
+from ss_flow.tasks.split.agreement import ONE_THING, View, agreement_of
 from ss_flow.tasks.split.contact import Contact
 from ss_flow.tasks.split.inlays import Inlays
 from ss_flow.tasks.split.mounds import Mounds
@@ -27,10 +27,9 @@ if TYPE_CHECKING:
 Members = tuple[int, ...]
 """Some pieces, or labels, by their rows, ascending."""
 
-_ON_TOP = 0.41
-"""What is left of an agreement when one piece stands on the others: the views show a group. The default of
-`split.granularity`, above which no such set then is: of a stool alone on a floor all views have one mask with what is
-on it."""
+_ON_TOP = ONE_THING
+"""What is left of an agreement when one piece stands on the others: the views show a group, and above that no such set
+is then. Of a stool alone on a floor all views have one mask with what is on it."""
 _TOGETHER = 0.5
 """Share of the views which see two pieces that must hold them under one mask, whatever else it holds, so that a convex
 edge between them makes them faces of one thing."""

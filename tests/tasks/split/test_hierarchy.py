@@ -132,7 +132,7 @@ def half_agree(views: int) -> list[tuple[list[tuple[set[int], float]], int]]:
 @pytest.mark.parametrize("views", [8, 10, 24, 60])
 def test_half_of_few_views_says_the_same_as_half_of_many(views):
     found = tree([tally(of, {1, 2}, points) for of, points in half_agree(views)], 2, prior=1.0)
-    assert Params().split.granularity < unions(found)[frozenset({1, 2})].expected < 0.5
+    assert 0.45 < unions(found)[frozenset({1, 2})].expected < 0.5  # a union at the default granularity
 
 
 def test_one_of_two_views_does_not_decide():
