@@ -128,13 +128,15 @@ class Pieces:
         return agreement
 
     def _sets(self) -> tuple[list[Members], dict[Members, tuple[Members, ...]]]:
-        """The sets of pieces that masks show: those of which a mask holds at least half; and these without what stands
-        on the others. For each set in which something does, what is below, and each thing that stands on that."""
+        """The sets of pieces that masks show: those of which a mask holds at least half, or of these the stuff alone, if
+        there is any; and these without what stands on the others. For each set in which something does, what is below,
+        and each thing that stands on that."""
         shown: Counter[Members] = Counter()
         for view in self.counted:
             for shows in view.shows:
-                members = tuple(np.flatnonzero(shows).tolist())
-                if len(members) > 1 and len(set(self.stuff[list(members)].tolist())) == 1:
+                stuff = shows & self.stuff
+                members = tuple(np.flatnonzero(stuff if stuff.any() else shows).tolist())
+                if len(members) > 1:
                     shown[members] += 1
         left = {members: self._below(members) for members in shown}
         for members, times in list(shown.items()):

@@ -230,6 +230,15 @@ def test_a_thing_and_stuff_are_never_united_and_a_union_of_stuff_is_stuff(monkey
     assert found.stuff.tolist() == [True, True, False, True]
 
 
+def test_a_mask_that_holds_a_thing_besides_shows_pieces_of_stuff_as_one_but_no_things(monkeypatch):
+    # two thirds of the mask are the stuff's: five ninths of the way from an IoU of .5 to .8
+    view = tally([({1, 2, 3}, 0.9)], {1, 2, 3})
+    known(monkeypatch, stuff=[1, 2])
+    assert unions(tree([view], 3)) == {frozenset({1, 2}): 5 / 9}
+    known(monkeypatch, stuff=[3])
+    assert not unions(tree([view], 3))
+
+
 @pytest.mark.parametrize(("stuff", "agreement"), [([3], 0.6), ([], 0.5), ([1, 2, 3], 0.5)])
 def test_things_that_touch_a_floor_besides_stand_alone_and_walls_do_not(monkeypatch, stuff, agreement):
     # 50 of 60 points, 10 of them presumed, are of the pair: two thirds of the way from a half to all of them.
