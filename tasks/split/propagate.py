@@ -25,7 +25,6 @@ from ss_flow.tasks.artifacts import (
 from ss_flow.tasks.geometry.clustering import dbscan, rows_by_label
 from ss_flow.tasks.ranges import Count, Fraction, Natural
 from ss_flow.tasks.split.observe import ClusterParams
-from ss_flow.tasks.split.votes.apart import part_labels
 from ss_flow.tasks.split.votes.at_once import (
     MaskClusteringParams,
     cluster_masks,
@@ -68,9 +67,6 @@ class PropagateParams:
     from its seat stays so; what a mask covers beyond a thing's outline goes. 1 = never."""
     min_label_points: Natural = 10
     """Points below which a label is dropped in the end."""
-    apart: bool = True
-    """Whether pieces of a label that lie apart in space, each with the share of its points that label_clusters keeps,
-    become labels of their own where the views do not show them as one (see at_once.rate)."""
     min_label_views: Count = 2
     """Views that must show a label by a mask, where as many see at least a tenth of it; else it is dropped in the end.
     1 keeps all."""
@@ -84,7 +80,7 @@ class PropagateParams:
         read = replace(self, touching=touching, label_clusters=self.label_clusters.in_use())
         if self.views == "at_once":
             return replace(read, in_turn=SequentialParams())
-        return replace(read, at_once=MaskClusteringParams(rate=self.at_once.rate))
+        return replace(read, at_once=MaskClusteringParams())
 
 
 @task(resources=Resources(cores=1, most_cores=8))
@@ -120,20 +116,6 @@ def propagate(
         dropped = _unconfirmed(settled, observations, matched, renamed, params)
         settled, renamed = np.where(dropped[settled], 0, settled), np.where(dropped[renamed], 0, renamed)
     match_label = renamed[np.array(matched.label, np.int32)]
-    if params.apart and params.label_clusters.eps:
-        whole = settled
-        settled = part_labels(
-            whole,
-            points,
-            observations,
-            reach=params.label_clusters.eps * points.spacing,
-            share=params.label_clusters.keep_share,
-            min_points=params.min_label_points,
-            rate=params.at_once.rate,
-            first=num_labels + 1,
-        )
-        num_labels = max(num_labels, int(settled.max(initial=0)))
-        match_label = _most_held(match_label, matched, observations, whole, settled)
     if num_labels > MOST_LABELS:
         given = np.unique(np.concatenate([[0], settled, match_label]))
         settled, match_label = (np.searchsorted(given, ids).astype(np.int32) for ids in (settled, match_label))
@@ -204,21 +186,6 @@ def _renaming(before: Int32, after: Int32, num_labels: int) -> Int32:
     renamed = np.zeros(num_labels + 1, np.int32)
     kept = after > 0
     renamed[before[kept]] = after[kept]
-    return renamed
-
-
-def _most_held(
-    match_label: Int32, matched: Matches, observations: Sequence[Observation], whole: Int32, parted: Int32
-) -> Int32:
-    """The labels of the matched masks [A] where labels of points [N] were parted: of the parts of its label, the one
-    that each mask holds most of."""
-    row_of = [{mask: row for row, mask in enumerate(seen.mask.tolist())} for seen in observations]
-    renamed = match_label.copy()
-    for a, (k, mask) in enumerate(zip(matched.view, matched.mask, strict=True)):
-        inside = observations[k].inside(row_of[k][mask])
-        held = np.bincount(parted[inside[whole[inside] == match_label[a]]])
-        if len(held):
-            renamed[a] = held.argmax()
     return renamed
 
 

@@ -10,7 +10,7 @@ from ss_flow.task import Resources, task
 from ss_flow.tasks.artifacts import Float64, Int32, MaskSet, PointLabels, PromptedMasks, Visibility
 from ss_flow.tasks.geometry.images import decode_valid
 from ss_flow.tasks.geometry.sampling import greedy_farthest
-from ss_flow.tasks.masks.painting import PaintedView, agreement, labels_in_front
+from ss_flow.tasks.masks.painting import PaintedView, labels_in_front
 from ss_flow.tasks.masks.pool import without_speckles
 from ss_flow.tasks.masks.selection import SelectionParams, paint_for_selection, select_masks
 from ss_flow.tasks.models.catalogue import Model
@@ -26,9 +26,6 @@ class RepromptParams:
 
     min_points: Count = 10
     """Points of a label that must be in front in a view."""
-    min_agreement: Fraction = 0.5
-    """IoU of a label's mask with its points in the view below which another one is asked for; 0 = only where it has
-    none."""
     prompts: Count = 10
     """Points that ask for the mask together, far from each other."""
     alpha: NonNegative = 0.3
@@ -50,7 +47,7 @@ def reprompt(
     selection: SelectionParams,
     model: Model,
 ) -> PromptedMasks:
-    """Masks for the labels that are visible in a view but that none of its masks shows, or shows well (spec S5).
+    """Masks for the labels that are visible in a view but that none of its masks shows (spec S5).
 
     visibility, masks: those of the photo. selection: how the view's own masks are matched to labels, as in the
     re-projection. Each such label gets one mask, prompted at points spread over it. Whether the mask agrees with the
@@ -58,8 +55,7 @@ def reprompt(
     """
     painted = paint_for_selection(visibility, labels.label, selection)
     shown = select_masks(painted, masks, selection)
-    good = {label for label, mask in shown.items() if agreement(painted, mask, label) >= params.min_agreement}
-    return prompt(photo, spread_prompts(painted, photo.frame.width, good, params), model, params.speckle)
+    return prompt(photo, spread_prompts(painted, photo.frame.width, set(shown), params), model, params.speckle)
 
 
 @dataclass(frozen=True)

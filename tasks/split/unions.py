@@ -128,8 +128,8 @@ class Pieces:
         return agreement
 
     def _sets(self) -> tuple[list[Members], dict[Members, tuple[Members, ...]]]:
-        """The sets of pieces that masks show: those of which a mask holds at least half, or of these the stuff alone, if
-        there is any; and these without what stands on the others. For each set in which something does, what is below,
+        """The sets of pieces that masks show: those of which a mask holds at least half, but of stuff and things the
+        stuff alone; and these without what stands on the others. For each set in which something does, what is below,
         and each thing that stands on that."""
         shown: Counter[Members] = Counter()
         for view in self.counted:

@@ -4,9 +4,9 @@
                                       [--preset fast] [--store DIR] [--jobs 2]
 
 A capture is a kind of `bench_composite.py` (a room, sensor, desk, kitchen, walk, ...) and its seeds; `photos` is a walk
-from its photos alone. A line for each rule, by the setting that undoes it: whole (the share of things that are exactly one
-instance), mIoU, PQ in per cent, mean over the captures, predicted ids in all, and the captures in which a thing more or
-less is whole without the rule, or mIoU differs by more than a point. Only what a rule changes is computed anew.
+from its photos alone. A line for each rule, by the setting that undoes it: whole (the share of things that are exactly
+one instance), mIoU, PQ in per cent, mean over the captures, predicted ids in all, and the captures in which a thing
+more or less is whole without the rule, or mIoU differs by more than a point. Only what a rule changes is computed anew.
 """
 
 from __future__ import annotations
@@ -30,10 +30,6 @@ from ss_flow.flows.params import Params
 from ss_flow.tasks.evaluate.instances import evaluate_masks
 
 RULES = (
-    "split.segment.suppression=boxes",
-    "split.segment.merge=union",
-    "split.segment.max_area=1",
-    "split.segment.speckle=0",
     "split.overlooked.rise=0",
     "split.visibility.deviations=0",
     "split.observe.nested=true",
@@ -41,7 +37,6 @@ RULES = (
     "split.propagate.smoothing=0",
     "split.propagate.touching_merge=false",
     "split.propagate.tau_piece=1",
-    "split.propagate.apart=false",
     "split.propagate.min_label_views=1",
     "split.hierarchy.doubt=1",
     "split.hierarchy.silent=1",
@@ -59,7 +54,6 @@ RULES = (
     "split.boards.rises=0",
     "split.walls.colors=0",
     "split.reproject.min_agreement=0",
-    "split.reprompt.min_agreement=0",
     "split.reproject.selection.masks=all",
     "split.reproject.draw_missing=false",
     "split.granularity=1",

