@@ -108,7 +108,7 @@ def split(capture: Capture, networks: Networks, params: SplitParams) -> Split:
     )
     propagating, granularity = params.propagate, params.granularity
     if capture.clicks is not None:  # what was clicked as two objects stays two, and what was clicked as one, one
-        propagating, granularity = replace(propagating, touching_merge=False, apart=False), 1.0
+        propagating, granularity = replace(propagating, touching_merge=False), 1.0
     voted = pieces = propagate(points, seen, observed, params=propagating.in_use())
     shown = masks
     if segmenter is not None and capture.masks is None and capture.clicks is None and params.overlooked.rise:
