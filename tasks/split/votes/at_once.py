@@ -155,11 +155,11 @@ def membership(groups: list[Int32], num_points: int) -> csr_array:
 def evidence(
     members: csr_array, view: Int32, copies: Int32, min_share: float = 0.0, *, masks: csr_array | None = None
 ) -> tuple[csr_array, Float64]:
-    """What the views say about pairs of masks, or of other sets of points.
+    """What the views say about pairs of masks.
 
-    members: [T, N] which points lie inside which mask. masks: [M, N] the same of the masks, where the sets are others.
-    view: [M] the view of each mask. copies: [M] how many views there are like that one. min_share: smaller g_im (see
-    below) count as 0.
+    members: [T, N] which points lie inside which mask. masks: [T, N] the same, each point with the root of its view's
+    word on it; without, all words count in full. view: [T] the view of each mask. copies: [T] how many views there are
+    like that one. min_share: smaller g_im (see below) count as 0.
     Returns `together` [T, T] and `said` [T, K]. Let g_im be the share of the points of mask i that lie inside mask m,
     and u_ik the sum of g_im over the masks of view k. A point of i and one of j, drawn at random, are both seen under
     masks of view k with probability u_ik u_jk, and under the same one with the sum of g_im g_jm. `together` holds the
