@@ -119,6 +119,15 @@ def other_of(kind: str, seed: int, place: Path) -> Path:
     return folder
 
 
+def capture_of(kind: str, seed: int, place: Path) -> Path:
+    """The capture of any kind, likewise; "sensor" is a room with the depth of a camera, "crowded" one of 100 things."""
+    if kind == "crowded":
+        return crowded_of(100, seed, place)
+    if kind in ("room", "sensor"):
+        return folder_of(replace(ROOM, seed=seed), place, kind == "sensor")
+    return other_of(kind, seed, place)
+
+
 def outcome(folder: Path, params: Params, store: Store, photos: bool = False) -> Outcome:
     """Run Split on a capture, or on its photos alone, and read what came of it."""
     scene = open_scene(folder / "color" if photos else folder)

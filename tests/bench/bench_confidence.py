@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_composite import ROOM, crowded_of, folder_of, other_of
+from bench_composite import capture_of
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
@@ -61,15 +61,6 @@ class Judged:
     right: Bool
     """[N]."""
     ap50: float
-
-
-def capture_of(kind: str, seed: int, place: Path) -> Path:
-    """The folder of a capture; it is written first where it is not there."""
-    if kind == "crowded":
-        return crowded_of(100, seed, place)
-    if kind in ("room", "sensor"):
-        return folder_of(replace(ROOM, seed=seed), place, kind == "sensor")
-    return other_of(kind, seed, place)
 
 
 def judged(kind: str, folder: Path, params: Params, store: Store) -> Judged:

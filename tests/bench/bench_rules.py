@@ -16,13 +16,12 @@ import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from bench_composite import ROOM, folder_of, other_of, outcome
+from bench_composite import capture_of, outcome
 
 from ss_flow.cache.store import Store
 from ss_flow.flows import settings
@@ -62,21 +61,14 @@ RULES = (
 COLUMNS = ("whole", "miou", "pq", "num_predicted")
 
 
-def folder_named(capture: str, place: Path) -> tuple[Path, bool]:
-    """The capture of a kind and a seed, written first where it is not there; whether its photos alone are used."""
-    kind, seed = capture.split(":")
-    if kind in ("room", "sensor"):
-        return folder_of(replace(ROOM, seed=int(seed)), place, kind == "sensor"), False
-    return other_of("walk" if kind == "photos" else kind, int(seed), place), kind == "photos"
-
-
 def table_of(capture: str, without: list[str], preset: str, place: Path) -> np.ndarray:
     """[1 + rules, COLUMNS] of a capture: with all rules, then without each."""
-    folder, photos = folder_named(capture, place)
+    kind, seed = capture.split(":")
+    folder = capture_of("walk" if kind == "photos" else kind, int(seed), place)
     rows, known = [], {}
     for undone in ([], *([setting] for setting in without)):
         params = settings.apply(settings.preset(Params(), preset), undone)
-        found = outcome(folder, params, Store(place), photos)
+        found = outcome(folder, params, Store(place), kind == "photos")
         masks = b"".join(view.ids.tobytes() for view in found.predicted)
         if masks not in known:
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
