@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from functools import partial
@@ -61,10 +62,10 @@ RULES = (
 COLUMNS = ("whole", "miou", "pq", "num_predicted")
 
 
-def table_of(capture: str, without: list[str], preset: str, place: Path) -> np.ndarray:
-    """[1 + rules, COLUMNS] of a capture: with all rules, then without each."""
-    kind, seed = capture.split(":")
-    folder = capture_of("walk" if kind == "photos" else kind, int(seed), place)
+def table_of(capture: tuple[str, int], without: Sequence[str], preset: str, place: Path) -> np.ndarray:
+    """[1 + rules, COLUMNS] of a capture, by its kind and seed: with all rules, then without each."""
+    kind, seed = capture
+    folder = capture_of("walk" if kind == "photos" else kind, seed, place)
     rows, known = [], {}
     for undone in ([], *([setting] for setting in without)):
         params = settings.apply(settings.preset(Params(), preset), undone)
@@ -74,7 +75,7 @@ def table_of(capture: str, without: list[str], preset: str, place: Path) -> np.n
             values = evaluate_masks(found.predicted, found.truth, None, found.frames).values
             known[masks] = [values[column] for column in COLUMNS]
         rows.append(known[masks])
-    print(capture, "done", file=sys.stderr, flush=True)
+    print(kind, seed, "done", file=sys.stderr, flush=True)
     return np.array(rows)
 
 
@@ -86,7 +87,8 @@ def main() -> None:
     parser.add_argument("--store", type=Path, help="a store to keep")
     parser.add_argument("--jobs", type=int, default=1)
     args = parser.parse_args()
-    captures = [f"{kind}:{seed}" for kind, seeds in (c.split(":") for c in args.captures) for seed in seeds.split(",")]
+    named = [capture.split(":") for capture in args.captures]
+    captures = [(kind, int(seed)) for kind, seeds in named for seed in seeds.split(",")]
     with nullcontext(args.store) if args.store else tempfile.TemporaryDirectory() as kept:
         work = partial(table_of, without=args.without, preset=args.preset, place=Path(kept))
         with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
@@ -96,8 +98,8 @@ def main() -> None:
         whole, miou, pq, _ = 100 * tables[:, row].mean(axis=0)
         change = 100 * (tables[:, row] - tables[:, 0])[:, :2]
         changed = [
-            f"{capture} {change[i, 0]:+.0f}, {change[i, 1]:+.1f}"
-            for i, capture in enumerate(captures)
+            f"{kind} {seed} {change[i, 0]:+.0f}, {change[i, 1]:+.1f}"
+            for i, (kind, seed) in enumerate(captures)
             if change[i, 0] or abs(change[i, 1]) > 1
         ]
         ids = int(tables[:, row, 3].sum())
